@@ -1,0 +1,138 @@
+"""What travels between the parts of the system: small frozen records and two protocols.
+
+The front end, the graph, the map and the evaluation never import each other; they meet in
+``slam/pipeline.py`` through these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.se3 import FloatArray
+
+Image = NDArray[np.uint8]
+DepthMap = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def K(self) -> FloatArray:
+        """The camera matrix ``(3, 3)``, pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same camera after its image is resized, half-pixel exact."""
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+        )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds."""
+
+    index: int
+    stamp: float
+    image: Image
+
+
+class Sequence(Protocol):
+    """A recording: frames in time order, their camera, and whatever else is known about them.
+
+    ``reference`` is the true ``T_world_camera`` ``(N, 4, 4)`` with the first pose the identity, or
+    None; ``camera_height_m`` is the height of the camera above the road, ``T_camera_lidar`` takes LiDAR
+    points to the camera: each None where unknown.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    stamps: FloatArray
+    reference: FloatArray | None
+    camera_height_m: float | None
+    T_camera_lidar: FloatArray | None
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def frame(self, index: int) -> Frame:
+        """Read one frame; ``SequenceError`` where its image cannot be read."""
+        ...
+
+    def scan_path(self, index: int) -> Path | None:
+        """The Velodyne ``.bin`` file taken with a frame, or None."""
+        ...
+
+    def provenance(self) -> tuple[str, ...]:
+        """Names of what this is, as the leak record of a checkpoint writes them."""
+        ...
+
+
+@dataclass(frozen=True)
+class SnippetPoses:
+    """A pose network's answer for one snippet.
+
+    ``T_source_target`` ``(N, 4, 4)``: target camera to source camera, unscaled, row k for
+    ``sources[k]`` in time order; ``target`` is the middle frame.
+    """
+
+    target: int
+    sources: tuple[int, ...]
+    T_source_target: FloatArray
+
+
+class Predictor(Protocol):
+    """Learned depth and snippet poses in one common, unknown scale: the networks, a cache or an oracle."""
+
+    sources: int
+
+    def depth(self, frame: Frame) -> DepthMap:
+        """Unscaled z-depth ``(H, W)`` of a frame, at the image's size."""
+        ...
+
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+        """Poses of the sources of a snippet whose target is the middle frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """A measured ``T_from_to`` between two frames and its noise.
+
+    ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
+    translation in the units of the measurement. ``source`` names who measured it.
+    """
+
+    from_index: int
+    to_index: int
+    T_from_to: FloatArray
+    sigmas: FloatArray
+    source: str
+
+
+def iterate(sequence: Sequence) -> Iterator[Frame]:
+    """The frames of a sequence in order."""
+    for index in range(len(sequence)):
+        yield sequence.frame(index)

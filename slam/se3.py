@@ -1,0 +1,117 @@
+"""Rigid transforms as 4x4 float64 matrices.
+
+``T_a_b`` takes coordinates in b to coordinates in a; neighbours cancel (``docs/conventions.md``).
+Functions accept stacks: any leading shape before ``(4, 4)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+
+def make(R_a_b: FloatArray, t_a_b: FloatArray) -> FloatArray:
+    """Assemble ``T_a_b`` ``(..., 4, 4)`` from ``R_a_b`` ``(..., 3, 3)`` and ``t_a_b`` ``(..., 3)``, metres."""
+    T_a_b = np.zeros((*R_a_b.shape[:-2], 4, 4))
+    T_a_b[..., :3, :3] = R_a_b
+    T_a_b[..., :3, 3] = t_a_b
+    T_a_b[..., 3, 3] = 1.0
+    return T_a_b
+
+
+def invert(T_a_b: FloatArray) -> FloatArray:
+    """``T_b_a`` of ``T_a_b``, both ``(..., 4, 4)``."""
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    return make(R_b_a, -(R_b_a @ T_a_b[..., :3, 3:])[..., 0])
+
+
+def apply(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
+    """Points ``(N, 3)`` in b, moved to a by one ``(4, 4)`` transform."""
+    points_a: FloatArray = points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return points_a
+
+
+def rotation_angle(R: FloatArray) -> FloatArray:
+    """Angle in radians of rotations ``(..., 3, 3)``, in [0, pi], accurate at both ends.
+
+    The sine comes from the skew part and the cosine from the trace, so neither end loses digits.
+    """
+    skew = np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    sine = np.linalg.norm(skew, axis=-1)
+    cosine = np.trace(R, axis1=-2, axis2=-1) - 1.0
+    angle: FloatArray = np.arctan2(sine, cosine)
+    return angle
+
+
+def chain(T_previous_next: FloatArray) -> FloatArray:
+    """Poses ``(N + 1, 4, 4)`` in the first frame from N increments ``T_previous_next`` ``(N, 4, 4)``."""
+    T_first_k = np.tile(np.eye(4), (len(T_previous_next) + 1, 1, 1))
+    for k, increment in enumerate(T_previous_next):
+        T_first_k[k + 1] = T_first_k[k] @ increment
+        T_first_k[k + 1, :3, :3] = nearest_rotation(T_first_k[k + 1, :3, :3])
+    return T_first_k
+
+
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """The rotation ``(3, 3)`` closest to M in the Frobenius norm (orthogonal Procrustes by SVD)."""
+    U, _, Vt = np.linalg.svd(M)
+    R: FloatArray = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R
+
+
+def from_rotation_vector(rotation_vector: FloatArray, t_a_b: FloatArray) -> FloatArray:
+    """``T_a_b`` from axis times angle in radians ``(..., 3)`` and translation ``(..., 3)``."""
+    return make(Rotation.from_rotvec(rotation_vector).as_matrix(), np.asarray(t_a_b, dtype=np.float64))
+
+
+def is_se3(T_a_b: FloatArray, tolerance: float = 1e-6) -> bool:
+    """Whether every matrix of the stack is a finite rigid transform."""
+    if T_a_b.shape[-2:] != (4, 4) or not np.isfinite(T_a_b).all():
+        return False
+    R = T_a_b[..., :3, :3]
+    orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max() < tolerance
+    right_handed = bool((np.linalg.det(R) > 0).all())
+    affine = np.abs(T_a_b[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max() < tolerance
+    return bool(orthogonal and right_handed and affine)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``p_a = scale * R_a_b @ p_b + t_a_b``."""
+
+    scale: float
+    R_a_b: FloatArray
+    t_a_b: FloatArray
+
+    def apply_to_poses(self, T_b_k: FloatArray) -> FloatArray:
+        """Poses ``(N, 4, 4)`` in b expressed in a: positions scaled, rotations turned."""
+        R_a_k = self.R_a_b @ T_b_k[:, :3, :3]
+        t_a_k = self.scale * T_b_k[:, :3, 3] @ self.R_a_b.T + self.t_a_b
+        return make(R_a_k, t_a_k)
+
+
+def umeyama(points_a: FloatArray, points_b: FloatArray, with_scale: bool) -> Similarity:
+    """Least-squares similarity that takes ``points_b`` ``(N, 3)`` onto ``points_a`` ``(N, 3)``.
+
+    Umeyama 1991, Eqs. 40-42. With all points of b in one place the scale is undefined and stays 1.
+    """
+    mean_a, mean_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    centred_a, centred_b = points_a - mean_a, points_b - mean_b
+    U, singular, Vt = np.linalg.svd(centred_a.T @ centred_b / len(points_a))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R_a_b = U @ np.diag(sign) @ Vt
+    variance_b = (centred_b**2).sum() / len(points_b)
+    scale = float(singular @ sign / variance_b) if with_scale and variance_b > 0 else 1.0
+    return Similarity(scale, R_a_b, mean_a - scale * R_a_b @ mean_b)

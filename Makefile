@@ -1,0 +1,40 @@
+# A fresh machine needs Python 3.11 and make, nothing else. `make demo` and `make test` set everything up.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+# An index of torch builds, if another than the default is wanted (see README, "Which torch")
+TORCH_INDEX ?=
+
+export OMP_WAIT_POLICY ?= PASSIVE
+
+.PHONY: setup demo test test-all lint benchmark clean
+
+setup: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"Python 3.11 or newer is wanted; $(PYTHON) is {sys.version.split()[0]}; set PYTHON=")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $(READY)
+
+demo: setup
+	$(BIN)/erfsfm-slam run
+
+test: lint
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-all: lint
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+benchmark: setup
+	$(BIN)/python -m pytest -q -s tests/benchmarks --override-ini testpaths=tests/benchmarks -m slow
+
+clean:
+	rm -rf $(VENV) results runs dist build

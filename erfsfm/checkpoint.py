@@ -1,0 +1,176 @@
+"""Trained networks on disk: a folder with two safetensors files and a readable record.
+
+``model.yaml`` says what was trained, on what, by which command; ``depth.safetensors`` and
+``pose.safetensors`` hold numbers only, so that loading never executes code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import yaml
+from pydantic import Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from erfsfm.config import NetworkConfig, Section, dump_yaml
+from erfsfm.errors import CheckpointError
+from erfsfm.networks.presets import build
+
+FORMAT = 1
+SHIPPED = Path(__file__).parent / "weights"
+FILES = ("depth.safetensors", "pose.safetensors")
+
+
+class ModelRecord(Section):
+    """Everything about a pair of networks but their weights."""
+
+    format: int = FORMAT
+    network: NetworkConfig
+    trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
+    licence: str = Field("unknown: depends on the training data", description="of the weights")
+    step: int = 0
+    metrics: dict[str, float] = Field(default_factory=dict, description="of the last validation")
+    version: str = ""
+    commit: str = ""
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Two networks and their record."""
+
+    record: ModelRecord
+    depth_net: nn.Module
+    pose_net: nn.Module
+
+
+def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
+    """Freshly initialised depth and pose networks."""
+    depth_net = build(config.depth, config.fidelity, config.depth_width, normalisation=config.normalisation)
+    pose_net = build(
+        config.pose,
+        config.fidelity,
+        config.pose_width,
+        sources=config.sources,
+        normalisation=config.normalisation,
+        mask_branch=config.masks,
+    )
+    return depth_net, pose_net
+
+
+def save_model(folder: Path, model: Model, half: bool = False) -> None:
+    """Write a model; each file appears whole or not at all.
+
+    Args:
+        folder: made if absent.
+        model: what to write.
+        half: store weights in half precision (BatchNorm statistics stay in single precision).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, net in zip(FILES, (model.depth_net, model.pose_net)):
+        tensors = {key: _stored(key, value, half) for key, value in net.state_dict().items()}
+        write_atomically(folder / name, lambda path, t=tensors: save_file(t, path))  # type: ignore[misc]
+    text = dump_yaml(model.record)
+    write_atomically(folder / "model.yaml", lambda path: path.write_text(text))
+
+
+def load_model(name_or_folder: str | Path) -> Model:
+    """Read a shipped model by name, or a folder that training wrote.
+
+    Raises:
+        CheckpointError: missing, damaged or of another architecture; one line.
+    """
+    folder = find_weights(name_or_folder)
+    record = _read_record(folder / "model.yaml")
+    depth_net, pose_net = build_networks(record.network)
+    for name, net in zip(FILES, (depth_net, pose_net)):
+        _load_into(net, folder / name)
+    return Model(record, depth_net.eval(), pose_net.eval())
+
+
+def find_weights(name_or_folder: str | Path) -> Path:
+    """The folder of a shipped name or of a path.
+
+    Raises:
+        CheckpointError: neither.
+    """
+    folder = Path(name_or_folder)
+    if (folder / "model.yaml").is_file():
+        return folder
+    shipped = sorted(p.parent.name for p in SHIPPED.glob("*/model.yaml"))
+    if str(name_or_folder) in shipped:
+        return SHIPPED / str(name_or_folder)
+    if folder.is_dir():
+        raise CheckpointError(
+            f"{folder} holds no model.yaml: it is not an output folder of 'erfsfm train' (or training has not "
+            "written weights yet)"
+        )
+    raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
+
+
+def weights_sha256(folder: Path) -> str:
+    """One fingerprint of both weight files."""
+    digest = hashlib.sha256()
+    for name in FILES:
+        digest.update((folder / name).read_bytes())
+    return digest.hexdigest()
+
+
+def _stored(key: str, value: torch.Tensor, half: bool) -> torch.Tensor:
+    statistics = "running_" in key or not value.is_floating_point()
+    return value.detach().cpu().contiguous() if statistics or not half else value.detach().cpu().half().contiguous()
+
+
+def _read_record(path: Path) -> ModelRecord:
+    try:
+        return ModelRecord.model_validate(yaml.safe_load(path.read_text()))
+    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        detail = f"'{'.'.join(map(str, first['loc']))}': {first['msg']}" if first else "it is not YAML"
+        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {detail}") from error
+
+
+def _load_into(net: nn.Module, path: Path) -> None:
+    try:
+        tensors = load_file(path)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
+    wanted = net.state_dict()
+    missing, extra = wanted.keys() - tensors.keys(), tensors.keys() - wanted.keys()
+    if missing or extra:
+        example = sorted(missing or extra)[0]
+        raise CheckpointError(
+            f"{path} is of another architecture than model.yaml says: {len(missing)} tensors missing, {len(extra)} "
+            f"unknown, first '{example}'"
+        )
+    for key, value in tensors.items():
+        if value.shape != wanted[key].shape:
+            raise CheckpointError(
+                f"{path}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
+                "another width or preset than model.yaml says"
+            )
+    net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a file beside ``path``, then put it in place at once."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    try:
+        write(Path(temporary))
+        umask = os.umask(0)
+        os.umask(umask)
+        Path(temporary).chmod(0o666 & ~umask)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)

@@ -1,0 +1,69 @@
+"""One random variation for a whole snippet; the camera moves with the images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.config import DataConfig, Fidelity
+from erfsfm.geometry.camera import Camera
+
+Images = list[NDArray[np.uint8]]
+
+
+def augment(
+    images: Images, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
+) -> tuple[Images, Camera]:
+    """Flip, scale-crop and recolour a snippet, all frames alike.
+
+    Args:
+        images: ``(H, W, 3)`` uint8 each.
+        camera: of these images.
+        config: probabilities and largest changes.
+        fidelity: ``paper`` mirrors the principal point as the reference does.
+        rng: the only source of chance.
+
+    Returns:
+        Images of the same size and their camera.
+    """
+    if rng.random() < config.flip:
+        images = [np.ascontiguousarray(image[:, ::-1]) for image in images]
+        camera = camera.flipped(fidelity)
+    if config.zoom > 1:
+        images, camera = _scale_crop(images, camera, config.zoom, rng)
+    if config.colour_jitter > 0:
+        images = _recolour(images, config.colour_jitter, rng)
+    return images, camera
+
+
+def _scale_crop(images: Images, camera: Camera, zoom: float, rng: np.random.Generator) -> tuple[Images, Camera]:
+    """Enlarge each axis by its own factor and crop back at a random place."""
+    width, height = camera.width, camera.height
+    zoom_x, zoom_y = rng.uniform(1, zoom, 2)
+    enlarged = camera.resized(int(width * zoom_x), int(height * zoom_y))
+    left = int(rng.integers(enlarged.width - width + 1))
+    top = int(rng.integers(enlarged.height - height + 1))
+    crops = [
+        cv2.resize(image, (enlarged.width, enlarged.height), interpolation=cv2.INTER_LINEAR)[
+            top : top + height, left : left + width
+        ]
+        for image in images
+    ]
+    return [np.ascontiguousarray(c) for c in crops], enlarged.cropped(left, top, width, height)
+
+
+def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Images:
+    """Brightness, contrast and gamma by one look-up table per channel, grey gains kept close."""
+    gain = 1 + rng.uniform(-strength, strength)
+    gamma = 1 + rng.uniform(-strength, strength)
+    contrast = 1 + rng.uniform(-strength, strength)
+    tint = 1 + rng.uniform(-strength, strength, 3) / 3
+    grey = rng.random() < 0.3
+    values = np.arange(256) / 255
+    curve = (np.power(values, gamma) - 0.45) * contrast + 0.45
+    table = np.clip(curve[:, None] * gain * tint * 255, 0, 255).astype(np.uint8)[None]  # (1, 256, 3)
+    if grey:
+        images = [cv2.cvtColor(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for i in images]
+        table = np.repeat(table[..., :1], 3, axis=-1)
+    return [cv2.LUT(image, table) for image in images]

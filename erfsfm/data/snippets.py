@@ -1,0 +1,185 @@
+"""Windows of consecutive frames with the target in the middle, as training samples.
+
+Sample number i is a pure function of the seed and i: which recording, which window, which
+variation. A run that resumes at step k therefore sees exactly what it would have seen.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from erfsfm.config import DataConfig, ExperimentConfig
+from erfsfm.data.augmentation import augment
+from erfsfm.data.recordings import Recording, discover
+from erfsfm.data.splits import EVERYTHING, FrameRange, overlapping
+from erfsfm.errors import DataError
+
+
+@dataclass(frozen=True)
+class Snippet:
+    """A window: frames ``first`` to ``first + length - 1`` of a recording."""
+
+    recording: Recording
+    first: int
+
+
+class ImageCache:
+    """The most recently decoded frames, up to a size in bytes."""
+
+    def __init__(self, limit_mb: int) -> None:
+        self._limit = limit_mb * 2**20
+        self._bytes = 0
+        self._images: OrderedDict[tuple[int, int], NDArray[np.uint8]] = OrderedDict()
+
+    def image(self, recording: Recording, index: int, height: int, width: int) -> NDArray[np.uint8]:
+        """One frame at ``height x width``, decoded at most once while it stays in the cache."""
+        key = (id(recording), index)
+        cached = self._images.get(key)
+        if cached is not None:
+            self._images.move_to_end(key)
+            return cached
+        image = recording.image(index, height, width)
+        self._images[key] = image
+        self._bytes += image.nbytes
+        while self._bytes > self._limit:
+            _, oldest = self._images.popitem(last=False)
+            self._bytes -= oldest.nbytes
+        return image
+
+
+class SnippetDraws(IterableDataset[dict[str, Tensor]]):
+    """Random snippets from draw number ``first_draw`` to ``draws``, whole batches dealt out to the workers."""
+
+    def __init__(
+        self, recordings: Sequence[Recording], config: ExperimentConfig, draws: int, first_draw: int = 0
+    ) -> None:
+        self._config = config
+        self._draws = draws
+        self._first_draw = first_draw
+        self._cache = ImageCache(config.data.cache_mb)
+        length = config.network.sources + 1
+        self._recordings = usable(recordings, length)
+        self._probabilities = _probabilities(self._recordings, length, config.data)
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        worker = get_worker_info()
+        index, count = (worker.id, worker.num_workers) if worker else (0, 1)
+        batch = self._config.training.batch
+        for number, first in enumerate(range(self._first_draw, self._draws, batch)):
+            if number % count == index:
+                yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
+
+    def draw(self, number: int) -> dict[str, Tensor]:
+        """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3)."""
+        rng = np.random.default_rng([self._config.training.seed, number])
+        recording = self._recordings[int(rng.choice(len(self._recordings), p=self._probabilities))]
+        network = self._config.network
+        first = int(rng.integers(len(recording) - network.sources))
+        snippet = Snippet(recording, first)
+        images = load_window(self._cache, snippet, network.sources + 1, network.height, network.width)
+        camera = recording.camera.resized(network.width, network.height)
+        images, camera = augment(images, camera, self._config.data, network.fidelity, rng)
+        return as_tensors(images, camera.K)
+
+
+class ValidationSnippets(Dataset[dict[str, Tensor]]):
+    """The same evenly spaced snippets every time, with truth where the recordings have it.
+
+    Beside the training tensors: ``depth`` ``(H, W)`` z-depth of the target at its stored size and
+    ``T_source_target`` ``(N, 4, 4)``, each absent where unknown.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig) -> None:
+        self._network = config.network
+        self._cache = ImageCache(config.data.cache_mb)
+        length = config.network.sources + 1
+        kept = usable(recordings, length)
+        windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
+        chosen = np.linspace(0, len(windows) - 1, min(config.data.validation_snippets, len(windows)))
+        self._snippets = [windows[int(i)] for i in chosen.round()]
+
+    def __len__(self) -> int:
+        return len(self._snippets)
+
+    def __getitem__(self, item: int) -> dict[str, Tensor]:
+        snippet, network = self._snippets[item], self._network
+        recording, length = snippet.recording, network.sources + 1
+        images = load_window(self._cache, snippet, length, network.height, network.width)
+        sample = as_tensors(images, recording.camera.resized(network.width, network.height).K)
+        middle = snippet.first + network.sources // 2
+        depth = recording.true_depth(middle)
+        if depth is not None:
+            sample["depth"] = torch.from_numpy(depth)
+        T_world_camera = recording.true_poses()
+        if T_world_camera is not None:
+            window = T_world_camera[snippet.first : snippet.first + length]
+            sources = np.delete(window, network.sources // 2, axis=0)
+            sample["T_source_target"] = torch.from_numpy(np.linalg.inv(sources) @ T_world_camera[middle])
+        return sample
+
+
+def load_window(cache: ImageCache, snippet: Snippet, length: int, height: int, width: int) -> list[NDArray[np.uint8]]:
+    """The images of a snippet at the networks' size, in time order."""
+    return [cache.image(snippet.recording, snippet.first + k, height, width) for k in range(length)]
+
+
+def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:
+    """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour in [0, 1]."""
+    middle = len(images) // 2
+    stacked = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255  # (N+1, 3, H, W)
+    sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
+    return {"target": stacked[middle], "sources": sources, "K": torch.from_numpy(K)}
+
+
+def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
+    """Recordings that hold at least one snippet.
+
+    Raises:
+        DataError: none does.
+    """
+    kept = [r for r in recordings if len(r) >= length]
+    if not kept:
+        sizes = ", ".join(f"{r.name} ({len(r)} frames)" for r in recordings) or "no recording"
+        raise DataError(f"a snippet needs {length} consecutive frames; found {sizes}")
+    return kept
+
+
+def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
+    """Training and validation recordings of all roots, by the configuration's ranges and exclusions."""
+    if not config.roots:
+        raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
+    training: list[Recording] = []
+    validation: list[Recording] = []
+    ranges = {key: FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()}
+    for recording in (r for root in config.roots for r in discover(root)):
+        if overlapping([recording.name], config.validation):
+            validation.append(recording)
+        elif not overlapping([recording.name], config.exclude):
+            span = ranges.get(recording.name)
+            whole = span is None or (span.start, span.stop) == (0, EVERYTHING)
+            training.append(recording if whole or span is None else recording.part(span.start, span.stop))
+    if not training:
+        raise DataError(f"every recording found is excluded or for validation (data.exclude: {', '.join(config.exclude)})")
+    return training, validation
+
+
+def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
+    """Chance of each recording: by its windows, then by the configured share of its kind."""
+    windows = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
+    if not config.weights:
+        return windows / windows.sum()
+    total = np.zeros(len(recordings))
+    for prefix, weight in config.weights.items():
+        chosen = np.array([r.name.startswith(prefix) for r in recordings])
+        if not chosen.any():
+            raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
+        total += np.where(chosen, weight * windows / windows[chosen].sum(), 0)
+    return total / total.sum()

@@ -1,0 +1,100 @@
+"""Depth errors as the field reports them (Eigen et al. 2014): crop, cap and scaling are always stated."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+MINIMUM_DEPTH_M = 1e-3
+Crop = Literal["none", "garg"]
+Scaling = Literal["none", "median"]
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Means over the compared pixels; ``scale`` is what the prediction was multiplied by."""
+
+    abs_rel: float
+    sq_rel: float
+    rmse: float
+    rmse_log: float
+    a1: float
+    a2: float
+    a3: float
+    scale: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Plain numbers by name."""
+        return asdict(self)
+
+
+def valid_pixels(true_depth: NDArray[np.float32], cap_m: float, crop: Crop) -> NDArray[np.bool_]:
+    """Pixels that count ``(H, W)``: truth known and under the cap, inside the crop of Garg et al. 2016."""
+    mask = (true_depth > MINIMUM_DEPTH_M) & (true_depth < cap_m)
+    if crop == "garg":
+        height, width = true_depth.shape
+        inside = np.zeros_like(mask)
+        rows = slice(int(0.40810811 * height), int(0.99189189 * height))
+        columns = slice(int(0.03594771 * width), int(0.96405229 * width))
+        inside[rows, columns] = True
+        mask &= inside
+    return mask
+
+
+def depth_errors(
+    predicted: NDArray[np.float32],
+    true_depth: NDArray[np.float32],
+    cap_m: float = 80.0,
+    crop: Crop = "none",
+    scaling: Scaling = "median",
+) -> DepthErrors | None:
+    """Compare one depth map with the truth.
+
+    Args:
+        predicted: z-depth ``(H, W)``, positive.
+        true_depth: z-depth in metres ``(H, W)``, 0 where unknown.
+        cap_m: truth beyond is left out; the scaled prediction is clipped to it.
+        crop: which part of the image counts.
+        scaling: ``median`` multiplies the prediction by the ratio of the medians.
+
+    Returns:
+        The errors, or None where no pixel has truth.
+
+    Raises:
+        ValueError: the maps differ in size.
+    """
+    if predicted.shape != true_depth.shape:
+        raise ValueError(f"predicted depth must have the truth's shape {true_depth.shape}; got {predicted.shape}")
+    mask = valid_pixels(true_depth, cap_m, crop)
+    if not mask.any():
+        return None
+    truth = true_depth[mask].astype(np.float64)
+    guess = predicted[mask].astype(np.float64)
+    scale = float(np.median(truth) / np.median(guess)) if scaling == "median" else 1.0
+    guess = np.clip(guess * scale, MINIMUM_DEPTH_M, cap_m)
+    ratio = np.maximum(truth / guess, guess / truth)
+    return DepthErrors(
+        abs_rel=float(np.mean(np.abs(truth - guess) / truth)),
+        sq_rel=float(np.mean((truth - guess) ** 2 / truth)),
+        rmse=float(np.sqrt(np.mean((truth - guess) ** 2))),
+        rmse_log=float(np.sqrt(np.mean((np.log(truth) - np.log(guess)) ** 2))),
+        a1=float(np.mean(ratio < 1.25)),
+        a2=float(np.mean(ratio < 1.25**2)),
+        a3=float(np.mean(ratio < 1.25**3)),
+        scale=scale,
+    )
+
+
+def mean_errors(errors: list[DepthErrors]) -> DepthErrors:
+    """Mean over images, each image counting once.
+
+    Raises:
+        ValueError: no image.
+    """
+    if not errors:
+        raise ValueError("no image with true depth to average over")
+    columns = {key: float(np.mean([e.as_dict()[key] for e in errors])) for key in errors[0].as_dict()}
+    return DepthErrors(**columns)

@@ -1,0 +1,129 @@
+"""Whole evaluations: trained networks on recordings with truth, beside a baseline that knows nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.config import Fidelity
+from erfsfm.data.recordings import Recording, discover
+from erfsfm.errors import DataError
+from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
+from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
+
+CAP_M = 80.0
+
+
+class Networks(Protocol):
+    """What an evaluation asks of trained networks (``erfsfm.inference.DepthPosePredictor``)."""
+
+    sources: int
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Unscaled z-depth ``(H, W)``."""
+        ...
+
+    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+        """``T_source_target`` ``(N, 4, 4)``."""
+        ...
+
+    def leaks(self, names: Sequence[str]) -> list[str]:
+        """Recordings that training saw."""
+        ...
+
+
+def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
+    """Median-scaled depth errors under 80 m on every fifth frame with true depth.
+
+    Returns:
+        One row for the networks and one for the data's own median depth map, which needs no image:
+        beating it is the least that a network must do.
+
+    Raises:
+        DataError: no true depth under the root, or a leak that was not allowed.
+    """
+    recordings = [r for r in discover(root) if r.depth is not None]
+    if not recordings:
+        raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")
+    leak = _refuse_leak(networks, recordings, allow_leak)
+    frames = [(r, i) for r in recordings for i in range(0, len(r), every)]
+    truths = [r.true_depth(i) for r, i in frames]
+    typical = _median_map([t for t in truths if t is not None])
+    rows: dict[str, list[DepthErrors]] = {"networks": [], "median depth map": []}
+    for (recording, index), truth in zip(frames, truths):
+        assert truth is not None
+        image = recording.image(index, recording.camera.height, recording.camera.width)
+        for name, guess in (("networks", networks.depth(image)), ("median depth map", typical)):
+            errors = depth_errors(guess, truth, CAP_M)
+            if errors is not None:
+                rows[name].append(errors)
+    return [_depth_row(name, errors, leak) for name, errors in rows.items()]
+
+
+def pose_protocol(
+    networks: Networks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
+) -> list[dict[str, Any]]:
+    """Five-frame snippets of each sequence: the networks, and a straight constant motion."""
+    found = {r.name.split("/")[-1]: r for r in reversed(discover(root))}
+    rows = []
+    for name in sequences:
+        recording = found.get(name)
+        if recording is None:
+            raise DataError(f"no sequence {name} in {root}: found {', '.join(sorted(found))}")
+        T_world_camera = recording.true_poses()
+        if T_world_camera is None:
+            raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
+        leak = _refuse_leak(networks, [recording], allow_leak)
+        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak)
+    return rows
+
+
+def _pose_rows(
+    networks: Networks, recording: Recording, T_world_camera: NDArray[np.float64], fidelity: Fidelity, leak: bool
+) -> list[dict[str, Any]]:
+    length = networks.sources + 1
+    if length != 5:
+        raise DataError(f"the snippet protocol wants networks with 4 sources; these have {networks.sources}")
+    camera = recording.camera
+    images = [recording.image(i, camera.height, camera.width) for i in range(len(recording))]
+    starts = range(len(recording) - length + 1)
+    predicted = np.stack([snippet_from_network(networks.poses(images[s : s + length])) for s in starts])
+    true = np.stack([np.linalg.inv(T_world_camera[s]) @ T_world_camera[s : s + length] for s in starts])
+    straight = np.tile(np.eye(4), (len(starts), length, 1, 1))
+    straight[:, :, 2, 3] = np.arange(length)
+    rows = []
+    for name, guess in (("networks", predicted), ("straight constant motion", straight)):
+        errors = snippet_errors(guess, true, fidelity=fidelity)
+        row = {"method": name, "recording": recording.name, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
+        rows.append(row | {"re_mean": errors.re_mean, "re_std": errors.re_std, "snippets": errors.count, "leak": leak})
+    return rows
+
+
+def _median_map(truths: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Per-pixel median of the true depth, the sky at the cap; every map has the first one's size."""
+    stacked = np.stack([np.where((t > 0) & (t < CAP_M), t, np.nan) for t in truths])
+    known = np.isfinite(stacked).any(axis=0)
+    median = np.full(stacked.shape[1:], CAP_M, dtype=np.float32)
+    median[known] = np.nanmedian(stacked[:, known], axis=0)
+    return median
+
+
+def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, Any]:
+    mean = mean_errors(errors).as_dict()
+    scales = np.array([e.scale for e in errors])
+    spread = float(scales.std() / scales.mean())
+    return {"method": name, **mean, "scale_spread": spread, "images": len(errors), "leak": leak}
+
+
+def _refuse_leak(networks: Networks, recordings: list[Recording], allow_leak: bool) -> bool:
+    names = [f"{r.name}[{r.start}:{r.start + len(r)}]" for r in recordings]
+    leaked = networks.leaks(names)
+    if leaked and not allow_leak:
+        raise DataError(
+            f"leak: these weights were trained on {', '.join(leaked)}; choose other weights or data, or say --allow-leak"
+        )
+    return bool(leaked)

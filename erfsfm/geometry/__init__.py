@@ -1,0 +1,1 @@
+"""Cameras, rigid transforms and the differentiable inverse warp."""

@@ -1,0 +1,61 @@
+"""The inverse warp: a source image seen from the target camera (Zhou et al. 2017, Section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from erfsfm.geometry.camera import backproject
+from erfsfm.geometry.transforms import transform_points
+
+MINIMUM_Z = 1e-3
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Where each target pixel lands in the source image.
+
+    ``grid`` ``(B, H, W, 2)`` in ``grid_sample`` coordinates (align_corners=True), ``z_source``
+    ``(B, 1, H, W)`` the depth of the target's points in the source camera, ``valid`` ``(B, 1, H, W)``
+    boolean: in front of the source camera and inside its image.
+    """
+
+    grid: Tensor
+    z_source: Tensor
+    valid: Tensor
+
+
+def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Projection:
+    """Project the target's points into the source camera.
+
+    p_s ~ K T_source_target D(p_t) K^-1 p_t        (Zhou et al. 2017, Eq. 2)
+
+    Args:
+        depth: target z-depth ``(B, 1, H, W)``.
+        T_source_target: ``(B, 4, 4)``.
+        K: intrinsics shared by both images, ``(B, 3, 3)``.
+    """
+    batch, _, height, width = depth.shape
+    points_source = transform_points(T_source_target, backproject(depth, K))  # (B, 3, H*W)
+    z = points_source[:, 2:]
+    pixels = (K @ points_source)[:, :2] / z.clamp(min=MINIMUM_Z)  # (B, 2, H*W)
+    size = pixels.new_tensor([max(width - 1, 1), max(height - 1, 1)]).reshape(1, 2, 1)
+    normalised = 2 * pixels / size - 1
+    # half a thousandth of a pixel of slack: round-off must not cut the border off an identity warp
+    slack = 1 + 1e-3 / size
+    inside = (normalised.abs() <= slack).all(dim=1, keepdim=True) & (z > MINIMUM_Z)
+    return Projection(
+        grid=normalised.reshape(batch, 2, height, width).permute(0, 2, 3, 1),
+        z_source=z.reshape(batch, 1, height, width),
+        valid=inside.reshape(batch, 1, height, width),
+    )
+
+
+def sample(image: Tensor, projection: Projection) -> Tensor:
+    """Bilinear look-up of ``image`` ``(B, C, H, W)`` at a projection; the border is repeated outside."""
+    # far-outside coordinates would overflow the integer conversion inside grid_sample
+    grid = torch.nan_to_num(projection.grid, nan=2.0).clamp(-2, 2)
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=True)

@@ -1,0 +1,146 @@
+"""The one door through which others use the networks: NumPy in, NumPy out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from erfsfm.checkpoint import Model, find_weights, load_model, weights_sha256, write_atomically
+from erfsfm.data.splits import overlapping
+from erfsfm.errors import ConfigError, DataError
+from erfsfm.geometry.transforms import pose_vector_to_matrix
+
+DeviceChoice = Literal["auto", "cpu", "cuda"]
+
+
+def choose_device(choice: str) -> torch.device:
+    """``auto`` is the GPU where there is one.
+
+    Raises:
+        ConfigError: ``cuda`` where there is none, or an unknown word.
+    """
+    if choice not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"device must be auto, cpu or cuda; got '{choice}'")
+    if choice == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device cuda was asked for, but this machine or this build of torch has none; use cpu")
+    return torch.device("cuda" if choice != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+class DepthPosePredictor:
+    """Depth of single images and poses of snippets, in one unknown scale."""
+
+    def __init__(self, model: Model, device: str = "cpu", sha256: str = "") -> None:
+        self.device = choose_device(device)
+        self.record = model.record
+        self.sha256 = sha256
+        self.sources: int = model.record.network.sources
+        self._depth_net = model.depth_net.eval().to(self.device)
+        self._pose_net = model.pose_net.eval().to(self.device)
+
+    @classmethod
+    def from_weights(cls, name_or_dir: str | Path, device: str = "cpu") -> DepthPosePredictor:
+        """Load a shipped model by name or a training output folder.
+
+        Raises:
+            CheckpointError: missing or damaged weights.
+            ConfigError: a device that is not there.
+        """
+        folder = find_weights(name_or_dir)
+        return cls(load_model(folder), device, weights_sha256(folder))
+
+    def leaks(self, names: Sequence[str]) -> list[str]:
+        """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""
+        return overlapping(names, self.record.trained_on)
+
+    @torch.inference_mode()
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Unscaled z-depth of an image.
+
+        Args:
+            image: ``(H, W, 3)`` uint8 RGB of any size.
+
+        Returns:
+            ``(H, W)`` float32, positive, at the image's size. Disparity is what is interpolated.
+        """
+        disparity = self._depth_net(self._input(image))[0, 0].float().cpu().numpy()
+        height, width = image.shape[:2]
+        if disparity.shape != (height, width):
+            disparity = cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(1 / disparity, dtype=np.float32)
+
+    @torch.inference_mode()
+    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+        """Poses of a snippet's sources.
+
+        Args:
+            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle.
+
+        Returns:
+            ``T_source_target`` ``(N, 4, 4)``, target camera to source camera, unscaled; row k belongs to
+            the k-th source in time order.
+
+        Raises:
+            ValueError: another number of images than the networks were trained for.
+        """
+        if len(images) != self.sources + 1:
+            raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
+        middle = self.sources // 2
+        inputs = [self._input(image) for image in images]
+        target = inputs.pop(middle)
+        vectors: Tensor = self._pose_net(target, inputs)[0].double()  # (N, 6)
+        return pose_vector_to_matrix(vectors).cpu().numpy()
+
+    def _input(self, image: NDArray[np.uint8]) -> Tensor:
+        """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
+        size = (self.record.network.width, self.record.network.height)
+        if (image.shape[1], image.shape[0]) != size:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
+        return tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """An image file as ``(H, W, 3)`` uint8 RGB.
+
+    Raises:
+        DataError: missing or not an image.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DataError(f"{path} is missing or not a readable image")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A picture ``(H, W, 3)`` RGB of 1/depth: near is bright, the nearest 2 % saturate."""
+    disparity = 1 / depth
+    low, high = np.percentile(disparity, [1, 98])
+    shade = np.clip((disparity - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
+
+
+def save_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an RGB image, whole or not at all."""
+    ok, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]))
+    if not ok:
+        raise DataError(f"cannot write {path}: images are .png or .jpg")
+    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
+
+
+def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
+    """Write a depth map as ``.npy``, whole or not at all."""
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.save(file, depth)
+
+    write_atomically(path, write)

@@ -1,0 +1,1 @@
+"""Depth and pose networks with wide receptive fields."""

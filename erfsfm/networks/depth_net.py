@@ -1,0 +1,136 @@
+"""Disparity from one image: DispNet (Zhou et al. 2017) and its wide-field variants."""
+
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.blocks import (
+    ConvBlock,
+    Encoder,
+    Fidelity,
+    Layer,
+    Normalisation,
+    UpBlock,
+    Variant,
+    crop_like,
+    initialise,
+    scaled,
+)
+
+MAX_DISPARITY = 10.0
+MIN_DISPARITY = 0.01
+
+_KERNELS = (7, 5, 3, 3, 3, 3, 3)
+_ENCODER_CHANNELS = (32, 64, 128, 256, 512, 512, 512)
+_DECODER_CHANNELS = (512, 512, 256, 128, 64, 32, 16)  # level 7 to level 1
+_SCALES = 4
+_DILATED_STAGES = (0, 1)
+_DEFORMABLE_STAGES: dict[Variant, tuple[int, ...]] = {"dfc": (0, 1, 2, 3), "dfcv2": (3, 4, 5, 6)}
+
+
+class DepthNet(nn.Module):
+    """Encoder-decoder with skip connections and four disparity heads.
+
+    Variants change both convolutions of some encoder stages: ``dilated`` conv1-2 (dilation 2), ``dfc``
+    conv1-4 and ``dfcv2`` conv4-7 (deformable). In paper fidelity the dilated maps shrink below what the
+    decoder needs at every image size: that network builds, and its forward raises one error. By
+    default the padding grows; conv1's first layer then still reads every second row and column of the
+    image, as stride 2 with dilation 2 does.
+    """
+
+    def __init__(
+        self,
+        variant: Variant = "plain",
+        fidelity: Fidelity = "default",
+        width: float = 1.0,
+        normalisation: Normalisation = "none",
+    ) -> None:
+        super().__init__()
+        self.variant = variant
+        self.fidelity = fidelity
+        encoder = [scaled(channels, width) for channels in _ENCODER_CHANNELS]
+        decoder = [scaled(channels, width) for channels in _DECODER_CHANNELS]
+        stages = []
+        for stage, (kernel, inside, outside) in enumerate(zip(_KERNELS, [3, *encoder], encoder)):
+            down, same = _stage_layers(stage, kernel, variant)
+            stages.append(
+                [
+                    ConvBlock(inside, outside, down, fidelity, normalisation),
+                    ConvBlock(outside, outside, same, fidelity, normalisation),
+                ]
+            )
+        self.encoder = Encoder(stages)
+        skips = [*reversed(encoder[:-1]), 0]  # level 7 to level 1; the image itself is not a skip
+        coarser = [int(level >= len(decoder) - _SCALES + 1) for level in range(len(decoder))]
+        self.upconvs = nn.ModuleList(
+            UpBlock(inside, outside, 3, normalisation)
+            for inside, outside in zip([encoder[-1], *decoder], decoder)
+        )
+        self.iconvs = nn.ModuleList(
+            ConvBlock(up + skip + disparity, up, Layer(3, 1), fidelity, normalisation)
+            for up, skip, disparity in zip(decoder, skips, coarser)
+        )
+        self.heads = nn.ModuleList(nn.Conv2d(channels, 1, 3, padding=1) for channels in decoder[-_SCALES:])
+        initialise(self, fidelity)
+
+    @property
+    def input_channels(self) -> int:
+        """Channels of the encoder's input."""
+        return 3
+
+    def encoder_layers(self) -> list[Layer]:
+        """Geometry of the encoder's convolutions, first to last."""
+        return self.encoder.layers()
+
+    def forward(self, image: Tensor) -> list[Tensor] | Tensor:
+        """Predict disparity, unscaled, in (0.01, 10.01).
+
+        Args:
+            image: colours in [-1, 1], ``(B, 3, H, W)``; any size.
+
+        Returns:
+            In training mode four disparities, finest first, ``(B, 1, ceil(H / 2^s), ceil(W / 2^s))``;
+            in evaluation mode the finest alone, ``(B, 1, H, W)``.
+
+        Raises:
+            ConfigError: for the dilated network in paper fidelity, which fits no image.
+        """
+        if self.variant == "dilated" and self.fidelity == "paper":
+            raise ConfigError(
+                "erf-depthnet-dilated cannot run in paper fidelity: its maps shrink below what the decoder "
+                "needs at every image size; use fidelity 'default'"
+            )
+        if image.dim() != 4 or image.shape[1] != 3:
+            raise ValueError(f"image must have shape (B, 3, H, W); got {tuple(image.shape)}")
+        disparities = self._decode(image, self.encoder(image))
+        return disparities if self.training else disparities[0]
+
+    def _decode(self, image: Tensor, stages: list[Tensor]) -> list[Tensor]:
+        features = stages[-1]
+        disparities: list[Tensor] = []
+        references = [*reversed(stages[:-1]), image]
+        for level, (upconv, iconv, reference) in enumerate(zip(self.upconvs, self.iconvs, references)):
+            parts = [crop_like(upconv(features), reference)]
+            if reference is not image:
+                parts.append(reference)
+            if disparities:
+                parts.append(crop_like(_double(disparities[0]), reference))
+            features = iconv(torch.cat(parts, dim=1))
+            head = level - len(self.upconvs) + _SCALES
+            if head >= 0:
+                raw = cast(Tensor, self.heads[head](features))
+                disparities.insert(0, MAX_DISPARITY * torch.sigmoid(raw) + MIN_DISPARITY)
+        return disparities
+
+
+def _stage_layers(stage: int, kernel: int, variant: Variant) -> tuple[Layer, Layer]:
+    dilation = 2 if variant == "dilated" and stage in _DILATED_STAGES else 1
+    deformable = stage in _DEFORMABLE_STAGES.get(variant, ())
+    return Layer(kernel, 2, dilation, deformable), Layer(kernel, 1, dilation, deformable)
+
+
+def _double(disparity: Tensor) -> Tensor:
+    return F.interpolate(disparity, scale_factor=2, mode="bilinear", align_corners=False)

@@ -1,0 +1,79 @@
+"""The paper's networks by name."""
+
+import difflib
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.blocks import Fidelity, Normalisation, Variant
+from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.pose_net import PoseNet
+
+NetworkKind = Literal["depth", "pose"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One named network: what it predicts and which convolutions its encoder has."""
+
+    kind: NetworkKind
+    variant: Variant
+
+
+PRESETS: dict[str, Preset] = {
+    "depthnet": Preset("depth", "plain"),
+    "erf-depthnet-dilated": Preset("depth", "dilated"),
+    "erf-depthnet-dfc": Preset("depth", "dfc"),
+    "erf-depthnet-dfcv2": Preset("depth", "dfcv2"),
+    "posenet": Preset("pose", "plain"),
+    "erf-posenet-dilated": Preset("pose", "dilated"),
+    "erf-posenet-dfc": Preset("pose", "dfc"),
+    "erf-posenet-dfcv2": Preset("pose", "dfcv2"),
+}
+
+
+def build(
+    name: str,
+    fidelity: Fidelity = "default",
+    width: float = 1.0,
+    sources: int = 4,
+    normalisation: Normalisation = "none",
+    mask_branch: bool = False,
+) -> DepthNet | PoseNet:
+    """Build a network with fresh weights.
+
+    Args:
+        name: a key of `PRESETS`.
+        fidelity: ``paper`` for the reference's exact layers and initialisation, ``default`` for ours.
+        width: multiplier of the hidden channels.
+        sources: number of source images of a pose network; a depth network ignores it.
+        normalisation: batch norm after every convolution but the heads, or none as published.
+        mask_branch: explainability masks in a pose network; a depth network ignores it.
+
+    Raises:
+        ConfigError: if the name or an option is unknown or out of range.
+    """
+    preset = _find(name)
+    _check_choice("fidelity", fidelity, get_args(Fidelity))
+    _check_choice("normalisation", normalisation, get_args(Normalisation))
+    if not 0 < width <= 8:
+        raise ConfigError(f"width must be above 0 and at most 8; got {width}")
+    if preset.kind == "depth":
+        return DepthNet(preset.variant, fidelity, width, normalisation)
+    try:
+        return PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _find(name: str) -> Preset:
+    if name in PRESETS:
+        return PRESETS[name]
+    close = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.4)
+    hint = f" (did you mean '{close[0]}'?)" if close else ""
+    raise ConfigError(f"unknown network '{name}'{hint}; known: {', '.join(PRESETS)}")
+
+
+def _check_choice(option: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ConfigError(f"{option} must be one of {', '.join(choices)}; got '{value}'")

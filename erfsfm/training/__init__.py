@@ -1,0 +1,1 @@
+"""The objective, the Lightning module and the run around it."""

@@ -1,0 +1,165 @@
+"""The self-supervised objective of one batch of snippets (Zhou et al. 2017; Godard et al. 2019; Bian et al. 2019)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from erfsfm.config import ExperimentConfig, LossConfig
+from erfsfm.geometry.camera import scale_intrinsics
+from erfsfm.geometry.transforms import pose_vector_to_matrix
+from erfsfm.geometry.warp import Projection, project_into_source, sample
+from erfsfm.losses.consistency import depth_inconsistency
+from erfsfm.losses.photometric import photometric_error
+from erfsfm.losses.regularisation import (
+    edge_aware_smoothness,
+    explainability_prior,
+    second_order_smoothness,
+)
+
+
+@dataclass(frozen=True)
+class SnippetBatch:
+    """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``."""
+
+    target: Tensor
+    sources: Tensor
+    K: Tensor
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The loss, its terms, and what the networks said.
+
+    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
+    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution seen from the target.
+    """
+
+    total: Tensor
+    terms: dict[str, Tensor]
+    disparities: list[Tensor]
+    T_source_target: Tensor
+    warped: Tensor
+
+
+def to_network_range(image: Tensor) -> Tensor:
+    """Colour in [0, 1] to the networks' [-1, 1]."""
+    return image * 2 - 1
+
+
+def evaluate_objective(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
+    """Predict depth and poses of a batch and say how badly they explain it."""
+    count = batch.sources.shape[1]
+    source_inputs = [to_network_range(batch.sources[:, k]) for k in range(count)]
+    target_input = to_network_range(batch.target)
+    disparities: list[Tensor] = depth_net(target_input)
+    masks: list[Tensor] | None = None
+    if config.network.masks:
+        pose_vectors, masks = pose_net.forward_with_masks(target_input, source_inputs)  # type: ignore[operator]
+    else:
+        pose_vectors = pose_net(target_input, source_inputs)
+    T_source_target = pose_vector_to_matrix(pose_vectors)
+
+    loss = config.loss
+    terms = dict.fromkeys(("photometric", "smoothness"), batch.target.new_zeros(()))
+    finest: tuple[Tensor, Projection] | None = None
+    for level in range(loss.scales):
+        scale = _Level.of(batch, disparities[level], config)
+        warped, projection = scale.warp(T_source_target)
+        mask = masks[level] if masks is not None else None
+        terms["photometric"] = terms["photometric"] + scale.photometric(warped, projection.valid, mask, loss)
+        terms["smoothness"] = terms["smoothness"] + scale.smoothness(loss) / 2**level
+        finest = finest or (warped, projection)
+    assert finest is not None
+    total = terms["photometric"] + loss.smoothness_weight * terms["smoothness"]
+    if masks is not None and loss.mask_weight > 0:
+        terms["explainability"] = torch.stack([explainability_prior(m) for m in masks]).sum()
+        total = total + loss.mask_weight * terms["explainability"]
+    if loss.consistency_weight > 0:
+        terms["consistency"] = _consistency(depth_net, source_inputs, finest[1], count)
+        total = total + loss.consistency_weight * terms["consistency"]
+    shape = (*batch.sources.shape[:3], *batch.target.shape[-2:])
+    return Outcome(total, terms, disparities, T_source_target, finest[0].reshape(shape))
+
+
+@dataclass(frozen=True)
+class _Level:
+    """One level of the image pyramid with its disparity."""
+
+    target: Tensor  # (B, 3, h, w)
+    sources: Tensor  # (B, N, 3, h, w)
+    K: Tensor
+    disparity: Tensor  # (B, 1, h, w)
+
+    @staticmethod
+    def of(batch: SnippetBatch, disparity: Tensor, config: ExperimentConfig) -> _Level:
+        size = (disparity.shape[-2], disparity.shape[-1])
+        full = (batch.target.shape[-2], batch.target.shape[-1])
+        if size == full:
+            return _Level(batch.target, batch.sources, batch.K, disparity)
+        sources = F.interpolate(batch.sources.flatten(0, 1), size=size, mode="area")
+        return _Level(
+            F.interpolate(batch.target, size=size, mode="area"),
+            sources.reshape(*batch.sources.shape[:3], *size),
+            scale_intrinsics(batch.K, size, full, config.network.fidelity),
+            disparity,
+        )
+
+    def warp(self, T_source_target: Tensor) -> tuple[Tensor, Projection]:
+        """All sources seen from the target, ``(B * N, 3, h, w)``, and how they were found."""
+        count = self.sources.shape[1]
+        depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
+        K = self.K.repeat_interleave(count, dim=0)
+        projection = project_into_source(depth, T_source_target.flatten(0, 1), K)
+        return sample(self.sources.flatten(0, 1), projection), projection
+
+    def photometric(self, warped: Tensor, valid: Tensor, mask: Tensor | None, loss: LossConfig) -> Tensor:
+        count = self.sources.shape[1]
+        target = self.target.repeat_interleave(count, dim=0)
+        error = photometric_error(target, warped, loss.ssim_weight)  # (B*N, 1, h, w)
+        shape = (len(self.target), count, *error.shape[-2:])
+        error, valid = error.reshape(shape), valid.reshape(shape)
+        if mask is not None:
+            error = error * mask
+        still: Tensor | None = None
+        if loss.auto_mask:
+            with torch.no_grad():
+                before, after = self.sources[:, count // 2 - 1], self.sources[:, count // 2]
+                still = torch.minimum(
+                    photometric_error(self.target, before, loss.ssim_weight),
+                    photometric_error(self.target, after, loss.ssim_weight),
+                )[:, 0]  # (B, h, w)
+        if loss.reduction == "mean":
+            # pixels without a source count as zero and sources are summed, as in the paper's code
+            summed = (error * valid).sum(dim=1)
+            if still is None:
+                return summed.mean()
+            moving = ((error * valid).sum(1) / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
+            return (summed * moving).mean()
+        best = error.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
+        counted = valid.any(dim=1)
+        if still is not None:
+            counted = counted & (best.detach() < still)
+        return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
+
+    def smoothness(self, loss: LossConfig) -> Tensor:
+        if loss.smoothness == "depth-second-order":
+            return second_order_smoothness(1 / self.disparity)
+        if loss.smoothness == "disparity-second-order":
+            return second_order_smoothness(self.disparity)
+        return edge_aware_smoothness(self.disparity, self.target)
+
+
+def _consistency(depth_net: nn.Module, source_inputs: list[Tensor], projection: Projection, count: int) -> Tensor:
+    """Depth agreement of the target with its two adjacent sources."""
+    adjacent = [count // 2 - 1, count // 2]
+    depths = 1 / depth_net(torch.cat([source_inputs[k] for k in adjacent]))[0]  # (2*B, 1, H, W)
+    terms = []
+    for k, depth_source in zip(adjacent, depths.chunk(2)):
+        part = Projection(projection.grid[k::count], projection.z_source[k::count], projection.valid[k::count])
+        disagreement = depth_inconsistency(part.z_source.clamp(min=1e-3), sample(depth_source, part))
+        terms.append(disagreement[part.valid].mean() if part.valid.any() else depth_source.sum() * 0)
+    return torch.stack(terms).mean()

@@ -1,0 +1,334 @@
+"""The configuration of a SLAM run: frozen, complete, refusing what it does not know.
+
+Every component gets its own section and never the whole tree. A YAML file may leave keys out (the
+defaults hold); ``configs/slam/default.yaml`` writes all of them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
+
+from slam.errors import ConfigError
+
+ScaleMode = Literal["none", "camera-height", "lidar", "reference"]
+
+
+class Section(BaseModel):
+    """A frozen group of settings that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class FrontendConfig(Section):
+    """Noise of the pose network's direct snippet poses, see ``frontend/network_factors.py``."""
+
+    rotation_sigma_deg: float = Field(
+        default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step"
+    )
+    translation_sigma_share: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
+    translation_floor_share: float = Field(
+        default=0.05, gt=0, le=10, description="floor, as a share of the median one-frame step"
+    )
+
+
+class GeometryConfig(Section):
+    """Relative poses from tracked corners, see ``frontend/geometric_factors.py``."""
+
+    enabled: bool = Field(default=True, description="add geometric factors beside the network's")
+    steps: tuple[PositiveInt, ...] = Field(
+        default=(1,), min_length=1, description="frame distances to measure"
+    )
+    max_corners: int = Field(default=800, ge=50, le=10000, description="corners to track")
+    corner_quality: float = Field(
+        default=0.003, gt=0, lt=1, description="share of the best corner's strength"
+    )
+    corner_spacing_px: float = Field(default=9.0, ge=1, description="least distance between corners")
+    window_px: int = Field(default=15, ge=5, le=63, description="side of the tracking window")
+    pyramid_levels: int = Field(default=3, ge=0, le=8, description="levels above the full image")
+    forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
+    inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
+    reprojection_px: float = Field(
+        default=2.0, gt=0, description="largest reprojection error of a PnP inlier"
+    )
+    min_inliers: int = Field(default=40, ge=8, description="fewer refuse the measurement")
+    still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
+    min_parallax_px: float = Field(
+        default=1.5, gt=0, description="median parallax that the essential matrix needs"
+    )
+    min_point_parallax_px: float = Field(
+        default=2.0, gt=0, description="least parallax of a point measuring length"
+    )
+    max_depth_heights: float = Field(
+        default=30.0, gt=0, description="farthest trusted depth, in camera heights"
+    )
+    rotation_floor_deg: float = Field(default=0.04, gt=0, description="least rotation sigma")
+    direction_floor_deg: float = Field(
+        default=0.5, gt=0, description="least sigma of the translation's direction"
+    )
+    length_floor_share: float = Field(
+        default=0.05, gt=0, description="least sigma of the translation's length"
+    )
+
+
+class ScaleConfig(Section):
+    """Metric scale, see ``frontend/scale.py``."""
+
+    mode: Literal["auto"] | ScaleMode = Field(
+        default="auto", description="auto: camera-height where a height is known, else none"
+    )
+    reference_frames: int = Field(default=50, ge=2, description="first frames that mode reference compares")
+    min_frames: int = Field(default=5, ge=1, description="fewer usable frames refuse a scale")
+    rejection_mads: float = Field(
+        default=3.0, gt=0, description="frames farther from the median are left out"
+    )
+    road_top_share: float = Field(
+        default=0.35,
+        ge=0,
+        lt=1,
+        description="top edge of the road trapezoid, from horizon (0) to image bottom (1)",
+    )
+    road_bottom_share: float = Field(default=0.97, gt=0, le=1, description="bottom edge, likewise")
+    road_top_width: float = Field(
+        default=0.16, gt=0, le=1, description="width of the top edge, share of the image"
+    )
+    road_bottom_width: float = Field(
+        default=0.5, gt=0, le=1, description="width of the bottom edge, likewise"
+    )
+    max_tilt_deg: float = Field(
+        default=12.0, gt=0, lt=90, description="plane normal from the camera's y axis"
+    )
+    inlier_share_of_depth: float = Field(
+        default=0.05, gt=0, lt=1, description="depth error of a plane inlier"
+    )
+    min_inlier_share: float = Field(default=0.5, gt=0, le=1, description="fewer inliers refuse the frame")
+
+    @model_validator(mode="after")
+    def _top_above_bottom(self) -> Self:
+        if self.road_top_share >= self.road_bottom_share:
+            raise ValueError("a road trapezoid with road_top_share < road_bottom_share")
+        return self
+
+
+class PoseGraphConfig(Section):
+    """The pose graph, see ``pose_graph.py``."""
+
+    kernel: Literal["none", "huber", "huber-cauchy"] = Field(
+        default="huber", description="robust loss; huber-cauchy polishes the Huber result with Cauchy"
+    )
+    huber_k: float = Field(default=1.345, gt=0, description="whitened residual where Huber turns linear")
+    cauchy_k: float = Field(
+        default=3.0, gt=0, description="whitened residual where Cauchy has halved the weight"
+    )
+    max_iterations: int = Field(default=100, ge=1, description="Levenberg-Marquardt iterations per stage")
+    relative_tolerance: float = Field(
+        default=1e-6, gt=0, lt=1, description="stop below this relative decrease"
+    )
+    max_dropped_loops: int = Field(
+        default=10, ge=0, description="loop edges to give up where the system is singular"
+    )
+
+
+class MappingConfig(Section):
+    """TSDF fusion, see ``mapping.py``; metres, or camera heights under scale mode none."""
+
+    enabled: bool = Field(default=True, description="fuse a map")
+    frame_stride: int = Field(default=1, ge=1, description="fuse every n-th frame")
+    width_px: int = Field(default=416, ge=32, description="depth maps are thinned to about this width")
+    voxel_size_m: float = Field(default=0.2, gt=0, description="side of a voxel")
+    truncation_voxels: float = Field(
+        default=4.5, ge=1, description="truncation distance of the signed distance"
+    )
+    depth_min_m: float = Field(default=1.0, ge=0, description="nearest depth fused")
+    depth_max_m: float = Field(default=25.0, gt=0, description="farthest depth fused")
+    max_depth_step: float = Field(
+        default=0.12, gt=0, description="relative step between neighbours that marks an edge"
+    )
+    consistency: float = Field(
+        default=0.1, gt=0, description="relative depth difference to the previous view"
+    )
+    min_weight: float = Field(
+        default=3.0, ge=0, description="observations that a voxel needs to be extracted"
+    )
+    min_component_triangles: int = Field(
+        default=100, ge=0, description="smaller pieces of the mesh are removed"
+    )
+    max_blocks: int = Field(
+        default=12000, ge=16, description="fusion stops there (16^3 voxels, 80 KiB a block)"
+    )
+
+    @model_validator(mode="after")
+    def _near_before_far(self) -> Self:
+        if self.depth_min_m >= self.depth_max_m:
+            raise ValueError("a range with depth_min_m < depth_max_m")
+        return self
+
+
+class OutputConfig(Section):
+    """What a run writes."""
+
+    root: str = Field(default="results", min_length=1, description="parent folder of run folders")
+    report: bool = Field(default=True, description="write report.html")
+
+
+class SlamConfig(Section):
+    """Everything that a run can be told."""
+
+    frontend: FrontendConfig = FrontendConfig()
+    geometry: GeometryConfig = GeometryConfig()
+    scale: ScaleConfig = ScaleConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
+    mapping: MappingConfig = MappingConfig()
+    output: OutputConfig = OutputConfig()
+
+
+def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str] = ()) -> SlamConfig:
+    """Read a configuration and change some of its keys.
+
+    Args:
+        file_or_name: a YAML file, or the name of one under ``configs/slam``; None for the defaults.
+        overrides: ``section.key=value`` each, the value in YAML.
+
+    Raises:
+        ConfigError: one line that names the key or file, what came and what is allowed.
+    """
+    tree = {} if file_or_name is None else _read(_find(file_or_name))
+    for override in overrides:
+        _override(tree, override)
+    try:
+        return SlamConfig.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_one_line(error)) from error
+
+
+def dump_yaml(config: SlamConfig) -> str:
+    """The whole configuration as YAML, every key with its meaning as a comment."""
+    lines: list[str] = []
+    for name, section in config:
+        lines += [*([""] if lines else []), f"{name}:  # {_summary(section)}"]
+        for key, value in section.model_dump(mode="json").items():
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+            lines.append(f"  {key}: {text}  # {type(section).model_fields[key].description}")
+    return "\n".join(lines) + "\n"
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML where ``1e-4`` is a number and a key may stand once."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As the parent, refusing duplicate keys."""
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.MarkedYAMLError(problem=f"key {key!r} stands twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+# PyYAML follows YAML 1.1, where a float needs a dot
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def _find(file_or_name: str | Path) -> Path:
+    path = Path(file_or_name)
+    if path.is_file():
+        return path
+    here = Path(__file__).resolve().parent
+    folders = [here.parent / "configs" / "slam", here / "_configs"]
+    known = {file.stem: file for folder in reversed(folders) for file in sorted(folder.glob("*.yaml"))}
+    if str(file_or_name) in known:
+        return known[str(file_or_name)]
+    if path.is_dir():
+        raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
+    nearest = difflib.get_close_matches(path.stem, known, 1)
+    hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
+    names = ", ".join(sorted(known)) or "none"
+    raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names}){hint}")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        tree = _parse(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {_yaml_problem(error)}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {tree!r:.60}")
+    return tree
+
+
+def _parse(text: str) -> Any:
+    return yaml.load(text, Loader=_Loader)
+
+
+def _override(tree: dict[str, Any], override: str) -> None:
+    dotted, equals, text = override.partition("=")
+    parts = dotted.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(f"an override is written section.key=value; got '{override}'")
+    try:
+        value = _parse(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"the value of '{override}' is not valid YAML: {_yaml_problem(error)}") from error
+    for part in parts[:-1]:
+        tree = tree.setdefault(part, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"'{override}': '{part}' is not a section")
+    tree[parts[-1]] = value
+
+
+def _yaml_problem(error: yaml.YAMLError) -> str:
+    problem = getattr(error, "problem", None) or " ".join(str(error).split())
+    mark = getattr(error, "problem_mark", None)
+    return f"{problem} (line {mark.line + 1})" if mark else str(problem)
+
+
+def _one_line(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    # pydantic appends the branch of a union to the place; keys end where no such key is known
+    known = list(_known_keys())
+    place = [str(part) for part in first["loc"]]
+    if first["type"] == "extra_forbidden":
+        return _unknown_key(".".join(place), known)
+    key = ".".join(place)
+    while key and key not in known:
+        key = key.rpartition(".")[0]
+    if first["type"] == "model_type":
+        return f"'{key}' is a section of keys; got {first['input']!r}"
+    if key == "scale.mode":
+        return f"'{key}' is one of auto, none, camera-height, lidar, reference; got {first['input']!r}"
+    wanted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"'{key}' should be {wanted}; got {first['input']!r}"
+
+
+def _unknown_key(key: str, known: list[str]) -> str:
+    nearest = difflib.get_close_matches(key, [name for name in known if name.count(".") == key.count(".")], 1)
+    if not nearest:
+        by_last_part = {name.rpartition(".")[2]: name for name in reversed(known)}
+        last = difflib.get_close_matches(key.rpartition(".")[2], by_last_part, 1)
+        nearest = [by_last_part[last[0]]] if last else []
+    if nearest:
+        return f"unknown key '{key}'; did you mean '{nearest[0]}'?"
+    section = key.rpartition(".")[0]
+    allowed = [name.rpartition(".")[2] for name in known if name.rpartition(".")[0] == section]
+    return f"unknown key '{key}'; allowed{f' in {section}' if section else ''}: {', '.join(allowed)}"
+
+
+def _known_keys() -> Iterator[str]:
+    for name, section in SlamConfig():
+        yield name
+        yield from (f"{name}.{key}" for key in type(section).model_fields)
+
+
+def _summary(section: Section) -> str:
+    return (type(section).__doc__ or "").partition("\n")[0].rstrip(".").replace("``", "")

@@ -1,0 +1,23 @@
+"""Doors to foreign libraries that need help before they can be imported."""
+
+import ctypes
+import functools
+import importlib
+from types import ModuleType
+
+from slam.errors import SlamError
+
+
+@functools.cache
+def import_open3d() -> ModuleType:
+    """Import Open3D, loading the libusb that its wheels link but do not ship.
+
+    Raises:
+        SlamError: if Open3D or libusb-package is not installed or cannot be loaded.
+    """
+    try:
+        libusb_package = importlib.import_module("libusb_package")
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise SlamError(f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package") from error

@@ -1,0 +1,1 @@
+"""From the networks and the images to relative-pose factors and a metric scale."""

@@ -1,0 +1,182 @@
+"""Relative poses from the images themselves: rotation and direction from corners, length from learned depth.
+
+As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax carries one, its length from the
+ratio of learned to triangulated depth; perspective-n-point against learned depth where it does not.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam.config import GeometryConfig
+from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
+from slam.frontend.epipolar import TwoView, estimate_two_view, parallax_px, triangulated_depth
+from slam.frontend.refusal import Refusal
+from slam.frontend.tracking import CornerTracker, Tracks
+from slam.se3 import FloatArray, invert, make
+
+ESSENTIAL_SOURCE = "essential"
+PNP_SOURCE = "pnp"
+STILL_SOURCE = "still"
+_MAD_TO_SIGMA = 1.4826
+_MIN_RATIOS = 20
+_LEARNED_SIGMA_SHARE = 0.1
+# neighbouring corners err together: the covariance of independent ones is widened by this
+_CORRELATION = 2.0
+
+
+class GeometricOdometry:
+    """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
+
+    def __init__(self, config: GeometryConfig, intrinsics: Intrinsics) -> None:
+        self._config = config
+        self._intrinsics = intrinsics
+        self._tracker = CornerTracker(config)
+
+    def relative_pose(
+        self,
+        previous: Frame,
+        current: Frame,
+        depth_previous_unscaled: DepthMap,
+        height_unscaled: float | None = None,
+    ) -> RelativePose | Refusal:
+        """Measure the motion between two frames.
+
+        Args:
+            previous: the earlier frame, at the size of the intrinsics.
+            current: a later frame.
+            depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
+            height_unscaled: camera height in the same unit; where known, farther depths than
+                ``max_depth_heights`` of it are not trusted.
+        """
+        tracks = self._tracker.track(previous, current)
+        if len(tracks.previous) < self._config.min_inliers:
+            return Refusal(f"only {len(tracks.previous)} corners could be followed")
+        depth = self._trusted(_sample(depth_previous_unscaled, tracks.previous), height_unscaled)
+        measured = (
+            self._still(tracks, depth) or self._by_essential(tracks, depth) or self._by_points(tracks, depth)
+        )
+        if isinstance(measured, Refusal):
+            return measured
+        T_previous_current, sigmas, source = measured
+        return RelativePose(previous.index, current.index, T_previous_current, sigmas, source)
+
+    def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
+        """Depths ``(M,)`` with NaN where not trusted."""
+        farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
+        return np.where(np.isfinite(depth) & (depth > 0) & (depth < farthest), depth, np.nan)
+
+    def _rays(self, pixels: FloatArray) -> FloatArray:
+        camera = self._intrinsics
+        x = (pixels[:, 0] - camera.cx) / camera.fx
+        y = (pixels[:, 1] - camera.cy) / camera.fy
+        return np.stack([x, y, np.ones_like(x)], axis=1)
+
+    def _still(self, tracks: Tracks, depth: FloatArray) -> _Measured | None:
+        flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
+        if flow >= self._config.still_flow_px or not np.isfinite(depth).any():
+            return None
+        # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
+        typical_radius_px = 0.25 * self._intrinsics.width
+        translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
+        rotation = np.deg2rad(self._config.rotation_floor_deg)
+        return np.eye(4), np.repeat([rotation, translation], 3), STILL_SOURCE
+
+    def _by_essential(self, tracks: Tracks, depth: FloatArray) -> _Measured | None:
+        """Rotation and direction from the essential matrix, None where it is not well conditioned."""
+        rays_previous, rays_current = self._rays(tracks.previous), self._rays(tracks.current)
+        two_view = estimate_two_view(rays_previous, rays_current, self._intrinsics.fx, self._config.inlier_px)
+        if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
+            return None
+        parallax = parallax_px(rays_previous, rays_current, two_view.R_current_previous, self._intrinsics)
+        if np.median(parallax[two_view.inliers]) < self._config.min_parallax_px:
+            return None
+        triangulated = triangulated_depth(rays_previous, rays_current, two_view)
+        measures = two_view.inliers & (triangulated > 0) & np.isfinite(depth)
+        measures &= parallax > self._config.min_point_parallax_px
+        if measures.sum() < _MIN_RATIOS:
+            return None
+        ratios = depth[measures] / triangulated[measures]
+        length, spread = _length(ratios, self._config.inlier_px / parallax[measures])
+        T_current_previous = make(two_view.R_current_previous, length * two_view.direction)
+        sigmas = self._essential_sigmas(two_view, length, max(spread, self._config.length_floor_share))
+        return invert(T_current_previous), sigmas, ESSENTIAL_SOURCE
+
+    def _essential_sigmas(self, two_view: TwoView, length: float, length_share: float) -> FloatArray:
+        """Sigmas ``(6,)`` in the current camera, where GTSAM perturbs ``T_previous_current``."""
+        widened = _CORRELATION * np.sqrt(np.diag(two_view.covariance))
+        rotation = np.hypot(widened[:3], np.deg2rad(self._config.rotation_floor_deg))
+        floor = np.deg2rad(self._config.direction_floor_deg)
+        across = np.hypot(widened[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
+        translation = length * np.hypot(across, length_share * two_view.direction)
+        return np.concatenate([rotation, np.maximum(translation, 1e-3 * length)])
+
+    def _by_points(self, tracks: Tracks, depth: FloatArray) -> _Measured | Refusal:
+        """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
+        known = np.isfinite(depth)
+        if known.sum() < self._config.min_inliers:
+            return Refusal(f"only {int(known.sum())} corners have a trusted depth")
+        points_previous = self._rays(tracks.previous[known]) * depth[known, None]
+        pixels = tracks.current[known]
+        cv2.setRNGSeed(0)
+        found, rotation, translation, chosen = cv2.solvePnPRansac(
+            points_previous,
+            pixels,
+            self._intrinsics.K,
+            None,
+            iterationsCount=200,
+            reprojectionError=self._config.reprojection_px,
+            confidence=0.999,
+        )
+        count = 0 if not found or chosen is None else len(chosen)
+        if count < self._config.min_inliers:
+            return Refusal(f"little parallax, and only {count} corners agree with the learned depth")
+        chosen = chosen.ravel()
+        rotation, translation = cv2.solvePnPRefineLM(
+            points_previous[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
+        )
+        R_current_previous = Rotation.from_rotvec(rotation.ravel()).as_matrix()
+        sigmas = self._points_sigmas(points_previous[chosen], pixels[chosen], rotation, translation)
+        return invert(make(R_current_previous, translation.ravel())), sigmas, PNP_SOURCE
+
+    def _points_sigmas(
+        self, points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray
+    ) -> FloatArray:
+        """Sigmas ``(6,)`` from the reprojection's Jacobian, widened by the learned depth's own error."""
+        projected, jacobian = cv2.projectPoints(points, rotation, translation, self._intrinsics.K, None)
+        residual = (projected.reshape(-1, 2) - pixels).ravel()
+        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 0.1)
+        J = jacobian[:, :6]
+        own = _CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
+        length = float(np.linalg.norm(translation))
+        share = max(2.0 * self._config.length_floor_share, _LEARNED_SIGMA_SHARE)
+        floors = np.repeat([np.deg2rad(self._config.rotation_floor_deg), share * length], 3)
+        return np.asarray(np.hypot(own, floors))
+
+
+_Measured = tuple[FloatArray, FloatArray, str]
+
+
+def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
+    """Depth at the nearest pixel of each point."""
+    height, width = depth.shape
+    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
+    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
+    return np.asarray(depth[v, u].astype(np.float64))
+
+
+def _length(ratios: FloatArray, triangulation_sigma_share: FloatArray) -> tuple[float, float]:
+    """Weighted median of learned over triangulated depth, and its relative sigma.
+
+    A point weighs by the relative variance of both depths; the median withstands moving cars.
+    """
+    logarithms = np.log(ratios)
+    order = np.argsort(logarithms)
+    weights = 1.0 / (_LEARNED_SIGMA_SHARE**2 + triangulation_sigma_share**2)
+    cumulative = np.cumsum(weights[order])
+    centre = float(logarithms[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    deviation = _MAD_TO_SIGMA * float(np.median(np.abs(logarithms - centre)))
+    # learned depth errs in patches, not pixels: count one independent measurement in ten
+    return float(np.exp(centre)), _CORRELATION * deviation / float(np.sqrt(max(len(ratios) / 10.0, 1.0)))

@@ -1,0 +1,99 @@
+"""The pose network's snippets as relative-pose factors, and as the raw trajectory they chain to.
+
+Noise model. The network errs by a share of what it measures: for a pair n frames apart the rotation
+sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_sigma_share`` of the length
+plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
+nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
+their sigmas times sqrt(m) and count as one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam.config import FrontendConfig
+from slam.errors import SlamError
+from slam.frames import RelativePose, SnippetPoses
+from slam.se3 import FloatArray, invert, nearest_rotation
+
+NETWORK_SOURCE = "network"
+
+
+def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
+    """Every direct pose of every snippet as ``T_source_target``, unscaled, with its noise."""
+    multiplicity = Counter(_pair(source, s.target) for s in snippets for source in s.sources)
+    floor = max(config.translation_floor_share * _median_step(snippets), 1e-9)
+    factors = []
+    for snippet in snippets:
+        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
+            repeated = np.sqrt(multiplicity[_pair(source, snippet.target)])
+            rotation = np.deg2rad(config.rotation_sigma_deg) * np.sqrt(abs(snippet.target - source))
+            length = float(np.linalg.norm(T_source_target[:3, 3]))
+            translation = config.translation_sigma_share * length + floor
+            sigmas = repeated * np.repeat([rotation, translation], 3)
+            factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
+    return factors
+
+
+def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
+    """The raw network trajectory: target to next source of each snippet in turn, and nothing else.
+
+    Frames before the first target and after the last come from those two snippets' direct poses.
+
+    Args:
+        snippets: one per target, in time order without gaps.
+        count: frames of the sequence.
+
+    Returns:
+        ``T_world_camera`` ``(count, 4, 4)``, unscaled, the first the identity.
+
+    Raises:
+        SlamError: if the sequence is shorter than a snippet or the snippets do not cover it.
+    """
+    _check_cover(snippets, count)
+    first, last = snippets[0], snippets[-1]
+    T_first_camera = np.tile(np.eye(4), (count, 1, 1))  # in the camera of the first target until the end
+    for source, T_source_target in zip(first.sources, first.T_source_target, strict=True):
+        if source < first.target:
+            T_first_camera[source] = invert(T_source_target)
+    for snippet in snippets[:-1]:
+        T_next_target = snippet.T_source_target[snippet.sources.index(snippet.target + 1)]
+        T_next = T_first_camera[snippet.target] @ invert(T_next_target)
+        T_next[:3, :3] = nearest_rotation(T_next[:3, :3])
+        T_first_camera[snippet.target + 1] = T_next
+    for source, T_source_target in zip(last.sources, last.T_source_target, strict=True):
+        if source > last.target:
+            T_first_camera[source] = T_first_camera[last.target] @ invert(T_source_target)
+    T_world_camera: FloatArray = invert(T_first_camera[0]) @ T_first_camera
+    T_world_camera[0] = np.eye(4)
+    return T_world_camera
+
+
+def _pair(a: int, b: int) -> tuple[int, int]:
+    return min(a, b), max(a, b)
+
+
+def _median_step(snippets: Sequence[SnippetPoses]) -> float:
+    steps = [
+        float(np.linalg.norm(T_source_target[:3, 3]))
+        for snippet in snippets
+        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True)
+        if abs(source - snippet.target) == 1
+    ]
+    return float(np.median(steps)) if steps else 0.0
+
+
+def _check_cover(snippets: Sequence[SnippetPoses], count: int) -> None:
+    if not snippets:
+        raise SlamError(f"a sequence of {count} frames is shorter than one snippet of the pose network")
+    targets = [snippet.target for snippet in snippets]
+    first, last = snippets[0], snippets[-1]
+    if targets != list(range(targets[0], targets[-1] + 1)):
+        raise SlamError("the raw trajectory needs one snippet per target, in time order without gaps")
+    if not set(range(first.target)) <= set(first.sources):
+        raise SlamError(f"the first snippet (target {first.target}) does not reach back to frame 0")
+    if not set(range(last.target + 1, count)) <= set(last.sources) or max(last.sources) >= count:
+        raise SlamError(f"the last snippet (target {last.target}) does not end at frame {count - 1}")

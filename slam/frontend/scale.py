@@ -1,0 +1,206 @@
+"""Metric scale of monocular depth, by a named mode: the road below the camera, LiDAR, or a reference.
+
+The camera-height mode fits the road plane in the learned depth of every frame. With the plane
+``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
+ray, and the ray is free of noise, so the fit is not biased by the depth's errors as a fit of points is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import ScaleConfig, ScaleMode
+from slam.frames import DepthMap, Intrinsics, RelativePose
+from slam.frontend.refusal import Refusal
+from slam.se3 import FloatArray
+
+_POINTS = 1500
+_HYPOTHESES = 150
+_REWEIGHTINGS = 8
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class RoadPlane:
+    """The road under one camera: distance, unit normal ``(3,)`` down to it, share of inliers in [0, 1]."""
+
+    height_unscaled: float
+    normal: FloatArray
+    inlier_share: float
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """``value`` times an unscaled length is a length in the mode's unit.
+
+    ``spread`` is the relative sigma of the single frames' values.
+    """
+
+    value: float
+    spread: float
+    frames_used: int
+
+
+def resolve_mode(config: ScaleConfig, camera_height_m: float | None) -> ScaleMode:
+    """The mode that ``auto`` stands for: camera-height where the height is known, else none."""
+    if config.mode != "auto":
+        return config.mode
+    return "none" if camera_height_m is None else "camera-height"
+
+
+def fit_road(depth_unscaled: DepthMap, intrinsics: Intrinsics, config: ScaleConfig) -> RoadPlane | Refusal:
+    """Fit the road in a trapezoid before the car, by RANSAC and reweighted least squares on inverse depth.
+
+    Args:
+        depth_unscaled: learned z-depth ``(H, W)`` at the size of ``intrinsics``.
+        intrinsics: the camera, pixels.
+        config: trapezoid, tolerances and the largest tilt.
+    """
+    rows, columns = _trapezoid(intrinsics, config)
+    inverse_depth = 1.0 / np.maximum(depth_unscaled[rows, columns].astype(np.float64), 1e-9)
+    usable = np.isfinite(inverse_depth) & (inverse_depth < 1e8)
+    if usable.sum() < 50:
+        return Refusal("the depth before the car is not usable")
+    rays = _rays(intrinsics, columns, rows)[usable]  # (P, 3)
+    inverse_depth = inverse_depth[usable]
+    scaled_normal = _ransac(rays, inverse_depth, config)
+    if scaled_normal is None:
+        return Refusal(f"no plane within {config.max_tilt_deg:g} deg of level before the car")
+    scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, config.inlier_share_of_depth)
+    height = 1.0 / float(np.linalg.norm(scaled_normal))
+    normal = scaled_normal * height
+    inlier_share = float(_inliers(rays, inverse_depth, scaled_normal[None], config)[0].mean())
+    if normal[1] < np.cos(np.deg2rad(config.max_tilt_deg)):
+        return Refusal(f"the plane before the car is tilted by more than {config.max_tilt_deg:g} deg")
+    if inlier_share < config.min_inlier_share:
+        return Refusal(f"only {inlier_share:.0%} of the pixels before the car lie on one plane")
+    return RoadPlane(height, normal, inlier_share)
+
+
+def scale_from_road(
+    roads: Sequence[RoadPlane | Refusal], camera_height_m: float | None, config: ScaleConfig
+) -> ScaleEstimate | Refusal:
+    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
+    height = 1.0 if camera_height_m is None else camera_height_m
+    ratios = [height / road.height_unscaled for road in roads if isinstance(road, RoadPlane)]
+    return estimate_scale(np.array(ratios), config)
+
+
+def lidar_ratio(depth_unscaled: DepthMap, points_uvz: FloatArray) -> float | None:
+    """Median ratio of LiDAR depth to learned depth in one image.
+
+    Args:
+        depth_unscaled: learned z-depth ``(H, W)``.
+        points_uvz: LiDAR points in the image ``(P, 3)``: u and v in pixels, z-depth in metres.
+    """
+    height, width = depth_unscaled.shape
+    u, v = np.rint(points_uvz[:, :2]).astype(int).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points_uvz[:, 2] > 0)
+    learned = depth_unscaled[v[inside], u[inside]].astype(np.float64)
+    ratios = points_uvz[inside, 2][learned > 0] / learned[learned > 0]
+    return float(np.median(ratios)) if len(ratios) >= 20 else None
+
+
+def scale_from_reference(
+    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray, config: ScaleConfig
+) -> ScaleEstimate | Refusal:
+    """True path length over estimated path length of the first ``reference_frames`` frames."""
+    estimated, true = (
+        np.linalg.norm(np.diff(T[: config.reference_frames, :3, 3], axis=0), axis=1)
+        for T in (T_world_camera_unscaled, T_world_camera_true)
+    )
+    if estimated.sum() <= 0 or true.sum() <= 0:
+        return Refusal(f"the camera does not move within the first {config.reference_frames} frames")
+    value = float(true.sum() / estimated.sum())
+    moving = estimated > 0.1 * estimated.mean()
+    spread = float(np.std(true[moving] / estimated[moving] / value))
+    return ScaleEstimate(value, spread, len(estimated) + 1)
+
+
+def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | Refusal:
+    """One scale from a ratio per frame ``(K,)``: their median, frames many MADs away left out."""
+    ratios = np.asarray(ratios, dtype=np.float64)
+    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
+    if len(ratios) < config.min_frames:
+        return Refusal(f"only {len(ratios)} frames measure the scale, {config.min_frames} are needed")
+    logarithms = np.log(ratios)
+    deviations = np.abs(logarithms - np.median(logarithms))
+    kept = logarithms[deviations <= config.rejection_mads * _MAD_TO_SIGMA * np.median(deviations) + 1e-12]
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(kept - np.median(kept))))
+    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
+
+
+def rescaled(relative_pose: RelativePose, scale: float) -> RelativePose:
+    """A measurement in other units: translation and its sigmas times ``scale``."""
+    T_from_to = relative_pose.T_from_to.copy()
+    T_from_to[:3, 3] *= scale
+    sigmas = relative_pose.sigmas * np.repeat([1.0, scale], 3)
+    return replace(relative_pose, T_from_to=T_from_to, sigmas=sigmas)
+
+
+def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns ``(P,)`` of about ``_POINTS`` pixels; the horizon is taken at cy (a level camera)."""
+    horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
+    shares = (config.road_top_share, config.road_bottom_share)
+    top_row, bottom_row = (horizon + share * (bottom - horizon) for share in shares)
+    area = intrinsics.width * (bottom_row - top_row) * (config.road_top_width + config.road_bottom_width) / 2
+    step = max(1.0, float(np.sqrt(max(area, 1.0) / _POINTS)))
+    rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
+    rows, columns = [], []
+    for row in rows_seen:
+        share = (row - top_row) / (bottom_row - top_row)
+        width = config.road_top_width + share * (config.road_bottom_width - config.road_top_width)
+        half = width * intrinsics.width / 2
+        across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
+        across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
+        columns.append(across)
+        rows.append(np.full(len(across), row))
+    empty = [np.empty(0, dtype=np.int64)]
+    return np.concatenate(rows or empty), np.concatenate(columns or empty)
+
+
+def _rays(intrinsics: Intrinsics, u: NDArray[np.int64], v: NDArray[np.int64]) -> FloatArray:
+    x = (u - intrinsics.cx) / intrinsics.fx
+    y = (v - intrinsics.cy) / intrinsics.fy
+    return np.stack([x, y, np.ones_like(x)], axis=1)
+
+
+def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig) -> FloatArray | None:
+    """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
+    rng = np.random.default_rng(0)
+    samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
+    minimal = rays[samples]  # (S, 3, 3)
+    solvable = np.abs(np.linalg.det(minimal)) > 1e-6
+    if not solvable.any():
+        return None
+    planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[..., 0]  # (S, 3)
+    level = planes[:, 1] > np.cos(np.deg2rad(config.max_tilt_deg)) * np.linalg.norm(planes, axis=1)
+    if not level.any():
+        return None
+    planes = planes[level]
+    votes = _inliers(rays, inverse_depth, planes, config).sum(axis=1)
+    best: FloatArray = planes[votes.argmax()]
+    return best
+
+
+def _inliers(
+    rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray, config: ScaleConfig
+) -> NDArray[np.bool_]:
+    """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
+    predicted = planes @ rays.T
+    relative = np.abs(predicted / inverse_depth - 1.0)
+    return np.asarray(relative < config.inlier_share_of_depth)
+
+
+def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray, sigma: float) -> FloatArray:
+    """Refine ``n / h`` by least squares with Cauchy weights on the relative error of inverse depth."""
+    for _ in range(_REWEIGHTINGS):
+        predicted = np.maximum(rays @ plane, 1e-9)
+        residual = inverse_depth / predicted - 1.0
+        weights = 1.0 / (predicted * np.sqrt(1.0 + (residual / (0.5 * sigma)) ** 2))
+        plane = np.linalg.lstsq(rays * weights[:, None], inverse_depth * weights, rcond=None)[0]
+    return plane

@@ -1,0 +1,82 @@
+"""A range of a sequence's frames, as a sequence of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from slam.errors import SequenceError
+from slam.frames import Frame, Sequence
+from slam.sequences.recording import Source, labels, rebased, require_frame
+
+
+class SourcedSequence(Sequence, Protocol):
+    """A sequence that knows the recordings it was cut from."""
+
+    sources: tuple[Source, ...]
+
+
+class Excerpt:
+    """Frames [start, stop) of a sequence, numbered from 0; stamps stay, poses begin at the identity."""
+
+    def __init__(self, base: SourcedSequence, start: int, stop: int) -> None:
+        """Cut a sequence.
+
+        Raises:
+            SequenceError: unless 0 <= start < stop <= len(base).
+        """
+        if not 0 <= start < stop <= len(base):
+            raise SequenceError(f"no frames {start}:{stop} in sequence {base.name}: it has {len(base)}")
+        self.base, self.start, self.stop = base, start, stop
+        self.name = base.name
+        self.intrinsics = base.intrinsics
+        self.stamps = base.stamps[start:stop]
+        self.reference = None if base.reference is None else rebased(base.reference[start:stop])
+        self.camera_height_m = base.camera_height_m
+        self.T_camera_lidar = base.T_camera_lidar
+        self.sources = tuple(source.shifted(start) for source in base.sources)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.stop - self.start
+
+    def frame(self, index: int) -> Frame:
+        """Read one frame; ``SequenceError`` where its image cannot be read."""
+        require_frame(f"{self.name}[{self.start}:{self.stop}]", index, len(self))
+        frame = self.base.frame(self.start + index)
+        return Frame(index, frame.stamp, frame.image)
+
+    def scan_path(self, index: int) -> Path | None:
+        """The Velodyne ``.bin`` file taken with a frame, or None."""
+        return self.base.scan_path(self.start + index)
+
+    def provenance(self) -> tuple[str, ...]:
+        """Names of what this is, as the leak record of a checkpoint writes them."""
+        return labels(self.sources, len(self))
+
+
+def frame_range(text: str, frames: int) -> tuple[int, int]:
+    """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
+
+    Unlike Python it does not cut what lies beyond the end: that is a mistake worth hearing about.
+
+    Raises:
+        SequenceError: if the text is no range, or the range is empty or reaches outside the sequence.
+    """
+    parts = text.strip().split(":")
+    try:
+        if len(parts) != 2:
+            raise ValueError
+        start = int(parts[0]) if parts[0].strip() else 0
+        stop = int(parts[1]) if parts[1].strip() else frames
+    except ValueError:
+        raise SequenceError(f"--frames {text!r} is not a range: write A:B, such as 0:300 or 100:") from None
+    first = start + frames if start < 0 else start
+    last = stop + frames if stop < 0 else stop
+    if not (0 <= first < frames and 0 <= last <= frames):
+        raise SequenceError(
+            f"--frames {text} reaches outside the sequence: it has {frames} frames; choose within 0:{frames}"
+        )
+    if first >= last:
+        raise SequenceError(f"--frames {text} holds no frames: A must come before B in A:B")
+    return first, last

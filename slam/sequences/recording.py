@@ -1,0 +1,151 @@
+"""A recording on disk: images from a file source and what lies beside them, as a ``Sequence``.
+
+Every kind of data set is opened by a function that returns a ``Recording``; only where the images
+come from (``ImageSource``) differs.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from slam import se3
+from slam.errors import SequenceError
+from slam.frames import Frame, Image, Intrinsics
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_FPS = 10.0
+KITTI_CAMERA_HEIGHT_M = 1.65
+
+
+class ImageSource(Protocol):
+    """Images of one size, read one at a time."""
+
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        """Number of images."""
+        ...
+
+    def read(self, index: int) -> Image:
+        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` where it cannot be read."""
+        ...
+
+
+@dataclass(frozen=True)
+class Source:
+    """A name in the leak record and where a sequence begins in it.
+
+    ``first`` is the number that frame 0 has in the named recording (negative where the sequence begins
+    earlier), or None for a source that is used as a whole, such as a simulated world. ``length`` is the
+    number of frames of the named recording where known.
+    """
+
+    name: str
+    first: int | None = 0
+    length: int | None = None
+
+    def shifted(self, start: int) -> Source:
+        """The source of a sequence that begins ``start`` frames later."""
+        return self if self.first is None else Source(self.name, self.first + start, self.length)
+
+    def label(self, frames: int) -> str | None:
+        """``name[a:b]`` for so many frames, or None where none of them is in the named recording."""
+        if self.first is None:
+            return self.name
+        start = max(self.first, 0)
+        stop = self.first + frames if self.length is None else min(self.first + frames, self.length)
+        return f"{self.name}[{start}:{stop}]" if start < stop else None
+
+
+def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
+    """The leak record's names for so many frames of a sequence."""
+    found = (source.label(frames) for source in sources)
+    return tuple(label for label in found if label is not None)
+
+
+@dataclass(eq=False)
+class Recording:
+    """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``."""
+
+    name: str
+    images: ImageSource
+    intrinsics: Intrinsics
+    stamps: FloatArray
+    sources: tuple[Source, ...]
+    reference: FloatArray | None = None
+    camera_height_m: float | None = None
+    T_camera_lidar: FloatArray | None = None
+    scans: dict[int, Path] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.images)
+
+    def frame(self, index: int) -> Frame:
+        """Read one frame; ``SequenceError`` where its image cannot be read."""
+        require_frame(self.name, index, len(self))
+        return Frame(index, float(self.stamps[index]), self.images.read(index))
+
+    def scan_path(self, index: int) -> Path | None:
+        """The Velodyne ``.bin`` file taken with a frame, or None."""
+        return self.scans.get(index)
+
+    def provenance(self) -> tuple[str, ...]:
+        """Names of what this is, as the leak record of a checkpoint writes them."""
+        return labels(self.sources, len(self))
+
+
+def require_frame(name: str, index: int, frames: int) -> None:
+    """Refuse a frame number outside a sequence.
+
+    Raises:
+        SequenceError: if ``index`` is not in [0, frames).
+    """
+    if not 0 <= index < frames:
+        raise SequenceError(f"no frame {index} in sequence {name}: it has frames 0 to {frames - 1}")
+
+
+def rebased(T_any_camera: FloatArray) -> FloatArray:
+    """Poses ``T_world_camera`` ``(N, 4, 4)`` whose world is the first camera; the first is the identity."""
+    T_any_first = T_any_camera[0].copy()
+    T_any_first[:3, :3] = se3.nearest_rotation(T_any_first[:3, :3])
+    T_world_camera: FloatArray = se3.invert(T_any_first) @ T_any_camera
+    T_world_camera[0] = np.eye(4)
+    return T_world_camera
+
+
+def uniform_stamps(frames: int, fps: float) -> FloatArray:
+    """Seconds from the first frame at a steady rate ``(frames,)``."""
+    return np.arange(frames, dtype=np.float64) / fps
+
+
+def fallback_stamps(path: Path, frames: int) -> FloatArray:
+    """Uniform stamps in place of a missing file of stamps, with a warning."""
+    logger.warning("no %s: the frames are taken to be %g a second", path, DEFAULT_FPS)
+    return uniform_stamps(frames, DEFAULT_FPS)
+
+
+def require_stamps(stamps: FloatArray, path: Path, frames: int) -> FloatArray:
+    """Stamps ``(frames,)`` in seconds read from a file, checked against the images.
+
+    Raises:
+        SequenceError: if there is not one finite stamp an image, or they do not increase.
+    """
+    if len(stamps) != frames:
+        raise SequenceError(
+            f"{path} has {len(stamps)} rows for {frames} images: it needs one stamp an image; "
+            f"restore the missing images or cut the file to match"
+        )
+    if not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
+        row = int(np.argmin(np.r_[True, np.diff(stamps) > 0] & np.isfinite(stamps))) + 1
+        raise SequenceError(f"{path} row {row}: stamps must be numbers that increase; correct the row")
+    return stamps

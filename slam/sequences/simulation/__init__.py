@@ -1,0 +1,1 @@
+"""The parts of the simulated street world: pure NumPy, no ray casting."""

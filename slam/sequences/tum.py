@@ -1,0 +1,90 @@
+"""TUM RGB-D folders: ``rgb.txt`` and, where known, ``groundtruth.txt`` (Sturm et al. 2012)."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from slam import se3
+from slam.errors import SequenceError
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import CameraFile
+from slam.sequences.images import ImageFiles
+from slam.sequences.recording import Recording, Source, rebased, require_stamps
+from slam.sequences.undistortion import calibrated
+from slam.trajectory import read_trajectory
+
+logger = logging.getLogger(__name__)
+
+INDEX_FILE = "rgb.txt"
+_MAX_GAP_S = 0.1
+
+
+def open_tum(folder: Path, camera: CameraFile) -> Recording:
+    """Open a TUM folder; poses between two of the ground truth are interpolated.
+
+    Raises:
+        SequenceError: if ``rgb.txt`` is malformed or names images that are missing.
+    """
+    stamps, paths = _read_index(folder / INDEX_FILE)
+    images, intrinsics = calibrated(ImageFiles(paths), camera, str(folder))
+    name = folder.absolute().name
+    return Recording(
+        name=name,
+        images=images,
+        intrinsics=intrinsics,
+        stamps=require_stamps(stamps, folder / INDEX_FILE, len(paths)),
+        sources=(Source(f"tum/{name}"),),
+        reference=_reference(folder / "groundtruth.txt", stamps),
+        camera_height_m=camera.height_or(None),
+    )
+
+
+def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
+    """Stamps and image paths of ``rgb.txt``."""
+    stamps, paths = [], []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp, name = words
+            stamps.append(float(stamp))
+        except ValueError:
+            raise SequenceError(f"{path} line {number} is not 'stamp file': {line!r}; correct it") from None
+        paths.append(path.parent / name)
+    if not paths:
+        raise SequenceError(f"{path} names no images: it needs rows of 'stamp file'")
+    missing = next((p for p in paths if not p.is_file()), None)
+    if missing is not None:
+        raise SequenceError(f"no image {missing}, which {path} names: restore it or remove the row")
+    return np.array(stamps), paths
+
+
+def _reference(path: Path, stamps: FloatArray) -> FloatArray | None:
+    """``T_world_camera`` at the images' stamps, or None where the ground truth does not cover them."""
+    if not path.is_file():
+        return None
+    truth = read_trajectory(path, format="tum")
+    known, T_any_camera = truth.stamps, truth.T_world_camera
+    if known is None or len(known) < 2:
+        return None
+    before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
+    gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
+    if (gap > _MAX_GAP_S).any():
+        bad = int(np.argmax(gap > _MAX_GAP_S))
+        logger.warning(
+            "%s has no pose within %g s of image %d (stamp %.6f): the sequence has no reference",
+            path,
+            _MAX_GAP_S,
+            bad,
+            stamps[bad],
+        )
+        return None
+    times = np.clip(stamps, known[0], known[-1])
+    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
+    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
+    return rebased(se3.make(R, t))

@@ -1,0 +1,123 @@
+"""Images of a lens made into images of a pinhole, once and for all while they are read."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SequenceError
+from slam.frames import Image, Intrinsics
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import CameraFile, scaled_hint
+from slam.sequences.recording import ImageSource
+
+_ZOOM_STEP = 1.02
+_ZOOM_LIMITS = (0.2, 8.0)
+
+
+class Undistortion:
+    """The pinhole camera inside a distorting one: same image size, no black borders.
+
+    The new camera keeps the principal point and the ratio fx : fy; its focal length is the shortest one
+    whose whole image lies inside the distorted image (OpenCV's ``alpha = 0``, but exact at the border
+    and the same for both lens models).
+    """
+
+    def __init__(self, camera: CameraFile) -> None:
+        """Build the look-up maps.
+
+        Raises:
+            SequenceError: if the coefficients fold the image over itself.
+        """
+        self._K = camera.intrinsics.K
+        self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
+        self._is_fisheye = camera.model == "fisheye"
+        zoom = self._shortest_zoom(camera.width, camera.height)
+        self.intrinsics = Intrinsics(
+            camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
+        )
+        build = cv2.fisheye.initUndistortRectifyMap if self._is_fisheye else cv2.initUndistortRectifyMap
+        size = (camera.width, camera.height)
+        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] = build(
+            self._K, self._coefficients, np.eye(3), self.intrinsics.K, size, cv2.CV_32FC1
+        )
+
+    def apply(self, image: Image) -> Image:
+        """Undistort an image ``(H, W, 3)``."""
+        flat: Image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return flat
+
+    def distort(self, pixels: FloatArray, K: FloatArray) -> FloatArray:
+        """Where the lens sees the points that a pinhole ``K`` ``(3, 3)`` sees at ``pixels`` ``(N, 2)``."""
+        rays = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+        if self._is_fisheye:
+            distorted = cv2.fisheye.distortPoints(rays[:, None], self._K, self._coefficients)
+        else:
+            points = np.column_stack([rays, np.ones(len(rays))])
+            distorted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._K, self._coefficients)
+        seen: FloatArray = np.asarray(distorted, dtype=np.float64).reshape(-1, 2)
+        return seen
+
+    def _shortest_zoom(self, width: int, height: int) -> float:
+        """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""
+        border = _border(width, height)
+        corner = np.array([width - 1.0, height - 1.0])
+        zoom, radius = _ZOOM_LIMITS[1], np.zeros(len(border))
+        fits = False
+        while zoom > _ZOOM_LIMITS[0]:
+            K = self._K.copy()
+            K[[0, 1], [0, 1]] *= zoom
+            seen = self.distort(border, K)
+            further = np.linalg.norm(seen - K[:2, 2], axis=1)
+            if (further < radius).any() or not ((seen >= 0) & (seen <= corner)).all():
+                break
+            zoom, radius, fits = zoom / _ZOOM_STEP, further, True
+        if not fits:
+            raise SequenceError(
+                f"distortion {self._coefficients.tolist()} leaves no image free of black borders: "
+                f"check the coefficients and the model in the camera file"
+            )
+        return zoom * _ZOOM_STEP
+
+
+class UndistortedImages:
+    """An image source seen through an ``Undistortion``."""
+
+    def __init__(self, images: ImageSource, undistortion: Undistortion) -> None:
+        self._images = images
+        self._undistortion = undistortion
+        self.width, self.height = images.width, images.height
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self._images)
+
+    def read(self, index: int) -> Image:
+        """One undistorted image ``(height, width, 3)`` uint8 RGB."""
+        return self._undistortion.apply(self._images.read(index))
+
+
+def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[ImageSource, Intrinsics]:
+    """Images as a pinhole would take them, and that pinhole.
+
+    Raises:
+        SequenceError: if the images have another size than the camera.
+    """
+    if (images.width, images.height) != (camera.width, camera.height):
+        raise SequenceError(
+            f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
+            f"{camera.width}x{camera.height}: resize the images, or if they were only resized, scale the "
+            f"file to {{{scaled_hint(camera.intrinsics, images.width, images.height)}}}"
+        )
+    if not camera.is_distorted:
+        return images, camera.intrinsics
+    undistortion = Undistortion(camera)
+    return UndistortedImages(images, undistortion), undistortion.intrinsics
+
+
+def _border(width: int, height: int) -> FloatArray:
+    """The pixels ``(N, 2)`` of an image's outermost rows and columns."""
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
+    return np.column_stack([u[edge], v[edge]])

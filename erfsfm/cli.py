@@ -33,7 +33,9 @@ Fidelity = Annotated[str, typer.Option(help="default, or paper: the reference pr
 @app.command()
 def train(
     config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
-    dataset: Annotated[list[Path] | None, typer.Option(help="KITTI odometry root, image folder or video; repeat")] = None,
+    dataset: Annotated[
+        list[Path] | None, typer.Option(help="KITTI odometry root, image folder or video; repeat")
+    ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint in OUTPUT")] = False,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from erfsfm.errors import ConfigError
 
@@ -23,16 +23,16 @@ class Section(BaseModel):
 class NetworkConfig(Section):
     """Which networks, how wide, how faithful."""
 
-    depth: str = Field("depthnet", description="preset of the depth network")
-    pose: str = Field("posenet", description="preset of the pose network")
-    fidelity: Fidelity = Field("default", description="'paper' keeps every quirk of the reference code")
-    depth_width: float = Field(1.0, gt=0, le=4, description="multiplies the depth network's channels")
-    pose_width: float = Field(1.0, gt=0, le=4, description="multiplies the pose network's channels")
-    normalisation: Literal["none", "batch"] = Field("none", description="layer after each convolution")
-    sources: Literal[2, 4] = Field(4, description="frames around the target: snippets have one more")
-    masks: bool = Field(False, description="explainability masks, the pose network's second head")
-    height: int = Field(128, ge=32, description="network input, pixels")
-    width: int = Field(416, ge=32, description="network input, pixels")
+    depth: str = Field(default="depthnet", description="preset of the depth network")
+    pose: str = Field(default="posenet", description="preset of the pose network")
+    fidelity: Fidelity = Field(default="default", description="'paper' keeps every quirk of the reference code")
+    depth_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the depth network's channels")
+    pose_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the pose network's channels")
+    normalisation: Literal["none", "batch"] = Field(default="none", description="layer after each convolution")
+    sources: Literal[2, 4] = Field(default=4, description="frames around the target: snippets have one more")
+    masks: bool = Field(default=False, description="explainability masks, the pose network's second head")
+    height: int = Field(default=128, ge=32, description="network input, pixels")
+    width: int = Field(default=416, ge=32, description="network input, pixels")
 
 
 class DataConfig(Section):
@@ -54,42 +54,42 @@ class DataConfig(Section):
         description="share of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "
         "empty: by number of frames",
     )
-    validation_snippets: int = Field(60, ge=1, description="snippets looked at in each validation")
-    flip: float = Field(0.5, ge=0, le=1, description="probability of a mirrored snippet")
-    zoom: float = Field(1.15, ge=1, le=2, description="largest scale-crop of a snippet, per axis")
-    colour_jitter: float = Field(0.0, ge=0, le=0.5, description="largest change of brightness, contrast, gamma")
-    cache_mb: int = Field(4000, ge=0, description="memory for decoded images")
-    workers: int = Field(1, ge=0, description="processes that prepare samples")
+    validation_snippets: int = Field(default=60, ge=1, description="snippets looked at in each validation")
+    flip: float = Field(default=0.5, ge=0, le=1, description="probability of a mirrored snippet")
+    zoom: float = Field(default=1.15, ge=1, le=2, description="largest scale-crop of a snippet, per axis")
+    colour_jitter: float = Field(default=0.0, ge=0, le=0.5, description="largest change of brightness, contrast, gamma")
+    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images")
+    workers: int = Field(default=1, ge=0, description="processes that prepare samples")
 
 
 class LossConfig(Section):
     """The objective: which terms, with which weights. The defaults are the paper's."""
 
-    ssim_weight: float = Field(0.0, ge=0, le=1, description="share of structural dissimilarity; 0 is L1")
+    ssim_weight: float = Field(default=0.0, ge=0, le=1, description="share of structural dissimilarity; 0 is L1")
     reduction: Literal["mean", "minimum"] = Field(
-        "mean", description="over sources: 'minimum' forgives occlusion (Godard et al. 2019)"
+        default="mean", description="over sources: 'minimum' forgives occlusion (Godard et al. 2019)"
     )
-    auto_mask: bool = Field(False, description="ignore pixels that a still camera explains better")
-    scales: int = Field(4, ge=1, le=4, description="pyramid levels of the photometric error")
+    auto_mask: bool = Field(default=False, description="ignore pixels that a still camera explains better")
+    scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
     smoothness: Literal["depth-second-order", "disparity-second-order", "disparity-edge-aware"] = Field(
-        "depth-second-order", description="what is kept smooth, and how"
+        default="depth-second-order", description="what is kept smooth, and how"
     )
-    smoothness_weight: float = Field(0.2, ge=0)
-    mask_weight: float = Field(0.0, ge=0, description="explainability regularisation; needs network.masks")
-    consistency_weight: float = Field(0.0, ge=0, description="depth agreement of adjacent frames")
+    smoothness_weight: float = Field(default=0.2, ge=0)
+    mask_weight: float = Field(default=0.0, ge=0, description="explainability regularisation; needs network.masks")
+    consistency_weight: float = Field(default=0.0, ge=0, description="depth agreement of adjacent frames")
 
 
 class TrainingConfig(Section):
     """The optimiser and the loop."""
 
-    steps: int = Field(200_000, ge=1)
-    batch: int = Field(4, ge=1)
-    learning_rate: float = Field(2e-4, gt=0)
-    schedule: Literal["constant", "cosine"] = Field("constant", description="of the learning rate")
-    gradient_clip: float = Field(0.0, ge=0, description="largest gradient norm; 0: not clipped")
-    validate_every: int = Field(1000, ge=1, description="steps")
-    checkpoint_every: int = Field(500, ge=1, description="steps")
-    log_every: int = Field(50, ge=1, description="steps")
+    steps: int = Field(default=200_000, ge=1)
+    batch: int = Field(default=4, ge=1)
+    learning_rate: float = Field(default=2e-4, gt=0)
+    schedule: Literal["constant", "cosine"] = Field(default="constant", description="of the learning rate")
+    gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: not clipped")
+    validate_every: int = Field(default=1000, ge=1, description="steps")
+    checkpoint_every: int = Field(default=500, ge=1, description="steps")
+    log_every: int = Field(default=50, ge=1, description="steps")
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     seed: int = 0
 
@@ -101,7 +101,13 @@ class ExperimentConfig(Section):
     data: DataConfig = Field(default_factory=DataConfig)
     loss: LossConfig = Field(default_factory=LossConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
-    initial_weights: str | None = Field(None, description="weights to start from; architecture must match")
+    initial_weights: str | None = Field(default=None, description="weights to start from; architecture must match")
+
+    @model_validator(mode="after")
+    def _masks_exist(self) -> Self:
+        if self.loss.mask_weight > 0 and not self.network.masks:
+            raise ValueError("loss.mask_weight needs network.masks: true")
+        return self
 
 
 def config_folders() -> list[Path]:
@@ -167,7 +173,10 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
         node = node.setdefault(section, {})
         if not isinstance(node, dict):
             raise ConfigError(f"--set {override}: '{section}' is not a section")
-    node[leaf] = yaml.safe_load(text)
+    try:
+        node[leaf] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {override}: '{text}' is not a YAML value") from error
 
 
 def _explain(error: ValidationError, origin: str) -> str:
@@ -175,6 +184,8 @@ def _explain(error: ValidationError, origin: str) -> str:
     first = error.errors()[0]
     location = [str(part) for part in first["loc"]]
     where = ".".join(location)
+    if not location:
+        return f"{origin}: {first['msg'].removeprefix('Value error, ')}"
     if first["type"] == "extra_forbidden":
         model: Any = ExperimentConfig
         for part in location[:-1]:

@@ -1,3 +1,18 @@
 """Monocular SLAM on learned depth and ego-motion: from frames to trajectory and map."""
 
+from __future__ import annotations
+
+from typing import Any
+
 DISTRIBUTION = "erfsfm-slam"
+
+__all__ = ["run_slam"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the system when it is asked for: ``import slam`` alone stays light."""
+    if name == "run_slam":
+        from slam.run import run_slam
+
+        return run_slam
+    raise AttributeError(f"module 'slam' has no attribute '{name}'")

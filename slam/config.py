@@ -49,9 +49,9 @@ class GeometryConfig(Section):
     corner_quality: float = Field(
         default=0.003, gt=0, lt=1, description="share of the best corner's strength"
     )
-    corner_spacing_px: float = Field(default=9.0, ge=1, description="least distance between corners")
-    window_px: int = Field(default=15, ge=5, le=63, description="side of the tracking window")
-    pyramid_levels: int = Field(default=3, ge=0, le=8, description="levels above the full image")
+    corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners")
+    window_px: int = Field(default=11, ge=5, le=63, description="side of the tracking window")
+    pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(
@@ -87,6 +87,9 @@ class ScaleConfig(Section):
     min_frames: int = Field(default=5, ge=1, description="fewer usable frames refuse a scale")
     rejection_mads: float = Field(
         default=3.0, gt=0, description="frames farther from the median are left out"
+    )
+    smoothing_frames: int = Field(
+        default=41, ge=1, description="window in which the scale may differ from the drive's"
     )
     road_top_share: float = Field(
         default=0.35,
@@ -139,7 +142,9 @@ class MappingConfig(Section):
     """TSDF fusion, see ``mapping.py``; metres, or camera heights under scale mode none."""
 
     enabled: bool = Field(default=True, description="fuse a map")
-    frame_stride: int = Field(default=1, ge=1, description="fuse every n-th frame")
+    frame_stride: int = Field(default=1, ge=1, description="offer every n-th frame to the map")
+    keyframe_distance_m: float = Field(default=0.3, ge=0, description="fuse after moving this far")
+    keyframe_rotation_deg: float = Field(default=3.0, ge=0, description="or after turning this far")
     width_px: int = Field(default=416, ge=32, description="depth maps are thinned to about this width")
     voxel_size_m: float = Field(default=0.2, gt=0, description="side of a voxel")
     truncation_voxels: float = Field(

@@ -65,9 +65,10 @@ def chain(T_previous_next: FloatArray) -> FloatArray:
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
-    """The rotation ``(3, 3)`` closest to M in the Frobenius norm (orthogonal Procrustes by SVD)."""
+    """The rotations ``(..., 3, 3)`` closest to M in the Frobenius norm (orthogonal Procrustes by SVD)."""
     U, _, Vt = np.linalg.svd(M)
-    R: FloatArray = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    R: FloatArray = U @ Vt
     return R
 
 

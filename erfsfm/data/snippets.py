@@ -167,7 +167,9 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             whole = span is None or (span.start, span.stop) == (0, EVERYTHING)
             training.append(recording if whole or span is None else recording.part(span.start, span.stop))
     if not training:
-        raise DataError(f"every recording found is excluded or for validation (data.exclude: {', '.join(config.exclude)})")
+        raise DataError(
+            f"every recording found is excluded or for validation (data.exclude: {', '.join(config.exclude)})"
+        )
     return training, validation
 
 

@@ -7,14 +7,13 @@ Pixel (0, 0) is the centre of the top-left pixel, so a resize by s moves the pri
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Fidelity = Literal["default", "paper"]
+from erfsfm.config import Fidelity
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the image resized to ``width x height``."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
-            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
-        )
+        return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of the window whose top-left pixel is ``(left, top)``."""

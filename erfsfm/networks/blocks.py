@@ -44,9 +44,7 @@ class ConvBlock(nn.Sequential):
         if layer.deformable:
             convolution = DeformableConv2d(in_channels, out_channels, layer.kernel, layer.stride, padding)
         else:
-            convolution = nn.Conv2d(
-                in_channels, out_channels, layer.kernel, layer.stride, padding, layer.dilation
-            )
+            convolution = nn.Conv2d(in_channels, out_channels, layer.kernel, layer.stride, padding, layer.dilation)
         super().__init__(convolution, *_activation(out_channels, normalisation))
         self.layer = layer
 

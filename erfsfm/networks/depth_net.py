@@ -66,8 +66,7 @@ class DepthNet(nn.Module):
         skips = [*reversed(encoder[:-1]), 0]  # level 7 to level 1; the image itself is not a skip
         coarser = [int(level >= len(decoder) - _SCALES + 1) for level in range(len(decoder))]
         self.upconvs = nn.ModuleList(
-            UpBlock(inside, outside, 3, normalisation)
-            for inside, outside in zip([encoder[-1], *decoder], decoder)
+            UpBlock(inside, outside, 3, normalisation) for inside, outside in zip([encoder[-1], *decoder], decoder)
         )
         self.iconvs = nn.ModuleList(
             ConvBlock(up + skip + disparity, up, Layer(3, 1), fidelity, normalisation)

@@ -144,12 +144,9 @@ class MaskDecoder(nn.Module):
         super().__init__()
         channels = [scaled(count, width) for count in _MASK_CHANNELS]
         self.upconvs = nn.ModuleList(
-            UpBlock(inside, outside, 4, normalisation)
-            for inside, outside in zip([in_channels, *channels], channels)
+            UpBlock(inside, outside, 4, normalisation) for inside, outside in zip([in_channels, *channels], channels)
         )
-        self.heads = nn.ModuleList(
-            nn.Conv2d(count, sources, 3, padding=1) for count in channels[-_MASK_SCALES:]
-        )
+        self.heads = nn.ModuleList(nn.Conv2d(count, sources, 3, padding=1) for count in channels[-_MASK_SCALES:])
 
     def forward(self, features: Tensor, references: list[Tensor]) -> list[Tensor]:
         """Decode the masks, finest first; `references` give the sizes to crop to, coarsest first."""

@@ -50,7 +50,9 @@ def to_network_range(image: Tensor) -> Tensor:
     return image * 2 - 1
 
 
-def evaluate_objective(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
+def evaluate_objective(
+    depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
+) -> Outcome:
     """Predict depth and poses of a batch and say how badly they explain it."""
     count = batch.sources.shape[1]
     source_inputs = [to_network_range(batch.sources[:, k]) for k in range(count)]

@@ -28,7 +28,12 @@ logger = logging.getLogger(__name__)
 
 
 def train(
-    config: ExperimentConfig, output: Path, resume: bool = False, device: str = "auto", command: str = "", quiet: bool = True
+    config: ExperimentConfig,
+    output: Path,
+    resume: bool = False,
+    device: str = "auto",
+    command: str = "",
+    quiet: bool = True,
 ) -> Path:
     """Train, validate, keep the best.
 
@@ -59,9 +64,7 @@ def train(
     batch = config.training.batch
     draws = SnippetDraws(training, config, config.training.steps * batch, done_steps * batch)
     workers = config.data.workers
-    loader = DataLoader(
-        draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0
-    )
+    loader = DataLoader(draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*num_workers.*")
@@ -146,7 +149,9 @@ def commit() -> str:
 def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, resume: bool) -> int:
     """Make the folder ready; the number of steps already done."""
     if resume and not checkpoint.is_file():
-        raise TrainingError(f"nothing to resume in {output}: no {checkpoint.relative_to(output)}; start without --resume")
+        raise TrainingError(
+            f"nothing to resume in {output}: no {checkpoint.relative_to(output)}; start without --resume"
+        )
     if not resume and checkpoint.is_file():
         raise TrainingError(f"{output} holds an unfinished run: go on with --resume or choose another --output")
     output.mkdir(parents=True, exist_ok=True)

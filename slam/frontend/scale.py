@@ -134,6 +134,30 @@ def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | R
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
 
+def scale_track(
+    roads: Sequence[RoadPlane | Refusal],
+    camera_height_m: float | None,
+    estimate: ScaleEstimate,
+    config: ScaleConfig,
+) -> FloatArray:
+    """The scale near each frame ``(N,)``: a running median of the road's ratios.
+
+    Learned depth breathes: its unit wanders along a drive. Where ``smoothing_frames`` around a frame hold
+    too few usable roads, the estimate of the whole drive stands in.
+    """
+    height = 1.0 if camera_height_m is None else camera_height_m
+    ratios = np.array([height / r.height_unscaled if isinstance(r, RoadPlane) else np.nan for r in roads])
+    bound = config.rejection_mads * max(estimate.spread, 0.02)
+    ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
+    half = config.smoothing_frames // 2
+    track = np.full(len(ratios), estimate.value)
+    for k in range(len(ratios)):
+        near = ratios[max(k - half, 0) : k + half + 1]
+        if np.isfinite(near).sum() >= config.min_frames:
+            track[k] = np.nanmedian(near)
+    return track
+
+
 def rescaled(relative_pose: RelativePose, scale: float) -> RelativePose:
     """A measurement in other units: translation and its sigmas times ``scale``."""
     T_from_to = relative_pose.T_from_to.copy()

@@ -106,7 +106,7 @@ def find_camera_file(explicit: Path | None, *folders: Path, wanted_by: str) -> C
     for folder in folders:
         if (folder / CAMERA_FILE).is_file():
             return read_camera_file(folder / CAMERA_FILE)
-    places = " and ".join(str(folder) for folder in folders)
+    places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
     raise SequenceError(
         f"no {CAMERA_FILE} for {wanted_by}: looked in {places}; put one there or give it with --camera "
         f"(width, height, fx, fy, cx, cy, fps)"

@@ -152,5 +152,5 @@ def _is_complete(data: bytes) -> bool:
     if data.startswith(b"\xff\xd8"):
         return data.rfind(_JPEG_END) > data.rfind(_JPEG_SCAN)
     if data.startswith(_PNG_START):
-        return _PNG_END in data[-64:] or data.rfind(_PNG_END) > 0
+        return data.rfind(_PNG_END) > 0
     return True

@@ -70,7 +70,7 @@ def _reference(path: Path, stamps: FloatArray) -> FloatArray | None:
         return None
     truth = read_trajectory(path, format="tum")
     known, T_any_camera = truth.stamps, truth.T_world_camera
-    if known is None or len(known) < 2:
+    if len(known) < 2:
         return None
     before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
     gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))

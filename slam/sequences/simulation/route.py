@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
-from slam import se3
 from slam.errors import SequenceError
-from slam.sequences.simulation import streets
-from slam.sequences.simulation.geometry import Bend, FloatArray, road_bend, town_bend
-from slam.sequences.simulation.streets import Node, StreetPlan
+from slam.sequences.simulation.geometry import Bend, FloatArray
+from slam.sequences.simulation.streets import StreetPlan
 
 STEP = 0.25  # between samples of a path, metres
 OVERLAP = 68.0  # how far a loop drives its own start again, metres

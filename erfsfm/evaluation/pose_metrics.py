@@ -1,0 +1,146 @@
+"""The five-frame snippet protocol for ego-motion (Zhou et al. 2017, section 4.2), in NumPy alone.
+
+Conventions: ``docs/conventions.md``. Poses of a snippet are written in the frame of its first camera.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Fidelity = Literal["default", "paper"]
+
+# The reference code sizes its error array by images instead of snippets: length - 1 rows stay zero.
+_PAPER_ZERO_ROWS = 4
+
+
+@dataclass(frozen=True)
+class SnippetErrors:
+    """Mean and population standard deviation over snippets.
+
+    ``ate``: norm of the position errors of a snippet after its own scale, over its length (metres, or the
+    units of the truth). ``re``: rotation error in radians, averaged over all frames of a snippet, the
+    first and always perfect one included. ``count``: true number of snippets, whatever the fidelity.
+    """
+
+    ate_mean: float
+    ate_std: float
+    re_mean: float
+    re_std: float
+    count: int
+    length: int = 5
+
+    @property
+    def rmse_mean(self) -> float:
+        """The position error as a true root mean square: ``sqrt(length) * ate_mean``."""
+        return math.sqrt(self.length) * self.ate_mean
+
+    @property
+    def re_moving_mean(self) -> float:
+        """Rotation error in radians over the frames that can be wrong: all but the first."""
+        return self.re_mean * self.length / (self.length - 1)
+
+
+def snippet_errors(
+    T_first_k_pred: FloatArray, T_first_k_true: FloatArray, fidelity: Fidelity = "default"
+) -> SnippetErrors:
+    """Errors of predicted snippets, each brought to the truth's scale on its own.
+
+    s   = sum(g . p) / sum(p . p)                    over the positions of one snippet
+    ATE = sqrt(sum |g - s p|^2) / K                  K frames: not a root mean square
+    RE  = sum_k angle(R_true,k R_pred,k^T) / K
+
+    A snippet that predicts no motion has no scale and is scored as standing still.
+
+    Args:
+        T_first_k_pred: predicted poses ``(S, K, 4, 4)``, any scale.
+        T_first_k_true: true poses ``(S, K, 4, 4)``.
+        fidelity: ``paper`` adds the four zero rows that the reference code averages over.
+
+    Raises:
+        ValueError: if the shapes differ or there is no snippet.
+    """
+    predicted = np.asarray(T_first_k_pred, dtype=np.float64)
+    truth = np.asarray(T_first_k_true, dtype=np.float64)
+    if predicted.shape != truth.shape or predicted.ndim != 4 or predicted.shape[2:] != (4, 4):
+        raise ValueError(f"snippets must both have shape (S, K, 4, 4); got {predicted.shape}, {truth.shape}")
+    count, length = predicted.shape[:2]
+    if count == 0 or length < 2:
+        raise ValueError(f"need at least one snippet of two frames; got {count} of {length}")
+    ate = _position_errors(predicted[..., :3, 3], truth[..., :3, 3])
+    R_error = truth[..., :3, :3] @ np.swapaxes(predicted[..., :3, :3], -1, -2)
+    re = rotation_angle(R_error).sum(axis=1) / length
+    if fidelity == "paper":
+        ate, re = np.pad(ate, (0, _PAPER_ZERO_ROWS)), np.pad(re, (0, _PAPER_ZERO_ROWS))
+    return SnippetErrors(float(ate.mean()), float(ate.std()), float(re.mean()), float(re.std()), count, length)
+
+
+def snippets_from_trajectory(T_world_camera: FloatArray, length: int = 5) -> FloatArray:
+    """Every window of consecutive frames, relative to its first: ``(N - length + 1, length, 4, 4)``.
+
+    Args:
+        T_world_camera: poses ``(N, 4, 4)``; with N < length there is no snippet.
+        length: frames in a snippet.
+    """
+    poses = np.asarray(T_world_camera, dtype=np.float64)
+    starts = np.arange(max(len(poses) - length + 1, 0))
+    T_world_k = poses[starts[:, None] + np.arange(length)]  # (S, length, 4, 4)
+    return _invert(T_world_k[:, :1]) @ T_world_k
+
+
+def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
+    """Poses of a snippet in its first camera, from a pose network's answer about its middle frame.
+
+    T_first_k = T_first_target T_k_target^-1, with the target's own identity put in the middle
+
+    Args:
+        T_source_target: ``(..., N, 4, 4)``, sources in time order, N even: target camera to source camera.
+
+    Returns:
+        ``T_first_k`` ``(..., N + 1, 4, 4)``.
+
+    Raises:
+        ValueError: if the target is not in the middle of the sources.
+    """
+    sources = np.asarray(T_source_target, dtype=np.float64)
+    if sources.ndim < 3 or sources.shape[-2:] != (4, 4) or sources.shape[-3] % 2 or not sources.shape[-3]:
+        raise ValueError(f"T_source_target must have shape (..., N, 4, 4), N even; got {sources.shape}")
+    T_k_target = np.insert(sources, sources.shape[-3] // 2, np.eye(4), axis=-3)
+    T_first_k: FloatArray = T_k_target[..., :1, :, :] @ _invert(T_k_target)
+    return T_first_k
+
+
+def rotation_angle(R: FloatArray) -> FloatArray:
+    """Angle in radians of rotations ``(..., 3, 3)``, in [0, pi], accurate at both ends.
+
+    angle = atan2(|vee(R - R^T)|, trace(R) - 1), both twice the sine and cosine
+    """
+    skew = R - np.swapaxes(R, -1, -2)
+    sine = np.linalg.norm(np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1)
+    angle: FloatArray = np.arctan2(sine, np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    return angle
+
+
+def _position_errors(predicted: FloatArray, truth: FloatArray) -> FloatArray:
+    """ATE ``(S,)`` of positions ``(S, K, 3)``."""
+    energy = (predicted**2).sum(axis=(1, 2))
+    agreement = (truth * predicted).sum(axis=(1, 2))
+    scale = np.divide(agreement, energy, out=np.zeros_like(energy), where=energy > 0)
+    residual = truth - scale[:, None, None] * predicted
+    ate: FloatArray = np.sqrt((residual**2).sum(axis=(1, 2))) / predicted.shape[1]
+    return ate
+
+
+def _invert(T_a_b: FloatArray) -> FloatArray:
+    """``T_b_a`` of rigid ``T_a_b``, both ``(..., 4, 4)``."""
+    T_b_a = np.zeros_like(T_a_b)
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    T_b_a[..., :3, :3] = R_b_a
+    T_b_a[..., :3, 3:] = -R_b_a @ T_a_b[..., :3, 3:]
+    T_b_a[..., 3, 3] = 1.0
+    return T_b_a

@@ -1,0 +1,283 @@
+"""The command line ``erfsfm-slam``: run, evaluate, export, simulate."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from erfsfm.errors import ErfsfmError
+from slam.errors import SlamError
+
+if TYPE_CHECKING:
+    from slam.pipeline import Progress
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
+)
+
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda")]
+Seed = Annotated[int, typer.Option(help="seed of everything random")]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+
+
+@app.command()
+def run(
+    dataset: Annotated[
+        str | None, typer.Option(help="KITTI odometry root, KITTI raw drive, TUM folder, image folder or video")
+    ] = None,
+    sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of a folder or video")] = None,
+    weights: Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output")] = "default",
+    config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
+    output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    as_json: Json = False,
+) -> None:
+    """The whole system on one sequence; with nothing given, on the embedded simulated street.
+
+    Example: erfsfm-slam run --dataset KITTI --sequence 09
+    """
+    from slam.run import run_slam
+
+    with _progress_bar() as progress:
+        folder = run_slam(
+            dataset,
+            sequence,
+            camera,
+            weights,
+            config,
+            overrides or [],
+            frames,
+            output,
+            seed,
+            device,
+            progress,
+            command="erfsfm-slam " + " ".join(sys.argv[1:]),
+        )
+    metrics = folder.metrics()
+    if as_json:
+        typer.echo(json.dumps(metrics, indent=2))
+        return
+    _print_run(folder.path, metrics)
+
+
+@app.command()
+def evaluate(
+    paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or one or more run folders")],
+    format: Annotated[str, typer.Option(help="auto, kitti or tum")] = "auto",
+    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 where it is larger; repeat")] = None,
+    as_json: Json = False,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Every metric of two trajectory files under every alignment, or the tables of runs side by side.
+
+    Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
+    """
+    if all(path.is_dir() for path in paths):
+        _evaluate_runs(paths, as_json)
+    elif len(paths) == 2:
+        _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)
+    else:
+        raise SlamError(f"evaluate wants two trajectory files or run folders; got {', '.join(map(str, paths))}")
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="a run folder")],
+    what: Annotated[str, typer.Option(help="mesh, cloud, trajectory or graph")],
+    output: Annotated[Path, typer.Option(help="the file to write")],
+    up: Annotated[str, typer.Option(help="axes of mesh and cloud: y-down (camera axes) or z")] = "y-down",
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """The map as PLY, the trajectory as KITTI or TUM, the graph as g2o.
+
+    Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
+    """
+    from slam.export import export as export_run
+    from slam.mapping import rotate_ply
+    from slam.run_folder import RunFolder
+
+    written = export_run(RunFolder.open(run), what, output, up, rotate_ply)
+    typer.echo(f"{what} of {run} in {written}")
+
+
+@app.command()
+def simulate(
+    output: Annotated[Path, typer.Argument(help="the root to write")],
+    route: Annotated[str, typer.Option(help="loop, grid or straight")] = "loop",
+    frames: Annotated[int, typer.Option(help="10 a second, about 1 m each; a loop wants 250 or more")] = 300,
+    seed: Seed = 0,
+    width: Annotated[int, typer.Option(help="pixels")] = 416,
+    height: Annotated[int, typer.Option(help="pixels")] = 128,
+    lidar: Annotated[bool, typer.Option("--lidar", help="write 64-beam scans")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="write exact depth maps")] = False,
+    hazards: Annotated[str, typer.Option(help="comma list of moving-cars, exposure, blur, stop, rain")] = "",
+    device: Device = "auto",
+) -> None:
+    """A simulated street as a KITTI odometry root, its truth exact.
+
+    Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
+    """
+    from slam.sequences.simulated import SimulatedStreet, parse_options, write_kitti_root
+
+    street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards))
+    with _progress_bar() as progress:
+        write_kitti_root(street, output, depth, lidar, lambda done: progress("frames", done, frames))
+    typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
+
+
+@app.command()
+def plot(
+    runs: Annotated[list[Path], typer.Argument(help="run folders")],
+    what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
+    output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Figures of runs for a paper.
+
+    Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
+    """
+    from slam.plots import plot_runs
+    from slam.run_folder import RunFolder
+
+    plot_runs([RunFolder.open(path) for path in runs], what.split(","), output)
+    typer.echo(f"figure in {output}")
+
+
+@app.command()
+def config() -> None:
+    """The full default configuration as YAML.
+
+    Example: erfsfm-slam config > mine.yaml && erfsfm-slam run --config mine.yaml
+    """
+    from slam.config import SlamConfig, dump_yaml
+
+    typer.echo(dump_yaml(SlamConfig()), nl=False)
+
+
+@app.command()
+def doctor(
+    dataset: Annotated[Path | None, typer.Option(help="a data set to look at")] = None,
+) -> None:
+    """What is installed, what is found, what is missing and what to do.
+
+    Example: erfsfm-slam doctor --dataset /data/kitti
+    """
+    from slam.doctor import examine
+
+    for line in examine(dataset):
+        typer.echo(line)
+
+
+def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
+    from rich.console import Console
+
+    from slam.comparison import comparison_json, comparison_table
+    from slam.run_folder import RunFolder
+
+    runs = [RunFolder.open(path) for path in paths]
+    if as_json:
+        typer.echo(json.dumps(comparison_json(runs), indent=2))
+    else:
+        Console(width=_table_width()).print(comparison_table(runs))
+
+
+def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
+    from rich.console import Console
+
+    from slam.evaluation import evo_commands, exceeded, trajectory_metrics
+    from slam.tables import metrics_table
+    from slam.trajectory import associate, read_trajectory
+
+    if format not in ("auto", "kitti", "tum"):
+        raise SlamError(f"--format must be auto, kitti or tum; got '{format}'")
+    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
+    metrics = trajectory_metrics(*pair)
+    if as_json:
+        typer.echo(json.dumps(metrics, indent=2))
+    else:
+        Console(width=_table_width()).print(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        for line in evo_commands(estimate, reference, format):
+            typer.echo(line)
+    broken = exceeded(metrics, limits)
+    if broken:
+        raise SlamError("; ".join(broken))
+
+
+def _print_run(path: Path, metrics: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    from slam.tables import metrics_table
+
+    provenance, scale, timing = metrics["provenance"], metrics["scale"], metrics["timing"]
+    known = {k: v for k, v in metrics["trajectories"].items() if isinstance(v, dict)}
+    Console(width=_table_width()).print(metrics_table(known, f"{metrics['sequence']['name']}, scale {scale['mode']}"))
+    typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
+    if provenance["leak"]:
+        typer.echo("LEAK: these weights were trained on frames of this sequence")
+    typer.echo(
+        f"{metrics['sequence']['frames']} frames in {timing['seconds_total']:.1f} s "
+        f"({timing['frames_per_second']:.1f} a second); everything in {path}, read {path}/report.html"
+    )
+
+
+def _table_width() -> int | None:
+    """The terminal's width, or one that wraps nothing in a pipe."""
+    return None if sys.stdout.isatty() else 200
+
+
+class _progress_bar:  # noqa: N801 - reads as the function it stands for
+    """A progress bar on a terminal, silence in a pipe."""
+
+    def __enter__(self) -> Progress:
+        if not sys.stderr.isatty():
+            return lambda stage, done, total: None
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar.start()
+        tasks: dict[str, Any] = {}
+
+        def update(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = self._bar.add_task(stage, total=total)
+            self._bar.update(tasks[stage], completed=done)
+
+        return update
+
+    def __exit__(self, *_: object) -> None:
+        bar = getattr(self, "_bar", None)
+        if bar is not None:
+            bar.stop()
+
+
+def main() -> None:
+    """Run the command line: known errors become one line and exit code 1."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    try:
+        app()
+    except (SlamError, ErfsfmError) as error:
+        typer.echo(f"erfsfm-slam: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
+        sys.exit(1)

@@ -1,0 +1,309 @@
+"""The dense map: learned depth, filtered honestly, fused into a truncated signed distance field.
+
+Curless and Levoy 1996 on Open3D's sparse ``VoxelBlockGrid``. Learned depth is wrong far away, at depth
+edges and where two views disagree; what is left after those three filters is fused.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from slam.config import MappingConfig
+from slam.errors import SlamError
+from slam.foreign import import_open3d
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.se3 import FloatArray, invert, rotation_angle
+
+_BLOCK_SIDE = 16
+_FIRST_BLOCKS = 1000
+_ATTRIBUTES = ("tsdf", "weight", "color")
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MapMesh:
+    """Vertices ``(V, 3)`` in the world, triangles ``(T, 3)`` of them, colours ``(V, 3)`` in [0, 1]."""
+
+    vertices_world: FloatArray
+    triangles: NDArray[np.int64]
+    colours: FloatArray
+
+
+@dataclass(frozen=True)
+class MapCloud:
+    """Points ``(P, 3)`` and unit normals ``(P, 3)`` in the world, colours ``(P, 3)`` in [0, 1]."""
+
+    points_world: FloatArray
+    normals_world: FloatArray
+    colours: FloatArray
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """Size of a map, and how many frames went into it or were left out because it was full."""
+
+    triangles: int
+    points: int
+    blocks: int
+    frames_fused: int
+    frames_left_out: int
+
+
+class TsdfMap:
+    """Fuses depth maps of one camera along its trajectory; lengths are in the trajectory's unit."""
+
+    def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
+        self._config = config
+        self._size = (intrinsics.height, intrinsics.width)
+        self._step = max(1, round(intrinsics.width / config.width_px))
+        self._intrinsics = _thinned(intrinsics, self._step)
+        self._rays = _rays(self._intrinsics)
+        self._grid = self._new_grid()
+        self._previous: _View | None = None
+        self._first_is_fused = False
+        self._fused = 0
+        self._left_out = 0
+        self._mesh: MapMesh | None = None
+        self._cloud: MapCloud | None = None
+
+    def integrate(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> None:
+        """Filter a depth map against the keyframe before it and fuse it; skip it where that is too near.
+
+        Args:
+            depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
+            image: its image ``(H, W, 3)`` uint8 RGB.
+            T_world_camera: its pose.
+        """
+        if depth.shape != self._size or image.shape != (*self._size, 3):
+            raise ValueError(f"depth and image must be {self._size}; got {depth.shape} and {image.shape}")
+        view = self._view(depth, image, T_world_camera)
+        previous = self._previous
+        if previous is None:
+            self._previous = view
+        elif self._is_keyframe(view, previous):
+            if not self._first_is_fused:
+                self._fuse(previous, self._agrees(previous, view))
+                self._first_is_fused = True
+            self._fuse(view, self._agrees(view, previous))
+            self._previous = view
+
+    def mesh(self) -> MapMesh:
+        """The surface as triangles, small loose pieces removed.
+
+        Raises:
+            SlamError: if nothing was fused or seen often enough.
+        """
+        if self._mesh is None:
+            self._fuse_lonely_frame()
+            extracted = self._extract(self._grid.extract_triangle_mesh)
+            mesh = MapMesh(
+                _array(extracted.vertex.positions),
+                extracted.triangle.indices.numpy().astype(np.int64),
+                _array(extracted.vertex.colors),
+            )
+            self._mesh = _without_small_components(mesh, self._config.min_component_triangles)
+        if len(self._mesh.triangles) == 0:
+            raise SlamError("the map is empty: no piece of surface is larger than min_component_triangles")
+        return self._mesh
+
+    def cloud(self) -> MapCloud:
+        """The surface as points; ``SlamError`` as for the mesh."""
+        if self._cloud is None:
+            self._fuse_lonely_frame()
+            point = self._extract(self._grid.extract_point_cloud).point
+            self._cloud = MapCloud(_array(point.positions), _array(point.normals), _array(point.colors))
+        return self._cloud
+
+    def statistics(self) -> MapStatistics:
+        """Counts, zero for an empty map."""
+        try:
+            triangles, points = len(self.mesh().triangles), len(self.cloud().points_world)
+        except SlamError:
+            triangles = points = 0
+        blocks = int(self._grid.hashmap().size())
+        return MapStatistics(triangles, points, blocks, self._fused, self._left_out)
+
+    def write_mesh(self, path: Path) -> None:
+        """Write the mesh as binary PLY, atomically; ``SlamError`` if the map is empty."""
+        o3d = import_open3d()
+        mesh = self.mesh()
+        written = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
+        )
+        written.vertex_colors = o3d.utility.Vector3dVector(mesh.colours)
+        written.compute_vertex_normals()
+        _write_ply(path, lambda name: o3d.io.write_triangle_mesh(name, written))
+
+    def write_cloud(self, path: Path) -> None:
+        """Write the cloud as binary PLY, atomically; ``SlamError`` if the map is empty."""
+        o3d = import_open3d()
+        cloud = self.cloud()
+        written = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_world))
+        written.normals = o3d.utility.Vector3dVector(cloud.normals_world)
+        written.colors = o3d.utility.Vector3dVector(cloud.colours)
+        _write_ply(path, lambda name: o3d.io.write_point_cloud(name, written))
+
+    def _new_grid(self) -> Any:
+        o3d = import_open3d()
+        kind = o3d.core.float32
+        return o3d.t.geometry.VoxelBlockGrid(
+            _ATTRIBUTES,
+            (kind, kind, kind),
+            ((1), (1), (3)),
+            self._config.voxel_size_m,
+            _BLOCK_SIDE,
+            min(_FIRST_BLOCKS, self._config.max_blocks),
+            o3d.core.Device("CPU:0"),
+        )
+
+    def _view(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> _View:
+        start, step = self._step // 2, self._step
+        depth = np.ascontiguousarray(depth[start::step, start::step], dtype=np.float32)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        return _View(depth, image[start::step, start::step], T_world_camera)
+
+    def _is_keyframe(self, view: _View, previous: _View) -> bool:
+        T_previous_camera = invert(previous.T_world_camera) @ view.T_world_camera
+        moved = float(np.linalg.norm(T_previous_camera[:3, 3]))
+        turned = float(rotation_angle(T_previous_camera[:3, :3]))
+        config = self._config
+        return moved >= config.keyframe_distance_m or turned >= np.deg2rad(config.keyframe_rotation_deg)
+
+    def _agrees(self, view: _View, other: _View) -> NDArray[np.bool_]:
+        """Pixels ``(H, W)`` whose depth the other view's depth confirms."""
+        camera = self._intrinsics
+        T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
+        points = self._rays * view.depth.ravel()  # (3, H*W)
+        x, y, z = T_other_camera[:3, :3] @ points + T_other_camera[:3, 3:]
+        before = np.where(z > 1e-3, z, np.float32(np.inf))
+        u = np.rint(np.float32(camera.fx) * (x / before) + np.float32(camera.cx))
+        v = np.rint(np.float32(camera.fy) * (y / before) + np.float32(camera.cy))
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (z > 1e-3)
+        pixel = np.where(inside, v * camera.width + u, 0).astype(np.int64)
+        agrees = inside & (np.abs(other.depth.ravel()[pixel] - z) < self._config.consistency * z)
+        return np.asarray(agrees.reshape(view.depth.shape))
+
+    def _fuse(self, view: _View, agrees: NDArray[np.bool_]) -> None:
+        config = self._config
+        near = (view.depth >= config.depth_min_m) & (view.depth <= config.depth_max_m)
+        kept = near & agrees & ~_at_edges(view.depth, config.max_depth_step)
+        if not kept.any():
+            return
+        if self._grid.hashmap().size() >= config.max_blocks:
+            if self._left_out == 0:
+                logger.warning("the map is full (%d blocks): later frames are left out", config.max_blocks)
+            self._left_out += 1
+            return
+        self._integrate(np.where(kept, view.depth, np.float32(0)), view.image, view.T_world_camera)
+        self._fused += 1
+        self._mesh = self._cloud = None
+
+    def _integrate(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> None:
+        o3d = import_open3d()
+        K = self._intrinsics.K
+        # Open3D truncates projected pixels where we round them: its pixel centres are at (0.5, 0.5)
+        K[:2, 2] += 0.5
+        intrinsic = o3d.core.Tensor(K)
+        extrinsic = o3d.core.Tensor(invert(T_world_camera))  # Open3D wants T_camera_world
+        depth_image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
+        colour_image = o3d.t.geometry.Image(o3d.core.Tensor(image.astype(np.float32) / np.float32(255)))
+        depth_scale, truncation = 1.0, self._config.truncation_voxels
+        depth_max = self._config.depth_max_m
+        blocks = self._grid.compute_unique_block_coordinates(
+            depth_image, intrinsic, extrinsic, depth_scale, depth_max, truncation
+        )
+        self._grid.integrate(
+            blocks, depth_image, colour_image, intrinsic, extrinsic, depth_scale, depth_max, truncation
+        )
+
+    def _fuse_lonely_frame(self) -> None:
+        """A map of a single keyframe has no second view to ask."""
+        if self._previous is not None and not self._first_is_fused:
+            self._fuse(self._previous, np.ones(self._previous.depth.shape, dtype=bool))
+            self._first_is_fused = True
+
+    def _extract(self, extract: Callable[[float], Any]) -> Any:
+        if self._fused == 0:
+            raise SlamError("the map is empty: no depth passed the filters")
+        # one frame alone weighs 1: a short sequence must not ask for more than it has
+        weight = min(self._config.min_weight, self._fused) - 0.5
+        try:
+            return extract(weight)
+        except RuntimeError as error:  # Open3D cannot build an empty geometry
+            raise SlamError(
+                f"the map is empty: no surface was seen {self._config.min_weight:g} times"
+            ) from error
+
+
+@dataclass(frozen=True)
+class _View:
+    """A thinned frame: depth ``(H, W)`` with 0 where unknown, its image and pose."""
+
+    depth: DepthMap
+    image: Image
+    T_world_camera: FloatArray
+
+
+def _thinned(intrinsics: Intrinsics, step: int) -> Intrinsics:
+    """The camera of every ``step``-th row and column, from ``step // 2`` on."""
+    start = step // 2
+    width = len(range(start, intrinsics.width, step))
+    height = len(range(start, intrinsics.height, step))
+    cx, cy = (intrinsics.cx - start) / step, (intrinsics.cy - start) / step
+    return Intrinsics(width, height, intrinsics.fx / step, intrinsics.fy / step, cx, cy)
+
+
+def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
+    """Rays ``(3, H*W)`` with z = 1."""
+    v, u = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    return np.stack([x, y, np.ones_like(x)]).astype(np.float32)
+
+
+def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
+    """Pixels on either side of a relative depth step: networks smear surfaces across it."""
+    edges = np.zeros(depth.shape, dtype=bool)
+    for near, far in (
+        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
+        ((slice(1, None),), (slice(-1),)),
+    ):
+        a, b = depth[near], depth[far]
+        step = np.abs(a - b) > max_step * np.minimum(a, b)
+        edges[near] |= step
+        edges[far] |= step
+    return edges
+
+
+def _without_small_components(mesh: MapMesh, min_triangles: int) -> MapMesh:
+    count, triangles = len(mesh.vertices_world), mesh.triangles
+    ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    links = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, component = connected_components(links, directed=False)
+    sizes = np.bincount(component[triangles[:, 0]], minlength=1)
+    kept = triangles[sizes[component[triangles[:, 0]]] >= min_triangles]
+    used, renumbered = np.unique(kept, return_inverse=True)
+    return MapMesh(mesh.vertices_world[used], renumbered.reshape(-1, 3), mesh.colours[used])
+
+
+def _array(tensor: Any) -> FloatArray:
+    return np.asarray(tensor.numpy(), dtype=np.float64)
+
+
+def _write_ply(path: Path, write: Callable[[str], bool]) -> None:
+    temporary = path.with_name(f".{path.stem}.partial.ply")
+    try:
+        if not write(str(temporary)):
+            raise SlamError(f"{path} cannot be written")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,405 @@
+"""Figures for a paper and for the report: trajectories, errors, drift, depth and the map from above.
+
+Colours are those of Okabe and Ito (2008), which stay apart for colour-blind readers; line styles keep them
+apart in grey. Matplotlib is imported inside the functions, and no global state of it changes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam import se3
+from slam.errors import RunError
+from slam.frames import DepthMap, Image
+from slam.run_folder import TRAJECTORIES, RunFolder
+from slam.se3 import FloatArray
+from slam.trajectory import Trajectory, associate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+
+SUFFIXES = (".png", ".pdf", ".svg")
+REFERENCE = "reference"
+SEGMENT_LENGTHS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+SEGMENT_STEP = 10
+CAMERA_HEIGHTS = "camera heights"
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.labelsize": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e6ea",
+    "grid.linewidth": 0.7,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "erfsfm-slam",
+}
+_LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: ("Ground truth", {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.5}),
+    "network": ("Network, chained", {"color": "#e69f00", "linestyle": "-", "linewidth": 1.3}),
+    "odometry": ("Odometry", {"color": "#cc79a7", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 1.5}),
+    "optimised": ("Optimised", {"color": "#0072b2", "linestyle": "-", "linewidth": 2.0}),
+    "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
+}
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Mean error of segments of one length: ``translation`` as a share, ``rotation`` in radians a metre."""
+
+    length_m: float
+    translation: float
+    rotation: float
+
+
+def trajectory_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Top view, x to the right and z ahead, all estimates brought to the reference by 7 degrees of freedom.
+
+    Args:
+        trajectories: by name: ``reference``, ``network``, ``odometry``, ``optimised``, ``lidar``.
+        title: over the figure.
+        unit: of the positions where there is no reference.
+    """
+    return _figure(draw_trajectories, trajectories, title, unit, (7.4, 5.6))
+
+
+def errors_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Position error over the distance travelled, after the 7-dof alignment.
+
+    Raises:
+        RunError: there is no reference.
+    """
+    return _figure(draw_errors, trajectories, title, unit, (7.4, 3.4))
+
+
+def drift_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Relative translation and rotation error over the length of segments, after the 7-dof alignment.
+
+    Raises:
+        RunError: there is no reference.
+    """
+    return _figure(draw_drift, trajectories, title, unit, (7.4, 3.4))
+
+
+def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw the top view on a figure or a part of one."""
+    axes = canvas.subplots()
+    has_reference = REFERENCE in trajectories
+    for name, trajectory in aligned(trajectories).items():
+        label, look = _LOOKS[name]
+        if not has_reference and name == "network" and "optimised" in trajectories:
+            label += " (scaled)"
+        axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
+    start = trajectories[REFERENCE if has_reference else next(iter(trajectories))].positions[0]
+    marker = {"marker": "o", "s": 42, "facecolor": "white", "edgecolor": "black", "linewidth": 1.3}
+    axes.scatter(start[0], start[2], zorder=5, label="Start", **marker)
+    unit = "m" if has_reference else unit
+    axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.legend(title="Estimates aligned by 7 dof" if has_reference else None, title_fontsize=9, **_beside())
+    return [axes]
+
+
+def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw the position error on a figure or a part of one."""
+    reference = _reference(trajectories)
+    axes = canvas.subplots()
+    for name, trajectory in _estimates(aligned(trajectories)):
+        estimate, truth = associate(trajectory, reference)
+        error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+        label, look = _LOOKS[name]
+        axes.plot(_travelled(truth), error, label=label, **look)
+    axes.set(xlabel="distance travelled (m)", ylabel="position error (m), 7 dof")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.legend(**_beside())
+    return [axes]
+
+
+def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw translation and rotation drift on a figure or a part of one."""
+    reference = _reference(trajectories)
+    left, right = canvas.subplots(1, 2)
+    lengths: set[float] = set()
+    for name, trajectory in _estimates(aligned(trajectories)):
+        drifts = segment_drifts(*associate(trajectory, reference))
+        length = [drift.length_m for drift in drifts]
+        lengths.update(length)
+        label, look = _LOOKS[name]
+        look = look | {"marker": "o", "markersize": 3.5}
+        left.plot(length, [100.0 * drift.translation for drift in drifts], label=label, **look)
+        right.plot(length, [np.rad2deg(100.0 * drift.rotation) for drift in drifts], label=label, **look)
+    left.set_ylabel("translation error (%), 7 dof")
+    right.set_ylabel("rotation error (deg / 100 m)")
+    for axes in (left, right):
+        axes.set_xlabel("segment length (m)")
+        axes.set_ylim(bottom=0)
+        if not lengths:
+            axes.text(0.5, 0.5, "path shorter than 10 m", ha="center", transform=axes.transAxes)
+        elif max(lengths) <= 100.0:
+            axes.set_xticks(sorted(lengths))
+    canvas.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return [left, right]
+
+
+def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Sequence[str]) -> Figure:
+    """Frames above their disparity, near in yellow and far in black, one colour scale for all.
+
+    Args:
+        images: ``(H, W, 3)`` uint8 RGB each.
+        depths: z-depth ``(H, W)`` each, any unit; grey where it is not positive and finite.
+        labels: over each frame.
+    """
+    from matplotlib import colormaps
+
+    height, width = images[0].shape[:2]
+    columns = min(len(images), 2 if width > 2 * height else 4)
+    blocks = -(-len(images) // columns)
+    disparities = [_disparity(depth) for depth in depths]
+    seen = np.concatenate([disparity.compressed() for disparity in disparities])
+    limits = np.percentile(seen, [2, 98]) if seen.size else np.array([0.0, 1.0])
+    colours = colormaps["inferno"].with_extremes(bad="#9aa0a6")
+    with _figure_style() as new_figure:
+        block_width = 7.4 / columns
+        size = (7.4, blocks * (2 * block_width * height / width + 0.3))
+        figure = new_figure(figsize=size, layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
+        grid = figure.subplots(2 * blocks, columns, squeeze=False)
+        for axes in grid.flat:
+            axes.axis("off")
+        for k, (image, disparity, label) in enumerate(zip(images, disparities, labels)):
+            row, column = divmod(k, columns)
+            grid[2 * row, column].imshow(image)
+            grid[2 * row, column].set_title(label, fontsize=9, loc="left", pad=3)
+            grid[2 * row + 1, column].imshow(disparity, cmap=colours, vmin=limits[0], vmax=limits[1])
+    return figure
+
+
+def map_figure(
+    points: NDArray[np.floating],
+    colours: NDArray[np.floating],
+    trajectory: Trajectory | None = None,
+    unit: str = "m",
+    most: int = 150_000,
+) -> Figure:
+    """The map from above in its own colours, what is highest drawn last, with the trajectory over it.
+
+    Args:
+        points: ``(P, 3)`` in the world, y down.
+        colours: ``(P, 3)`` RGB in [0, 1].
+        trajectory: camera poses in the same world.
+        unit: of all lengths.
+        most: points drawn; a larger map is thinned evenly.
+    """
+    chosen = np.linspace(0, len(points) - 1, min(most, len(points))).astype(np.intp)
+    chosen = chosen[np.isfinite(points[chosen]).all(axis=1)]
+    # y points down: from the lowest to the highest
+    chosen = chosen[np.argsort(-points[chosen, 1], kind="stable")]
+    ground = points[chosen][:, [0, 2]]
+    path = trajectory.positions[:, [0, 2]] if trajectory else np.empty((0, 2))
+    corners = np.concatenate([np.percentile(ground, [0.5, 99.5], axis=0), path]) if len(ground) else path
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    with _figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4, 5.6), layout="constrained")
+        axes = figure.subplots()
+        rgb = np.clip(colours[chosen], 0.0, 1.0)
+        size = float(np.clip(60_000 / max(len(chosen), 1), 0.25, 4.0))
+        axes.scatter(ground[:, 0], ground[:, 1], s=size, c=rgb, linewidths=0, rasterized=True)
+        if trajectory:
+            axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
+            axes.plot(path[:, 0], path[:, 1], **_LOOKS["optimised"][1], label="Optimised trajectory")
+            axes.legend(**_beside())
+        axes.set_aspect("equal", adjustable="datalim")
+        margin = 0.04 * float((high - low).max())
+        axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+        axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+    return figure
+
+
+def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> None:
+    """Write one figure: a column for each run, a row for each of ``what``.
+
+    Raises:
+        RunError: an unknown ``what`` or suffix, or a run without what the figure needs.
+    """
+    panels = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
+    unknown = [name for name in what if name not in panels]
+    if unknown or not what or not runs:
+        wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
+        raise RunError(f"{wanted}: give at least one run and some of {', '.join(panels)}")
+    if output.suffix.lower() not in SUFFIXES:
+        raise RunError(f"figures are written as {', '.join(SUFFIXES)}; got '{output.name}'")
+    contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
+    heights = [4.6 if name == "trajectory" else 3.2 for name in what]
+    with _figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4 * len(runs), sum(heights)), layout="constrained")
+        grid = figure.subfigures(len(what), len(runs), squeeze=False, height_ratios=heights)
+        for name, row in zip(what, grid):
+            drawn = [panels[name](part, each, length_unit(run)) for part, each, run in zip(row, contents, runs)]
+            if name != "trajectory":
+                _share_heights(drawn)
+        for part, run in zip(grid[0], runs):
+            part.suptitle(run.path.resolve().name, fontsize=12)
+        _save(figure, output)
+
+
+def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, Trajectory]:
+    """The trajectories of a run, the reference first.
+
+    Raises:
+        RunError: there is none, or no reference where one is needed.
+    """
+    found = {name: run.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
+    trajectories = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+    if not trajectories:
+        raise RunError(f"{run.path} holds no trajectory: run the sequence again")
+    if needs_reference:
+        if REFERENCE not in trajectories:
+            raise RunError(f"{run.path} has no reference: errors and drift need ground truth; plot --what trajectory")
+        if len(trajectories) == 1:
+            raise RunError(f"{run.path} holds no estimated trajectory: run the sequence again")
+    return trajectories
+
+
+def length_unit(run: RunFolder) -> str:
+    """The unit of a run's trajectories and map: metres, or camera heights under scale mode none."""
+    scale = run.metrics().get("scale") or {}
+    if scale.get("mode") == "none":
+        return CAMERA_HEIGHTS
+    return "m" if scale.get("value") is not None else "unscaled"
+
+
+def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
+    """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
+
+    Without a reference they stay as written, only the raw network is brought to the optimised one's scale.
+    """
+    drawn = dict(trajectories)
+    if REFERENCE in drawn:
+        for name, trajectory in _estimates(drawn):
+            estimate, truth = associate(trajectory, drawn[REFERENCE])
+            fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
+            moved = fit.apply_to_poses(trajectory.T_world_camera)
+            drawn[name] = Trajectory(trajectory.stamps, moved, trajectory.timed)
+    elif "network" in drawn and "optimised" in drawn:
+        raw, optimised = associate(drawn["network"], drawn["optimised"])
+        energy = float((raw.positions**2).sum())
+        scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
+        fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
+        moved = fit.apply_to_poses(drawn["network"].T_world_camera)
+        drawn["network"] = Trajectory(drawn["network"].stamps, moved, drawn["network"].timed)
+    return drawn
+
+
+def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
+    """Mean relative error of all segments of each length that the path holds, one start every tenth frame.
+
+    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+
+    Args:
+        estimate: metric poses, row k beside row k of the reference.
+        reference: true poses.
+    """
+    distance = _travelled(reference)
+    drifts = []
+    for length_m in SEGMENT_LENGTHS_M:
+        starts = np.arange(0, len(reference), SEGMENT_STEP)
+        ends = np.searchsorted(distance, distance[starts] + length_m, side="right")
+        starts, ends = starts[ends < len(reference)], ends[ends < len(reference)]
+        if not len(starts):
+            break
+        T_start_end = [se3.invert(t.T_world_camera[starts]) @ t.T_world_camera[ends] for t in (estimate, reference)]
+        T_error = se3.invert(T_start_end[0]) @ T_start_end[1]
+        translation = float(np.linalg.norm(T_error[:, :3, 3], axis=1).mean()) / length_m
+        drifts.append(Drift(length_m, translation, float(se3.rotation_angle(T_error[:, :3, :3]).mean()) / length_m))
+    return drifts
+
+
+def _figure(
+    draw: Callable[[FigureBase, Mapping[str, Trajectory], str], list[Axes]],
+    trajectories: Mapping[str, Trajectory],
+    title: str,
+    unit: str,
+    size: tuple[float, float],
+) -> Figure:
+    with _figure_style() as new_figure:
+        figure = new_figure(figsize=size, layout="constrained")
+        if title:
+            figure.suptitle(title, fontsize=12)
+        draw(figure, trajectories, unit)
+    return figure
+
+
+@contextmanager
+def _figure_style() -> Iterator[Callable[..., Figure]]:
+    """The figure class under our style; without pyplot nothing outlives the block."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        yield Figure
+
+
+def _beside() -> dict[str, Any]:
+    return {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+
+
+def _reference(trajectories: Mapping[str, Trajectory]) -> Trajectory:
+    if REFERENCE not in trajectories:
+        raise RunError("errors and drift need ground truth, and this run has no reference")
+    return trajectories[REFERENCE]
+
+
+def _estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Trajectory]]:
+    return [(name, trajectory) for name, trajectory in trajectories.items() if name != REFERENCE]
+
+
+def _travelled(trajectory: Trajectory) -> FloatArray:
+    """Distance travelled ``(N,)`` up to each pose."""
+    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _disparity(depth: DepthMap) -> Any:
+    """1 / depth, masked where there is no depth."""
+    known = np.isfinite(depth) & (depth > 0)
+    return np.ma.masked_array(1.0 / np.where(known, depth, 1.0), mask=~known)
+
+
+def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
+    """Give the axes of a row one upper limit, so that runs can be compared by eye."""
+    for same in zip(*drawn):
+        top = max(axes.get_ylim()[1] for axes in same)
+        for axes in same:
+            axes.set_ylim(0.0, top)
+
+
+def _save(figure: Figure, output: Path) -> None:
+    """Write beside the target and move into place; the file depends on nothing but its content."""
+    kind = output.suffix.lower().removeprefix(".")
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
+    partial = output.with_name(f".{output.stem}.{os.getpid()}.partial")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(partial, format=kind, dpi=200, metadata=undated)
+        partial.replace(output)
+    except OSError as error:
+        raise RunError(f"{output}: cannot be written ({error.strerror or error})") from error
+    finally:
+        partial.unlink(missing_ok=True)

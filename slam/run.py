@@ -1,0 +1,272 @@
+"""One run from start to end: sequence and weights in, a run folder out."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm import __version__
+from erfsfm.evaluation.pose_metrics import (
+    SnippetErrors,
+    snippet_errors,
+    snippet_from_network,
+    snippets_from_trajectory,
+)
+from erfsfm.inference import DepthPosePredictor
+from slam.config import dump_yaml, load_config
+from slam.errors import SlamError
+from slam.evaluation import trajectory_metrics
+from slam.frames import Predictor
+from slam.frames import Sequence as FrameSequence
+from slam.frontend.refusal import Refusal
+from slam.map_metrics import accuracy_median_m, completeness, visible_surface
+from slam.networks import NetworkPredictor
+from slam.pipeline import Progress, SlamPipeline, SlamResult
+from slam.pose_graph import coverage
+from slam.report import DepthExample, write_report
+from slam.run_folder import RunFolder
+from slam.se3 import apply, umeyama
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.simulated_sequence import SimulatedSequence
+from slam.summary import (
+    SCHEMA,
+    Provenance,
+    as_json,
+    describe_failure,
+    describe_sequence,
+    describe_timing,
+    finite,
+    null,
+)
+
+logger = logging.getLogger(__name__)
+
+NOT_BUILT = "this part is not built yet"
+
+
+def run_slam(
+    dataset: str | Path | None = None,
+    sequence: str | None = None,
+    camera: Path | None = None,
+    weights: str | Path = "default",
+    config: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    frames: str | None = None,
+    output: Path | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: Progress | None = None,
+    command: str = "slam.run_slam",
+) -> RunFolder:
+    """Run the whole system on one sequence.
+
+    Args:
+        dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
+            ``sequence`` is the embedded simulated street.
+        sequence: name inside the data set.
+        camera: ``camera.yaml`` of a folder or video, where none lies beside it.
+        weights: a shipped name or a training output folder.
+        config: a YAML file or a shipped name; None for the defaults.
+        overrides: ``section.key=value`` each.
+        frames: ``A:B``, half-open.
+        output: the run folder itself; None makes ``results/<stamp>_<sequence>``.
+        seed: of everything random.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: told of (stage, done, total).
+        command: recorded in the metrics.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        SlamError, ErfsfmError: one line; a folder already made then holds what there is and says why.
+    """
+    settings = load_config(config, overrides)
+    recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
+    networks = DepthPosePredictor.from_weights(weights, device)
+    provenance = Provenance(
+        version=__version__,
+        commit=_commit(),
+        command=command,
+        seed=seed,
+        device=str(networks.device),
+        weights=str(weights),
+        weights_sha256=networks.sha256,
+        weights_licence=networks.record.licence,
+        trained_on=networks.record.trained_on,
+        leak=bool(networks.leaks(recording.provenance())),
+    )
+    folder = RunFolder.create(output, Path(settings.output.root), recording.name)
+    folder.write_text("config.yaml", dump_yaml(settings))
+    with _logging_to(folder.path / "run.log"):
+        try:
+            return _run(folder, SlamPipeline(recording, _seeded(networks, seed), settings, progress), recording, provenance)
+        except (SlamError, OSError, MemoryError, KeyboardInterrupt) as error:
+            reason = str(error) or type(error).__name__
+            logger.error("the run failed: %s", reason)
+            folder.write_metrics(describe_failure(provenance, reason))
+            raise
+
+
+def _seeded(networks: DepthPosePredictor, seed: int) -> Predictor:
+    np.random.seed(seed)
+    cv2.setRNGSeed(seed)
+    return NetworkPredictor(networks)
+
+
+def _run(folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance) -> RunFolder:
+    result = pipeline.run()
+    for name in ("network", "odometry", "optimised"):
+        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+    if result.reference is not None:
+        folder.write_trajectory("reference", result.reference)
+    folder.write("graph.g2o", result.graph.write_g2o)
+    folder.write_text("loops.json", as_json({"reason": NOT_BUILT, "accepted": [], "rejected": []}))
+    surface = _write_map(folder, result, sequence)
+    folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
+    examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
+    write_report(folder, examples, surface.points, surface.colours)
+    return folder
+
+
+def _metrics(
+    result: SlamResult, sequence: FrameSequence, provenance: Provenance, map_summary: dict[str, Any]
+) -> dict[str, Any]:
+    reference = result.reference
+    lidar = "the sequence has no LiDAR scans" if sequence.T_camera_lidar is None else NOT_BUILT
+    trajectories = {
+        "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
+        "odometry": trajectory_metrics(result.odometry, reference),
+        "optimised": trajectory_metrics(result.optimised, reference),
+        **null("lidar", lidar),
+    }
+    loops = {**null("candidates", NOT_BUILT), **null("verified", NOT_BUILT), **null("accepted", NOT_BUILT)}
+    metrics: dict[str, Any] = finite(
+        {
+            "schema": SCHEMA,
+            "status": "ok",
+            "provenance": asdict(provenance),
+            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None),
+            "timing": describe_timing(result.stopwatch, len(sequence)),
+            "scale": _scale(result),
+            "trajectories": trajectories,
+            "graph": _graph(result),
+            "loops": {**loops, "rejected": []},
+            "map": map_summary,
+        }
+    )
+    return metrics
+
+
+def _network_snippets(result: SlamResult) -> SnippetErrors | None:
+    """The paper's protocol on the network's direct answers; None without truth or with other snippets."""
+    snippets = result.observations.snippets
+    if result.reference is None or len(snippets[0].sources) != 4:
+        return None
+    predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
+    return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
+
+
+def _scale(result: SlamResult) -> dict[str, Any]:
+    estimate = result.scale.estimate
+    if isinstance(estimate, Refusal):
+        return {"mode": result.scale.mode, **null("value", estimate.reason)}
+    return {
+        "mode": result.scale.mode,
+        "value": estimate.value,
+        "spread": estimate.spread,
+        "frames_used": estimate.frames_used,
+    }
+
+
+def _graph(result: SlamResult) -> dict[str, Any]:
+    """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
+    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.factors)}
+    if result.reference is None:
+        return summary | {"coverage": None, "coverage_reason": "the sequence has no true poses"}
+    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+    return summary | {"coverage": coverage(result.factors, result.reference.T_world_camera, aligned.scale)}
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The map as points for the report, and its numbers."""
+
+    summary: dict[str, Any]
+    points: NDArray[np.float64] | None = None
+    colours: NDArray[np.float64] | None = None
+
+
+def _write_map(folder: RunFolder, result: SlamResult, sequence: FrameSequence) -> _Surface:
+    if result.map is None:
+        return _Surface(_no_map("fusion is switched off (mapping.enabled)"))
+    try:
+        folder.write("map_mesh.ply", result.map.write_mesh)
+        folder.write("map_cloud.ply", result.map.write_cloud)
+    except SlamError as error:
+        logger.warning("no map: %s", error)
+        return _Surface(_no_map(str(error)))
+    points, colours = result.map.cloud()
+    statistics = asdict(result.map.statistics())
+    return _Surface(statistics | _map_quality(points, result, sequence), points, colours)
+
+
+def _no_map(reason: str) -> dict[str, Any]:
+    names = ("triangles", "points", "blocks", "accuracy_median_m", "completeness")
+    return {key: value for name in names for key, value in null(name, reason).items()}
+
+
+def _map_quality(points: NDArray[np.float64], result: SlamResult, sequence: FrameSequence) -> dict[str, Any]:
+    """Distance to the true street and share of it found, the map moved by the trajectory's 7-dof alignment."""
+    if result.reference is None or not isinstance(sequence, SimulatedSequence):
+        reason = "the true surface is known for the embedded simulated sequence only"
+        return null("accuracy_median_m", reason) | null("completeness", reason)
+    street = sequence.street
+    to_truth = umeyama(result.reference.positions, result.optimised.positions, with_scale=True)
+    T_street_world = street.T_world_camera[0]
+    points_true = apply(T_street_world, to_truth.scale * points @ to_truth.R_a_b.T + to_truth.t_a_b)
+    seen = [
+        visible_surface(street.render(k).depth, sequence.intrinsics.K, street.T_world_camera[k], step=8)
+        for k in range(0, len(sequence), 10)
+    ]
+    rng = np.random.default_rng(0)
+    sample = points_true[rng.permutation(len(points_true))[:20_000]]
+    return {
+        "accuracy_median_m": accuracy_median_m(sample, street.distance_to_surface),
+        "completeness": completeness(np.concatenate(seen), points_true),
+    }
+
+
+@contextmanager
+def _logging_to(path: Path) -> Iterator[None]:
+    """Send the package's log to a file, line by line, beside wherever it goes already."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger("slam")
+    level = root.level
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+        root.setLevel(level)
+        handler.close()
+
+
+def _commit() -> str:
+    """The revision of the source tree this runs from, or an empty string outside one."""
+    root = Path(__file__).resolve().parents[1]
+    if not (root / ".git").exists():
+        return ""
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

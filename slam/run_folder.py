@@ -1,0 +1,133 @@
+"""A run folder: everything that a run leaves behind, each file whole or absent."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from slam.errors import RunError
+from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+
+logger = logging.getLogger(__name__)
+
+TRAJECTORIES = ("network", "odometry", "optimised", "lidar")
+
+
+class RunFolder:
+    """The files of one run, under the names of the contract (``docs/outputs.md``)."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, output: Path | None, results: Path, sequence: str) -> RunFolder:
+        """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` to it.
+
+        Raises:
+            RunError: ``output`` exists and holds something that is not a run.
+        """
+        if output is not None:
+            if output.exists() and any(output.iterdir()) and not (output / "metrics.json").is_file():
+                raise RunError(f"{output} is not empty and holds no run: choose another --output")
+            output.mkdir(parents=True, exist_ok=True)
+            for stale in output.iterdir():
+                if stale.is_file():
+                    stale.unlink()
+            return cls(output)
+        safe = re.sub(r"[^\w.-]+", "-", sequence)
+        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+        path = results / f"{stamp}_{safe}"
+        number = 1
+        while path.exists():
+            number += 1
+            path = results / f"{stamp}-{number}_{safe}"
+        path.mkdir(parents=True)
+        _link(results / "latest", path)
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: Path) -> RunFolder:
+        """An existing run.
+
+        Raises:
+            RunError: no run there.
+        """
+        if not (path / "metrics.json").is_file():
+            what = "no such folder" if not path.exists() else "it holds no metrics.json"
+            raise RunError(f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote")
+        return cls(path)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file at once."""
+        self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def write(self, name: str, fill: Callable[[Path], object]) -> None:
+        """Let ``fill`` write a file beside its place, then put it there."""
+        target = self.path / name
+        handle, temporary = tempfile.mkstemp(dir=self.path, prefix=".", suffix=f".{name}")
+        os.close(handle)
+        try:
+            fill(Path(temporary))
+            umask = os.umask(0)
+            os.umask(umask)
+            Path(temporary).chmod(0o666 & ~umask)
+            Path(temporary).replace(target)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """Write ``metrics.json``; a number that is not finite is a mistake and is refused."""
+        self.write_text("metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+
+    def write_trajectory(self, stem: str, trajectory: Trajectory) -> None:
+        """Write ``<stem>.kitti.txt`` and ``<stem>.tum.txt``."""
+        write_kitti(self.path / f"{stem}.kitti.txt", trajectory)
+        write_tum(self.path / f"{stem}.tum.txt", trajectory)
+
+    def metrics(self) -> dict[str, Any]:
+        """What ``metrics.json`` says.
+
+        Raises:
+            RunError: the file is damaged.
+        """
+        try:
+            content: dict[str, Any] = json.loads((self.path / "metrics.json").read_text())
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise RunError(f"{self.path / 'metrics.json'} is damaged: {error}; run the sequence again") from error
+        return content
+
+    def trajectory(self, name: str) -> Trajectory | None:
+        """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
+        stem = name if name == "reference" else f"trajectory_{name}"
+        path = self.path / f"{stem}.tum.txt"
+        return read_trajectory(path, "tum") if path.is_file() else None
+
+    def require(self, name: str) -> Path:
+        """A file of the run.
+
+        Raises:
+            RunError: it is not there.
+        """
+        path = self.path / name
+        if not path.is_file():
+            present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
+            raise RunError(f"{self.path} has no {name}: it holds {present}")
+        return path
+
+
+def _link(link: Path, target: Path) -> None:
+    """Point ``link`` to a sibling; a file system without links keeps the folders and loses the shortcut."""
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    try:
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(target.name, target_is_directory=True)
+        temporary.replace(link)
+    except OSError as error:
+        logger.warning("could not link %s to %s: %s", link, target, error)

@@ -1,0 +1,276 @@
+"""Trajectories: timed camera poses, their KITTI and TUM files, and the matching of two of them.
+
+Conventions: ``docs/conventions.md``. This is the only file where quaternions appear.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam import se3
+from slam.errors import TrajectoryError
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+FileFormat = Literal["kitti", "tum"]
+
+_COLUMNS: dict[FileFormat, int] = {"kitti": 12, "tum": 8}
+# Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera poses in time order.
+
+    ``stamps`` ``(N,)`` in seconds, ``T_world_camera`` ``(N, 4, 4)``, metres or the trajectory's own unit.
+    ``timed`` is False where the stamps are mere row numbers, as in a KITTI file.
+    """
+
+    stamps: FloatArray
+    T_world_camera: FloatArray
+    timed: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit.
+
+        Raises:
+            ValueError: if there is no pose, or the shapes are not ``(N,)`` and ``(N, 4, 4)``.
+        """
+        count = len(self.T_world_camera)
+        if not count or self.stamps.shape != (count,) or self.T_world_camera.shape != (count, 4, 4):
+            raise ValueError(
+                "stamps and T_world_camera must have shapes (N,) and (N, 4, 4), N >= 1; "
+                f"got {self.stamps.shape} and {self.T_world_camera.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Camera centres in the world ``(N, 3)``."""
+        return self.T_world_camera[:, :3, 3]
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path through all positions."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def rebased(self) -> Trajectory:
+        """The same motion with the first camera as the world: the first pose is the identity."""
+        T_first_world = se3.invert(self.T_world_camera[0])
+        return Trajectory(self.stamps, T_first_world @ self.T_world_camera, self.timed)
+
+    def select(self, rows: NDArray[np.intp]) -> Trajectory:
+        """The poses of some rows, in the order given."""
+        return Trajectory(self.stamps[rows], self.T_world_camera[rows], self.timed)
+
+
+def read_trajectory(path: Path | str, format: Literal["auto", "kitti", "tum"] = "auto") -> Trajectory:
+    """Read a KITTI file (12 numbers a row) or a TUM file (8), with the format seen from the columns.
+
+    Blank lines and lines that start with ``#`` are skipped. Rotations off by rounding are replaced by the
+    nearest rotation.
+
+    Raises:
+        TrajectoryError: if the file cannot be read as such; one line that names file and line number.
+    """
+    path = Path(path)
+    if format not in ("auto", *_COLUMNS):
+        raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
+    lines, numbers = _read_numbers(path, None if format == "auto" else cast(FileFormat, format))
+    if numbers.shape[1] == _COLUMNS["kitti"]:
+        T_world_camera, stamps = _kitti_poses(numbers), np.arange(len(numbers), dtype=np.float64)
+    else:
+        T_world_camera, stamps = _tum_poses(path, lines, numbers), numbers[:, 0]
+        backwards = np.flatnonzero(np.diff(stamps) <= 0)
+        if backwards.size:
+            raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: time stamps must increase")
+    R = T_world_camera[:, :3, :3]
+    deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero((deviation >= _ROTATION_TOLERANCE) | (np.linalg.det(R) <= 0))
+    if wrong.size:
+        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the 3x3 part is not a rotation matrix")
+    T_world_camera[:, :3, :3] = se3.nearest_rotation(R)
+    return Trajectory(stamps, T_world_camera, timed=numbers.shape[1] == _COLUMNS["tum"])
+
+
+def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
+    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically.
+
+    Raises:
+        TrajectoryError: if the file cannot be written.
+    """
+    rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
+    _write_atomically(Path(path), (_row(row) for row in rows))
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps keep every digit they have.
+
+    Raises:
+        TrajectoryError: if the file cannot be written.
+    """
+    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
+    poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
+    stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
+    rows = (f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses))
+    _write_atomically(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
+
+
+def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The rows of both that belong together, equally many.
+
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. As soon
+    as one has no stamps of its own, row k belongs to row k and the lengths must agree.
+
+    Raises:
+        TrajectoryError: if the lengths differ and stamps are missing, or no stamp has a partner.
+    """
+    if not (estimate.timed and reference.timed):
+        if len(estimate) != len(reference):
+            raise TrajectoryError(
+                f"the estimate has {len(estimate)} poses and the reference {len(reference)}; files without "
+                "time stamps are compared row by row: give each frame a row, or use TUM files for both"
+            )
+        return estimate, reference
+    rows_estimate, rows_reference = _match_stamps(estimate, reference)
+    if not rows_estimate.size:
+        raise TrajectoryError(
+            f"no time stamps match within {matching_tolerance_s(estimate, reference):.3g} s: the estimate "
+            f"covers {_time_span(estimate)} and the reference {_time_span(reference)}; "
+            "bring both to the same clock"
+        )
+    expected = min(len(estimate), len(reference))
+    if rows_estimate.size < 0.9 * expected:
+        logger.warning("only %d of %d poses have a partner in time", rows_estimate.size, expected)
+    return estimate.select(rows_estimate), reference.select(rows_reference)
+
+
+def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
+    """Largest time difference of a matching pair: half the frame period (median) of the denser one."""
+    periods = [float(np.median(np.diff(each.stamps))) for each in (estimate, reference) if len(each) > 1]
+    return 0.5 * min(periods, default=0.02)
+
+
+def _match_stamps(a: Trajectory, b: Trajectory) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of a and b whose stamps are each other's nearest, within the tolerance."""
+    nearest_b, nearest_a = _nearest(a.stamps, b.stamps), _nearest(b.stamps, a.stamps)
+    rows_a = np.arange(len(a))
+    mutual = nearest_a[nearest_b] == rows_a
+    # A hair of slack: the tolerance itself is a difference of rounded stamps.
+    close = np.abs(b.stamps[nearest_b] - a.stamps) <= matching_tolerance_s(a, b) * (1.0 + 1e-6)
+    chosen = mutual & close
+    return rows_a[chosen], nearest_b[chosen]
+
+
+def _nearest(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.intp]:
+    """For each stamp the row of the nearest of the increasing candidates."""
+    after = np.clip(np.searchsorted(candidates, stamps), 1, max(len(candidates) - 1, 1))
+    if len(candidates) == 1:
+        return np.zeros(len(stamps), dtype=np.intp)
+    before_is_nearer = stamps - candidates[after - 1] <= candidates[after] - stamps
+    nearest: NDArray[np.intp] = np.where(before_is_nearer, after - 1, after)
+    return nearest
+
+
+def _time_span(trajectory: Trajectory) -> str:
+    return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
+
+
+def _read_numbers(path: Path, format: FileFormat | None) -> tuple[list[int], FloatArray]:
+    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; None takes the first row's format."""
+    lines: list[int] = []
+    rows: list[list[float]] = []
+    columns = _COLUMNS[format] if format else 0
+    for line, words in _read_words(path):
+        columns = columns or len(words)
+        _check_columns(f"{path}, line {line}", len(words), columns)
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise TrajectoryError(f"{path}, line {line}: {_reason(error)}") from error
+        lines.append(line)
+    if not rows:
+        raise TrajectoryError(f"{path}: there is no pose in this file")
+    numbers = np.array(rows)
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if bad.size:
+        raise TrajectoryError(f"{path}, line {lines[bad[0]]}: a number is not finite")
+    return lines, numbers
+
+
+def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and words of each line that holds data."""
+    if path.is_dir():
+        raise TrajectoryError(f"{path}: this is a folder, not a trajectory file")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise TrajectoryError(f"{path}: no such file") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: this is not a text file") from error
+    except OSError as error:
+        raise TrajectoryError(f"{path}: {error.strerror}") from error
+    for line, content in enumerate(text.splitlines(), start=1):
+        words = content.split()
+        if words and not words[0].startswith("#"):
+            yield line, words
+
+
+def _check_columns(where: str, found: int, wanted: int) -> None:
+    if wanted not in _COLUMNS.values():
+        raise TrajectoryError(f"{where}: {wanted} columns; a KITTI row has 12, a TUM row 8")
+    if found == wanted:
+        return
+    name = "KITTI" if wanted == _COLUMNS["kitti"] else "TUM"
+    other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(found, "")
+    raise TrajectoryError(f"{where}: {found} columns where {name} has {wanted}{other}")
+
+
+def _reason(error: ValueError) -> str:
+    """Python's message about a word that is no number, in ours."""
+    return str(error).replace("could not convert string to float:", "not a number:")
+
+
+def _kitti_poses(numbers: FloatArray) -> FloatArray:
+    T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T_world_camera[:, :3] = numbers.reshape(-1, 3, 4)
+    return T_world_camera
+
+
+def _tum_poses(path: Path, lines: list[int], numbers: FloatArray) -> FloatArray:
+    quaternions_xyzw = numbers[:, 4:]
+    deviation = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0)
+    wrong = np.flatnonzero(deviation >= _ROTATION_TOLERANCE)
+    if wrong.size:
+        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the quaternion does not have length 1")
+    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, 1:4])
+
+
+def _row(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.9e}" for value in values)
+
+
+def _write_atomically(path: Path, rows: Iterable[str]) -> None:
+    """Write beside the target and move into place, so that no reader ever meets half a file."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text("".join(f"{row}\n" for row in rows), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,163 @@
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import SequenceError, SlamError
+from slam.sequences.catalogue import open_sequence
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("layout", ["root", "dataset", "sequences", "one"])
+def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str) -> None:
+    base = tmp_path / "dataset" if layout == "dataset" else tmp_path
+    odometry(base, suffix=suffix)
+    given = {"sequences": base / "sequences", "one": base / "sequences" / "00"}.get(layout, tmp_path)
+    sequence = open_sequence(given, "00", None, None)
+    assert (sequence.name, len(sequence)) == ("00", 6)
+    assert sequence.frame(3).image[0, 0] == pytest.approx([30, 30, 30], abs=2)
+    assert sequence.frame(3).image.shape == (24, 40, 3)
+    assert sequence.frame(3).stamp == pytest.approx(0.3) and sequence.frame(3).index == 3
+    assert sequence.reference is not None and sequence.camera_height_m == 1.65
+    assert sequence.provenance() == ("kitti_odometry/00[0:6]",)
+
+
+@pytest.mark.parametrize("camera, x_m", [(0, 0.0), (1, 0.5), (2, -0.06), (3, 0.47)])
+def test_each_camera_has_its_intrinsics_and_reference(
+    tmp_path: Path, odometry, camera: int, x_m: float
+) -> None:
+    folder = odometry(tmp_path, camera=camera)
+    rows = (folder / "calib.txt").read_text().splitlines()
+    rows[camera] = rows[camera].replace("30 0 20", "31 0 20", 1).replace("30 12", "31 12")
+    (folder / "calib.txt").write_text("\n".join(rows))
+    sequence = open_sequence(tmp_path, None, None, None)
+    assert sequence.intrinsics.fx == 31
+    assert sequence.reference is not None
+    assert np.array_equal(sequence.reference[0], np.eye(4))
+    # camera 0 drives 1 m a frame along its z axis without turning: every camera of the rig does
+    assert sequence.reference[4, :3, 3] == pytest.approx([0, 0, 4])
+
+
+def test_reference_of_a_turning_rig(tmp_path: Path, odometry) -> None:
+    """The rig turns right by 90 degrees about camera 0; camera 2, 6 cm left of it, swings forward."""
+    odometry(tmp_path, frames=2)
+    (tmp_path / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 0 0 1 0 0 -1 0 0 0\n")
+    reference = open_sequence(tmp_path, "00", None, None).reference
+    assert reference is not None
+    assert reference[1, :3, 3] == pytest.approx([0.06, 0, 0.06])
+
+
+def test_colour_is_preferred_to_grey(tmp_path: Path, odometry) -> None:
+    odometry(tmp_path, camera=0)
+    odometry(tmp_path, camera=3, suffix=".jpg")
+    sequence = open_sequence(tmp_path, "00", None, None)
+    assert sequence.T_camera_lidar is not None
+    # Tr puts the LiDAR at (0.1, 0.2, 0.3) of camera 0; camera 3 is 0.47 m right of it
+    assert sequence.T_camera_lidar[:3, 3] == pytest.approx([0.1 - 0.47, 0.2, 0.3])
+
+
+def test_scans(tmp_path: Path, odometry) -> None:
+    folder = odometry(tmp_path)
+    (folder / "velodyne").mkdir()
+    (folder / "velodyne" / "000002.bin").write_bytes(b"")
+    sequence = open_sequence(tmp_path, "00", None, "1:4")
+    assert sequence.scan_path(1) == folder / "velodyne" / "000002.bin"
+    assert sequence.scan_path(0) is None
+
+
+def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture) -> None:
+    folder = odometry(tmp_path)
+    (folder / "times.txt").unlink()
+    with caplog.at_level(logging.WARNING):
+        sequence = open_sequence(tmp_path, "00", None, None)
+    assert sequence.stamps == pytest.approx(np.arange(6) / 10)
+    assert "times.txt" in caplog.text
+
+
+def test_without_poses_or_lidar_calibration(tmp_path: Path, odometry) -> None:
+    folder = odometry(tmp_path, poses=False)
+    calib = (folder / "calib.txt").read_text()
+    (folder / "calib.txt").write_text(calib[: calib.index("Tr")])
+    sequence = open_sequence(tmp_path, "00", None, None)
+    assert sequence.reference is None and sequence.T_camera_lidar is None
+
+
+def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
+    odometry(tmp_path, name="sim")
+    (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.52\n")
+    (tmp_path / "simulation.json").write_text(json.dumps({"seed": 612}))
+    sequence = open_sequence(tmp_path, None, None, "0:3")
+    assert sequence.camera_height_m == 1.52
+    assert sequence.provenance() == ("simulated/612",)
+    (tmp_path / "simulation.json").write_text("{}")
+    with pytest.raises(SequenceError, match="must hold the simulation's seed"):
+        open_sequence(tmp_path, None, None, None)
+
+
+def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str) -> None:
+    odometry(tmp_path)
+    path = tmp_path / "mine.yaml"
+    path.write_text(camera_yaml.replace("fx: 30", "fx: 33") + "camera_height_m: unknown\n")
+    sequence = open_sequence(tmp_path, "00", path, None)
+    assert sequence.intrinsics.fx == 33 and sequence.camera_height_m is None
+
+
+def broken(folder: Path, base: Path, what: str) -> None:
+    match what:
+        case "gap":
+            (folder / "image_2/000002.png").unlink()
+        case "no calib":
+            (folder / "calib.txt").unlink()
+        case "bad calib":
+            (folder / "calib.txt").write_text("P2: 1 2 3\n")
+        case "short poses":
+            (base / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 4)
+        case "bad poses":
+            (base / "poses/00.txt").write_text("1 0 0\n" * 6)
+        case "short times":
+            (folder / "times.txt").write_text("0\n0.1\n")
+        case "bad times":
+            (folder / "times.txt").write_text("0\none\n")
+        case "equal times":
+            (folder / "times.txt").write_text("0\n1\n1\n2\n3\n4\n")
+        case "first image":
+            (folder / "image_2/000000.png").write_bytes(b"")
+        case "no images":
+            for path in (folder / "image_2").iterdir():
+                path.unlink()
+
+
+@pytest.mark.parametrize(
+    "what, message",
+    [
+        ("gap", r"no image 000002\.png in .*image_2"),
+        ("no calib", r"no calib\.txt in "),
+        ("bad calib", "row P2 has 3 numbers"),
+        ("short poses", r"00\.txt has 4 poses for 6 images: .*cut the poses"),
+        ("bad poses", r"00\.txt"),
+        ("short times", r"times\.txt has 2 rows for 6 images"),
+        ("bad times", r"times\.txt must hold one time"),
+        ("equal times", r"times\.txt row 3: stamps must be numbers that increase"),
+        ("first image", r"000000\.png is empty"),
+        ("no images", "looked for png or jpg in .*image_2"),
+    ],
+)
+def test_broken_sequences(tmp_path: Path, odometry, what: str, message: str) -> None:
+    broken(odometry(tmp_path), tmp_path, what)
+    with pytest.raises(SlamError, match=message) as caught:
+        open_sequence(tmp_path, "00", None, None)
+    assert "\n" not in str(caught.value)
+
+
+def test_damage_further_on_is_heard_when_read(tmp_path: Path, odometry) -> None:
+    folder = odometry(tmp_path)
+    path = folder / "image_2/000004.png"
+    path.write_bytes(path.read_bytes()[:40])
+    sequence = open_sequence(tmp_path, "00", None, None)
+    sequence.frame(3)
+    with pytest.raises(SequenceError, match=r"000004\.png is truncated"):
+        sequence.frame(4)
+    with pytest.raises(SequenceError, match="no frame 6 in sequence 00: it has frames 0 to 5"):
+        sequence.frame(6)

@@ -1,0 +1,75 @@
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import SequenceError
+from slam.sequences.catalogue import open_sequence
+
+STAMPS = [100.02, 100.05, 100.09]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, images, camera_yaml: str) -> Path:
+    root = tmp_path / "freiburg"
+    images(root / "rgb", [f"{stamp}.png" for stamp in STAMPS])
+    rows = "".join(f"{stamp} rgb/{stamp}.png\n" for stamp in STAMPS)
+    (root / "rgb.txt").write_text("# colour images\n# timestamp filename\n" + rows)
+    (root / "camera.yaml").write_text(camera_yaml)
+    return root
+
+
+def write_truth(folder: Path, stamps: np.ndarray) -> None:
+    """Straight ahead at 1 m/s, turning about y by 0.5 rad/s."""
+    half = 0.25 * (stamps - 100)
+    rows = [f"{s:.4f} 0 0 {s - 100:.6f} 0 {np.sin(h):.9f} 0 {np.cos(h):.9f}\n" for s, h in zip(stamps, half)]
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(rows))
+
+
+def test_opens(folder: Path) -> None:
+    sequence = open_sequence(folder, None, None, None)
+    assert (sequence.name, len(sequence), sequence.reference) == ("freiburg", 3, None)
+    assert sequence.stamps.tolist() == STAMPS
+    assert sequence.frame(2).image[0, 0, 0] == 20
+    assert sequence.provenance() == ("tum/freiburg[0:3]",)
+    assert sequence.camera_height_m is None and sequence.scan_path(0) is None
+
+
+def test_truth_is_interpolated(folder: Path) -> None:
+    write_truth(folder, np.arange(100.0, 100.2, 0.02))
+    reference = open_sequence(folder, None, None, None).reference
+    assert reference is not None
+    assert np.array_equal(reference[0], np.eye(4))
+    # 0.03 s after the first image, seen from a camera turned by 0.01 rad
+    assert reference[1, :3, 3] == pytest.approx([-0.03 * np.sin(0.01), 0, 0.03 * np.cos(0.01)], abs=1e-6)
+    assert reference[1, 0, 2] == pytest.approx(np.sin(0.015), abs=1e-6)
+
+
+def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_truth(folder, np.arange(101.0, 102.0, 0.02))
+    with caplog.at_level(logging.WARNING):
+        assert open_sequence(folder, None, None, None).reference is None
+    assert "no pose within 0.1 s of image 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("# nothing\n", "names no images"),
+        ("100.0 rgb/100.02.png extra\n", "line 1 is not 'stamp file'"),
+        ("soon rgb/100.02.png\n", "line 1 is not 'stamp file'"),
+        ("100.0 rgb/gone.png\n", r"no image .*gone\.png"),
+        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "row 2: stamps must be numbers that increase"),
+    ],
+)
+def test_malformed_index(folder: Path, text: str, message: str) -> None:
+    (folder / "rgb.txt").write_text(text)
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(folder, None, None, None)
+
+
+def test_needs_a_camera_file(folder: Path) -> None:
+    (folder / "camera.yaml").unlink()
+    with pytest.raises(SequenceError, match=r"no camera\.yaml for TUM folder"):
+        open_sequence(folder, None, None, None)

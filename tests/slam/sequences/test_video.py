@@ -1,0 +1,97 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.errors import SequenceError
+from slam.sequences import video
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.video import VideoFrames
+
+FRAMES = 90
+FORMATS = {".mp4": "mp4v", ".avi": "MJPG", ".mov": "mp4v", ".mkv": "MJPG"}
+
+
+def coded(number: int) -> np.ndarray:
+    """An image whose eight upright stripes are the bits of a number."""
+    bits = np.array([255 * (number >> bit & 1) for bit in range(8)], np.uint8)
+    return np.repeat(np.tile(np.repeat(bits, 8), (48, 1))[..., None], 3, axis=2)
+
+
+def decoded(image: np.ndarray) -> int:
+    bright = image[:, 4::8].mean(axis=(0, 2)) > 127
+    return int(sum(1 << bit for bit in range(8) if bright[bit]))
+
+
+def write_video(path: Path, frames: int = FRAMES) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fourcc = cv2.VideoWriter.fourcc(*FORMATS[path.suffix])
+    writer = cv2.VideoWriter(str(path), fourcc, 10, (64, 48))
+    if not writer.isOpened():
+        pytest.skip(f"this OpenCV cannot write {path.suffix}")
+    for k in range(frames):
+        writer.write(coded(k))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def camera_64(camera_yaml: str) -> str:
+    return camera_yaml.replace("width: 40", "width: 64").replace("height: 24", "height: 48")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str) -> None:
+    frames = VideoFrames(write_video(tmp_path / f"a{suffix}"))
+    assert (len(frames), frames.width, frames.height) == (FRAMES, 64, 48)
+    for index in [0, 1, 2, 80, 3, 79, 89, 10, 11, 0, 45]:
+        assert decoded(frames.read(index)) == index
+
+
+def test_uncounted_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "_COUNTED_FRAMES", 10)
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    assert len(frames) == FRAMES
+    for index in [70, 3, 60, 89, 0]:
+        assert decoded(frames.read(index)) == index
+
+
+def test_a_seek_that_lands_elsewhere_is_noticed(tmp_path: Path) -> None:
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    frames._times_ms = [time + 1 for time in frames._times_ms]
+    assert decoded(frames.read(50)) == 50
+    assert decoded(frames.read(5)) == 5
+
+
+def test_returned_images_may_be_written(tmp_path: Path) -> None:
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    frames.read(5)[:] = 255
+    assert decoded(frames.read(5)) == 5
+
+
+@pytest.mark.parametrize("by_folder", [False, True])
+def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
+    path = write_video(tmp_path / "trip" / "drive.avi")
+    (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
+    sequence = open_sequence(tmp_path / "trip" if by_folder else path, None, None, "10:20")
+    assert (sequence.name, len(sequence)) == ("drive", 10)
+    assert decoded(sequence.frame(2).image) == 12
+    assert sequence.stamps[0] == pytest.approx(2.0)
+    assert sequence.provenance() == ("folder/trip[10:20]",)
+
+
+def test_errors(tmp_path: Path, camera_64: str, camera_yaml: str) -> None:
+    path = write_video(tmp_path / "drive.avi")
+    with pytest.raises(SequenceError, match=r"no camera\.yaml for video .*drive\.avi"):
+        open_sequence(path, None, None, None)
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    with pytest.raises(SequenceError, match="are 64x48, but the camera file is for 40x24"):
+        open_sequence(path, None, None, None)
+    (tmp_path / "camera.yaml").write_text(camera_64)
+    write_video(tmp_path / "other.avi")
+    with pytest.raises(SequenceError, match="has 2 sequences: drive, other"):
+        open_sequence(tmp_path, None, None, None)
+    path.write_bytes(b"not a video")
+    with pytest.raises(SequenceError, match=r"drive\.avi cannot be opened"):
+        open_sequence(path, None, None, None)

@@ -1,0 +1,91 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from slam.config import SlamConfig, dump_yaml, load_config
+from slam.errors import ConfigError
+
+DEFAULT = Path(__file__).parents[2] / "configs" / "slam" / "default.yaml"
+
+
+def test_default_file_is_the_defaults_complete_and_explained():
+    assert load_config(DEFAULT) == load_config("default") == load_config() == SlamConfig()
+    assert DEFAULT.read_text() == dump_yaml(SlamConfig())
+    assert yaml.safe_load(DEFAULT.read_text()).keys() == SlamConfig.model_fields.keys()
+    assert "None" not in dump_yaml(SlamConfig())
+
+
+def test_dump_reads_back(tmp_path):
+    config = load_config(None, ["pose_graph.relative_tolerance=1e-4", "geometry.steps=[1, 2]", "scale.mode=none"])
+    assert config.pose_graph.relative_tolerance == 1e-4
+    assert config.geometry.steps == (1, 2)
+    path = tmp_path / "mine.yaml"
+    path.write_text(dump_yaml(config))
+    assert load_config(path) == config
+
+
+def test_file_may_be_partial_and_overrides_win(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("pose_graph: {huber_k: 2e0}\nmapping:\n  voxel_size_m: 1e-1\n")
+    config = load_config(path, ["pose_graph.huber_k=3"])
+    assert config.pose_graph.huber_k == 3.0
+    assert config.mapping.voxel_size_m == 0.1
+    path.write_text("")
+    assert load_config(path) == SlamConfig()
+
+
+def test_sections_are_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        SlamConfig().pose_graph.huber_k = 2.0
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("pose_graph.hubber_k=1", ["pose_graph.hubber_k", "did you mean 'pose_graph.huber_k'"]),
+        ("huber_k=1", ["huber_k", "did you mean 'pose_graph.huber_k'"]),
+        ("mapping.zzzz=1", ["mapping.zzzz", "allowed in mapping", "voxel_size_m"]),
+        ("pose_graph.huber_k=-1", ["pose_graph.huber_k", "greater than 0", "-1"]),
+        ("pose_graph.huber_k=.nan", ["pose_graph.huber_k", "nan"]),
+        ("pose_graph.kernel=tukey", ["pose_graph.kernel", "'huber'", "tukey"]),
+        ("scale.mode=metric", ["scale.mode", "camera-height", "metric"]),
+        ("mapping.enabled=maybe", ["mapping.enabled", "boolean", "maybe"]),
+        ("mapping=3", ["mapping", "section", "3"]),
+        ("mapping.enabled.deep=3", ["mapping.enabled", "deep"]),
+        ("mapping.depth_min_m=30", ["mapping", "depth_min_m < depth_max_m"]),
+        ("geometry.steps=[0]", ["geometry.steps", "greater than 0"]),
+        ("geometry.steps", ["section.key=value", "geometry.steps"]),
+        ("geometry.steps=[1", ["geometry.steps=[1", "YAML"]),
+    ],
+)
+def test_wrong_override_is_one_clear_line(override, parts):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [override])
+    assert "\n" not in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("- 1\n", "sections"),
+        ("mapping: {enabled: true\n", "YAML"),
+        ("mapping: {enabled: true, enabled: false}\n", "twice"),
+        ("maping: {}\n", "did you mean 'mapping'"),
+    ],
+)
+def test_wrong_file_is_one_clear_line(tmp_path, text, part):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=part) as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_name_lists_the_known_ones(tmp_path):
+    with pytest.raises(ConfigError, match=r"'defalt'.*known names: .*did you mean 'default'"):
+        load_config("defalt")
+    with pytest.raises(ConfigError, match="folder"):
+        load_config(tmp_path)

@@ -1,0 +1,216 @@
+"""Triangle soup with materials: every surface of the simulated world is a patch, a bent grid of quads."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+
+PARAMETERS = 6
+
+
+class Material(IntEnum):
+    """What a surface is made of; the key to its texture."""
+
+    ASPHALT = 0
+    JUNCTION = 1
+    PAVEMENT = 2
+    KERB = 3
+    GRASS = 4
+    GRAVEL = 5
+    WALL = 6
+    ROOF = 7
+    BARK = 8
+    LEAVES = 9
+    METAL = 10
+    SIGN = 11
+    PAINT = 12
+    GLASS = 13
+    TYRE = 14
+    FENCE = 15
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A finished soup; coordinates in the street frame (x east, y north, z up, metres).
+
+    Attributes:
+        vertices: ``(V, 3)``.
+        triangles: vertex indices, ``(T, 3)``.
+        uv: texture coordinates of the three corners, metres, ``(T, 3, 2)``.
+        normals: unit normals, ``(T, 3)``.
+        instance: index into the tables below, ``(T,)``.
+        material: per instance, ``(I,)``.
+        colours: two base colours per instance, RGB in [0, 1], ``(I, 2, 3)``.
+        parameters: what the texture of the material wants to know, ``(I, PARAMETERS)``.
+        offsets: where in the noise an instance lies, ``(I, 2)``.
+    """
+
+    vertices: Float32Array
+    triangles: NDArray[np.uint32]
+    uv: Float32Array
+    normals: Float32Array
+    instance: NDArray[np.int32]
+    material: NDArray[np.int32]
+    colours: Float32Array
+    parameters: Float32Array
+    offsets: Float32Array
+
+    def joined(self, other: Mesh, other_normals: Float32Array) -> Mesh:
+        """Both tables of looks in one, the other's triangles counted on; vertices stay this mesh's own."""
+        return replace(
+            self,
+            triangles=np.concatenate([self.triangles, other.triangles]),
+            uv=np.concatenate([self.uv, other.uv]),
+            normals=np.concatenate([self.normals, other_normals]),
+            instance=np.concatenate([self.instance, other.instance + len(self.material)]),
+            material=np.concatenate([self.material, other.material]),
+            colours=np.concatenate([self.colours, other.colours]),
+            parameters=np.concatenate([self.parameters, other.parameters]),
+            offsets=np.concatenate([self.offsets, other.offsets]),
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def _patch_triangles(rows: int, columns: int) -> IntArray:
+    """Triangles of a grid of vertices, wound so that (column, row) is right-handed, ``(T, 3)``."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+class Soup:
+    """Collects patches, then bends them onto the terrain in one go."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._vertices: list[FloatArray] = []
+        self._triangles: list[IntArray] = []
+        self._uv: list[FloatArray] = []
+        self._instance: list[IntArray] = []
+        self._materials: list[int] = []
+        self._colours: list[FloatArray] = []
+        self._parameters: list[FloatArray] = []
+        self._count = 0
+
+    def instance(
+        self,
+        material: Material,
+        colour: FloatArray,
+        colour2: FloatArray | None = None,
+        parameters: tuple[float, ...] = (),
+    ) -> int:
+        """Register one thing with its own look and return its number."""
+        row = np.zeros(PARAMETERS)
+        row[: len(parameters)] = parameters
+        self._materials.append(int(material))
+        self._colours.append(np.stack([colour, colour if colour2 is None else colour2]))
+        self._parameters.append(row)
+        return len(self._materials) - 1
+
+    def patch(self, points: FloatArray, uv: FloatArray, instance: int) -> None:
+        """Add a grid of quads.
+
+        Args:
+            points: plan coordinates of the grid's vertices, ``(R, C, 3)``.
+            uv: texture coordinates in metres, ``(R, C, 2)``.
+            instance: from :meth:`instance`.
+        """
+        triangles = _patch_triangles(points.shape[0], points.shape[1])
+        self._vertices.append(points.reshape(-1, 3))
+        self._uv.append(uv.reshape(-1, 2)[triangles])
+        self._triangles.append(triangles + self._count)
+        self._instance.append(np.full(len(triangles), instance))
+        self._count += points.shape[0] * points.shape[1]
+
+    def quad(self, corner: FloatArray, along: FloatArray, up: FloatArray, instance: int) -> None:
+        """Add one parallelogram, textured in metres from its corner."""
+        points = np.stack([[corner, corner + along], [corner + up, corner + along + up]])
+        width, height = float(np.linalg.norm(along)), float(np.linalg.norm(up))
+        self.patch(points, np.array([[[0, 0], [width, 0]], [[0, height], [width, height]]]), instance)
+
+    def finish(self, bend: Bend) -> Mesh:
+        """Bend every vertex from plan to street coordinates and drop triangles without area."""
+        vertices = bend(np.concatenate(self._vertices))
+        triangles, uv = np.concatenate(self._triangles), np.concatenate(self._uv)
+        instance = np.concatenate(self._instance)
+        corners = vertices[triangles]  # (T, 3, 3)
+        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normals = np.cross(edge1, edge2)
+        area = np.linalg.norm(normals, axis=1)
+        keep = area > 1e-6
+        normals /= np.maximum(area, 1e-9)[:, None]
+        count = len(self._materials)
+        return Mesh(
+            vertices=vertices.astype(np.float32),
+            triangles=triangles[keep].astype(np.uint32),
+            uv=uv[keep].astype(np.float32),
+            normals=normals[keep].astype(np.float32),
+            instance=instance[keep].astype(np.int32),
+            material=np.array(self._materials, dtype=np.int32),
+            colours=np.stack(self._colours).astype(np.float32),
+            parameters=np.stack(self._parameters).astype(np.float32),
+            offsets=self._rng.uniform(0.0, 200.0, (count, 2)).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A smooth map from the plan (straight streets, flat ground) to the street frame.
+
+    Streets of a town are swayed by two slow sine waves; a lone road follows a heading that wanders.
+
+    Attributes:
+        amplitudes: of the sway in x and in y and of the hills, metres, ``(3,)``.
+        wavelengths: of the same, metres, ``(3,)``.
+        phases: of the same, radians, ``(3, 2)``.
+        road: x, y and heading of a lone road every metre from plan x = ``road_start``, ``(M, 3)``; or None.
+        road_start: plan x of its first row.
+    """
+
+    amplitudes: FloatArray
+    wavelengths: FloatArray
+    phases: FloatArray
+    road: FloatArray | None = None
+    road_start: float = 0.0
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Map plan points ``(..., 3)`` to the street frame."""
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        k = 2.0 * np.pi / self.wavelengths
+        hill = self.amplitudes[2] * np.sin(k[2] * x + self.phases[2, 0]) * np.cos(k[2] * y + self.phases[2, 1])
+        if self.road is None:
+            sway_x = self.amplitudes[0] * np.sin(k[0] * y + self.phases[0, 0])
+            sway_y = self.amplitudes[1] * np.sin(k[1] * x + self.phases[1, 0])
+            return np.stack([x + sway_x, y + sway_y, z + hill], axis=-1)
+        steps = np.arange(len(self.road)) + self.road_start
+        centre_x, centre_y, heading = (np.interp(x, steps, self.road[:, i]) for i in range(3))
+        return np.stack([centre_x - y * np.sin(heading), centre_y + y * np.cos(heading), z + hill], axis=-1)
+
+
+def town_bend(rng: np.random.Generator) -> Bend:
+    """Streets that sway by a few degrees over gentle hills."""
+    wavelengths = rng.uniform([120.0, 120.0, 140.0], [220.0, 220.0, 220.0])
+    return Bend(
+        amplitudes=np.array([*rng.uniform(0.5, 2.2, 2), rng.uniform(0.1, 0.45)]),
+        wavelengths=wavelengths,
+        phases=rng.uniform(0.0, 2.0 * np.pi, (3, 2)),
+    )
+
+
+def road_bend(rng: np.random.Generator, start: float, end: float) -> Bend:
+    """A road whose heading wanders within about 35 degrees, radius of curvature at least about 100 m."""
+    town = town_bend(rng)
+    s = np.arange(np.floor(start), np.ceil(end) + 2.0)
+    heading = np.zeros_like(s)
+    for wavelength, amplitude in ((rng.uniform(330.0, 480.0), 0.38), (rng.uniform(150.0, 220.0), 0.14)):
+        heading += rng.uniform(0.5, 1.0) * amplitude * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 6.28))
+    position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
+    return Bend(town.amplitudes, town.wavelengths, town.phases, np.column_stack([position, heading]), float(s[0]))

@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 import yaml
@@ -24,7 +25,7 @@ from erfsfm.config import NetworkConfig, Section, dump_yaml
 from erfsfm.errors import CheckpointError
 from erfsfm.networks.presets import build
 
-FORMAT = 1
+FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
 FILES = ("depth.safetensors", "pose.safetensors")
 
@@ -32,7 +33,7 @@ FILES = ("depth.safetensors", "pose.safetensors")
 class ModelRecord(Section):
     """Everything about a pair of networks but their weights."""
 
-    format: int = FORMAT
+    format: Literal[1] = FORMAT
     network: NetworkConfig
     trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
     licence: str = Field("unknown: depends on the training data", description="of the weights")
@@ -89,7 +90,7 @@ def load_model(name_or_folder: str | Path) -> Model:
         CheckpointError: missing, damaged or of another architecture; one line.
     """
     folder = find_weights(name_or_folder)
-    record = _read_record(folder / "model.yaml")
+    record = read_record(folder / "model.yaml")
     depth_net, pose_net = build_networks(record.network)
     for name, net in zip(FILES, (depth_net, pose_net)):
         _load_into(net, folder / name)
@@ -129,12 +130,18 @@ def _stored(key: str, value: torch.Tensor, half: bool) -> torch.Tensor:
     return value.detach().cpu().contiguous() if statistics or not half else value.detach().cpu().half().contiguous()
 
 
-def _read_record(path: Path) -> ModelRecord:
+def read_record(path: Path) -> ModelRecord:
+    """Read a ``model.yaml``.
+
+    Raises:
+        CheckpointError: damaged, or of another format.
+    """
     try:
         return ModelRecord.model_validate(yaml.safe_load(path.read_text()))
     except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         first = error.errors()[0] if isinstance(error, ValidationError) else None
-        detail = f"'{'.'.join(map(str, first['loc']))}': {first['msg']}" if first else "it is not YAML"
+        where = ".".join(map(str, first["loc"])) if first else ""
+        detail = f"{where or 'all of it'}: {first['msg']}" if first else "it is not YAML"
         raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {detail}") from error
 
 

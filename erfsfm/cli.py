@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -23,11 +23,13 @@ app = typer.Typer(
 evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
 app.add_typer(evaluate_app, name="evaluate")
 
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
 Seed = Annotated[int, typer.Option(help="seed of everything random")]
 Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-Fidelity = Annotated[str, typer.Option(help="default, or paper: the reference protocol with its quirks")]
+Fidelity = Annotated[
+    Literal["default", "paper"], typer.Option(help="paper: as the reference code does it, with its quirks")
+]
 
 
 @app.command()
@@ -91,7 +93,7 @@ def predict(
 
 @app.command()
 def networks(
-    fidelity: Annotated[str, typer.Option(help="default or paper")] = "default",
+    fidelity: Fidelity = "default",
     width: Annotated[float, typer.Option(help="multiplies the channels")] = 1.0,
     sources: Annotated[int, typer.Option(help="source frames of the pose networks")] = 4,
     as_json: Json = False,
@@ -100,7 +102,7 @@ def networks(
 
     Example: erfsfm networks --fidelity paper
     """
-    from erfsfm.networks.summary import describe
+    from erfsfm.networks.presets import describe
 
     summaries: list[dict[str, Any]] = [s.as_dict() for s in describe(fidelity, width, sources)]
     if as_json:
@@ -167,7 +169,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         app()
-    except ErfsfmError as error:
+    except (ErfsfmError, OSError) as error:
         typer.echo(f"erfsfm: {error}", err=True)
         sys.exit(1)
     except KeyboardInterrupt:

@@ -49,7 +49,7 @@ class DataConfig(Section):
     validation: list[str] = Field(
         default_factory=lambda: ["simulated/500-599"], description="recordings that only validate"
     )
-    weights: dict[str, float] = Field(
+    weights: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,
         description="share of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "
         "empty: by number of frames",
@@ -91,7 +91,7 @@ class TrainingConfig(Section):
     checkpoint_every: int = Field(default=500, ge=1, description="steps")
     log_every: int = Field(default=50, ge=1, description="steps")
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
-    seed: int = 0
+    seed: int = Field(default=0, ge=0)
 
 
 class ExperimentConfig(Section):

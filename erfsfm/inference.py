@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.checkpoint import Model, find_weights, load_model, weights_sha256, write_atomically
+from erfsfm.data.recordings import resize_image
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.geometry.transforms import pose_vector_to_matrix
@@ -101,9 +102,7 @@ class DepthPosePredictor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
-        size = (self.record.network.width, self.record.network.height)
-        if (image.shape[1], image.shape[0]) != size:
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        image = resize_image(image, self.record.network.height, self.record.network.width)
         tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
         return tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 MISSING = "–"
+NOT_RECORDED = "not recorded"
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,12 @@ def lookup(tree: Mapping[str, Any] | None, *path: str) -> tuple[Any, str]:
     node: Any = tree
     for name in path:
         if not isinstance(node, Mapping):
-            return None, "not recorded"
+            return None, NOT_RECORDED
         value = node.get(name)
         if value is None:
-            return None, str(node.get(f"{name}_reason") or "not recorded")
+            return None, str(node.get(f"{name}_reason") or NOT_RECORDED)
         node = value
-    return (None, "not recorded") if node is None else (node, "")
+    return (None, NOT_RECORDED) if node is None else (node, "")
 
 
 def written(value: Any, decimals: int) -> str:
@@ -102,28 +103,25 @@ def comparison_table(runs: Sequence[RunFolder]) -> Table:
     from rich.text import Text
 
     contents = _contents(runs)
-    table = Table(title="Errors against the reference", title_justify="left", pad_edge=False)
-    table.add_column("run", overflow="fold", max_width=36)
+    table = Table(title="Errors against the reference", title_justify="left", caption_justify="left")
+    table.add_column("run", overflow="fold", min_width=10)
     table.add_column("trajectory", no_wrap=True)
     for statistic in STATISTICS:
-        table.add_column(statistic.short, justify="right", no_wrap=True)
+        table.add_column(statistic.short, justify="right", min_width=statistic.decimals + 2, no_wrap=True)
     notes: dict[str, None] = {}
     for name, metrics in zip(run_names(runs), contents):
-        reason = failure(metrics)
-        if reason:
-            table.add_row(Text(name), Text(f"failed: {reason}"), end_section=True)
-            continue
-        rows = _rows(metrics, notes)
         leak, _ = lookup(metrics, "provenance", "leak")
-        for k, (trajectory, cells) in enumerate(rows):
-            title = Text(name) if k == 0 else Text("LEAK", style="bold red") if k == 1 and leak else Text("")
-            table.add_row(title, trajectory, *cells, end_section=k == len(rows) - 1)
+        title = Text.assemble(name, ("\nLEAK", "bold red") if leak else "")
+        rows = [] if failure(metrics) else _rows(name, metrics, notes)
+        if failure(metrics):
+            notes[f"{name} failed: {failure(metrics)}."] = None
+            title.append("\nfailed", "bold red")
+        names, *columns = zip(*rows) if rows else [()] * (1 + len(STATISTICS))
+        table.add_row(title, *("\n".join(cells) for cells in (names, *columns)), end_section=True)
         if leak:
-            notes["LEAK: the weights have seen this sequence in training; its numbers are no test."] = None
-        notes.update(dict.fromkeys(unit_notes(metrics)))
-    notes["ATE RMSE and snippet ATE in metres, snippet RE in radians."] = None
-    table.caption = Text("\n".join(notes))
-    table.caption_justify = "left"
+            notes["LEAK: the weights have seen the sequence in training; the numbers are no test."] = None
+        notes.update({f"{name}: {note}": None for note in unit_notes(metrics)})
+    table.caption = Text("\n".join(["ATE and snippet ATE in metres, snippet RE in radians.", *notes]))
     return table
 
 
@@ -157,20 +155,20 @@ def _contents(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
     return [run.metrics() for run in runs]
 
 
-def _rows(metrics: Mapping[str, Any], notes: dict[str, None]) -> list[tuple[str, list[str]]]:
-    """Trajectory and cells of each row; reasons of whole missing trajectories go to the notes."""
+def _rows(name: str, metrics: Mapping[str, Any], notes: dict[str, None]) -> list[list[str]]:
+    """Cells of each trajectory, its own name first; why numbers are missing goes to the notes."""
     rows = []
-    for name in TRAJECTORIES:
-        numbers, reason = lookup(metrics, "trajectories", name)
+    missing: dict[str, dict[str, None]] = {}
+    for trajectory in TRAJECTORIES:
+        numbers, reason = lookup(metrics, "trajectories", trajectory)
         if numbers is None:
-            notes[f"No {name} trajectory: {reason}."] = None
+            missing.setdefault(reason, {})[trajectory] = None
             continue
-        cells, reasons = [], {}
-        for statistic in STATISTICS:
-            value, reason = lookup(numbers, *statistic.path)
-            cells.append(written(value, statistic.decimals))
-            if reason:
-                reasons[reason] = None
-        notes.update({f"{MISSING} in {name}: {reason}.": None for reason in reasons})
-        rows.append((name, cells))
-    return rows or [("none", [MISSING] * len(STATISTICS))]
+        values = [lookup(numbers, *statistic.path) for statistic in STATISTICS]
+        for _, why in values:
+            if why:
+                missing.setdefault(why, {})[trajectory] = None
+        cells = [written(value, statistic.decimals) for (value, _), statistic in zip(values, STATISTICS)]
+        rows.append([trajectory, *cells])
+    notes.update({f"{MISSING} {name}, {' and '.join(where)}: {why}.": None for why, where in missing.items()})
+    return rows

@@ -29,9 +29,7 @@ class Section(BaseModel):
 class FrontendConfig(Section):
     """Noise of the pose network's direct snippet poses, see ``frontend/network_factors.py``."""
 
-    rotation_sigma_deg: float = Field(
-        default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step"
-    )
+    rotation_sigma_deg: float = Field(default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step")
     translation_sigma_share: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
     translation_floor_share: float = Field(
         default=0.05, gt=0, le=10, description="floor, as a share of the median one-frame step"
@@ -42,39 +40,25 @@ class GeometryConfig(Section):
     """Relative poses from tracked corners, see ``frontend/geometric_factors.py``."""
 
     enabled: bool = Field(default=True, description="add geometric factors beside the network's")
-    steps: tuple[PositiveInt, ...] = Field(
-        default=(1,), min_length=1, description="frame distances to measure"
-    )
+    steps: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1, description="frame distances to measure")
     max_corners: int = Field(default=800, ge=50, le=10000, description="corners to track")
-    corner_quality: float = Field(
-        default=0.003, gt=0, lt=1, description="share of the best corner's strength"
-    )
+    corner_quality: float = Field(default=0.003, gt=0, lt=1, description="share of the best corner's strength")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners")
     window_px: int = Field(default=11, ge=5, le=63, description="side of the tracking window")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
-    reprojection_px: float = Field(
-        default=2.0, gt=0, description="largest reprojection error of a PnP inlier"
-    )
+    reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")
     min_inliers: int = Field(default=40, ge=8, description="fewer refuse the measurement")
     still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
     min_parallax_px: float = Field(
-        default=1.5, gt=0, description="median parallax that the essential matrix needs"
+        default=0.8, gt=0, description="median motion that a rotation must leave unexplained"
     )
-    min_point_parallax_px: float = Field(
-        default=2.0, gt=0, description="least parallax of a point measuring length"
-    )
-    max_depth_heights: float = Field(
-        default=30.0, gt=0, description="farthest trusted depth, in camera heights"
-    )
+    min_point_parallax_px: float = Field(default=2.0, gt=0, description="least parallax of a point measuring length")
+    max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
     rotation_floor_deg: float = Field(default=0.04, gt=0, description="least rotation sigma")
-    direction_floor_deg: float = Field(
-        default=0.5, gt=0, description="least sigma of the translation's direction"
-    )
-    length_floor_share: float = Field(
-        default=0.05, gt=0, description="least sigma of the translation's length"
-    )
+    direction_floor_deg: float = Field(default=0.5, gt=0, description="least sigma of the translation's direction")
+    length_floor_share: float = Field(default=0.05, gt=0, description="least sigma of the translation's length")
 
 
 class ScaleConfig(Section):
@@ -85,12 +69,8 @@ class ScaleConfig(Section):
     )
     reference_frames: int = Field(default=50, ge=2, description="first frames that mode reference compares")
     min_frames: int = Field(default=5, ge=1, description="fewer usable frames refuse a scale")
-    rejection_mads: float = Field(
-        default=3.0, gt=0, description="frames farther from the median are left out"
-    )
-    smoothing_frames: int = Field(
-        default=41, ge=1, description="window in which the scale may differ from the drive's"
-    )
+    rejection_mads: float = Field(default=3.0, gt=0, description="frames farther from the median are left out")
+    smoothing_frames: int = Field(default=41, ge=1, description="window in which the scale may differ from the drive's")
     road_top_share: float = Field(
         default=0.35,
         ge=0,
@@ -98,18 +78,10 @@ class ScaleConfig(Section):
         description="top edge of the road trapezoid, from horizon (0) to image bottom (1)",
     )
     road_bottom_share: float = Field(default=0.97, gt=0, le=1, description="bottom edge, likewise")
-    road_top_width: float = Field(
-        default=0.16, gt=0, le=1, description="width of the top edge, share of the image"
-    )
-    road_bottom_width: float = Field(
-        default=0.5, gt=0, le=1, description="width of the bottom edge, likewise"
-    )
-    max_tilt_deg: float = Field(
-        default=12.0, gt=0, lt=90, description="plane normal from the camera's y axis"
-    )
-    inlier_share_of_depth: float = Field(
-        default=0.05, gt=0, lt=1, description="depth error of a plane inlier"
-    )
+    road_top_width: float = Field(default=0.16, gt=0, le=1, description="width of the top edge, share of the image")
+    road_bottom_width: float = Field(default=0.5, gt=0, le=1, description="width of the bottom edge, likewise")
+    max_tilt_deg: float = Field(default=12.0, gt=0, lt=90, description="plane normal from the camera's y axis")
+    inlier_share_of_depth: float = Field(default=0.05, gt=0, lt=1, description="depth error of a plane inlier")
     min_inlier_share: float = Field(default=0.5, gt=0, le=1, description="fewer inliers refuse the frame")
 
     @model_validator(mode="after")
@@ -126,16 +98,10 @@ class PoseGraphConfig(Section):
         default="huber", description="robust loss; huber-cauchy polishes the Huber result with Cauchy"
     )
     huber_k: float = Field(default=1.345, gt=0, description="whitened residual where Huber turns linear")
-    cauchy_k: float = Field(
-        default=3.0, gt=0, description="whitened residual where Cauchy has halved the weight"
-    )
+    cauchy_k: float = Field(default=3.0, gt=0, description="whitened residual where Cauchy has halved the weight")
     max_iterations: int = Field(default=100, ge=1, description="Levenberg-Marquardt iterations per stage")
-    relative_tolerance: float = Field(
-        default=1e-6, gt=0, lt=1, description="stop below this relative decrease"
-    )
-    max_dropped_loops: int = Field(
-        default=10, ge=0, description="loop edges to give up where the system is singular"
-    )
+    relative_tolerance: float = Field(default=1e-6, gt=0, lt=1, description="stop below this relative decrease")
+    max_dropped_loops: int = Field(default=10, ge=0, description="loop edges to give up where the system is singular")
 
 
 class MappingConfig(Section):
@@ -147,26 +113,14 @@ class MappingConfig(Section):
     keyframe_rotation_deg: float = Field(default=3.0, ge=0, description="or after turning this far")
     width_px: int = Field(default=416, ge=32, description="depth maps are thinned to about this width")
     voxel_size_m: float = Field(default=0.2, gt=0, description="side of a voxel")
-    truncation_voxels: float = Field(
-        default=4.5, ge=1, description="truncation distance of the signed distance"
-    )
+    truncation_voxels: float = Field(default=4.5, ge=1, description="truncation distance of the signed distance")
     depth_min_m: float = Field(default=1.0, ge=0, description="nearest depth fused")
     depth_max_m: float = Field(default=25.0, gt=0, description="farthest depth fused")
-    max_depth_step: float = Field(
-        default=0.12, gt=0, description="relative step between neighbours that marks an edge"
-    )
-    consistency: float = Field(
-        default=0.1, gt=0, description="relative depth difference to the previous view"
-    )
-    min_weight: float = Field(
-        default=3.0, ge=0, description="observations that a voxel needs to be extracted"
-    )
-    min_component_triangles: int = Field(
-        default=100, ge=0, description="smaller pieces of the mesh are removed"
-    )
-    max_blocks: int = Field(
-        default=12000, ge=16, description="fusion stops there (16^3 voxels, 80 KiB a block)"
-    )
+    max_depth_step: float = Field(default=0.12, gt=0, description="relative step between neighbours that marks an edge")
+    consistency: float = Field(default=0.1, gt=0, description="relative depth difference to the previous view")
+    min_weight: float = Field(default=3.0, ge=0, description="observations that a voxel needs to be extracted")
+    min_component_triangles: int = Field(default=100, ge=0, description="smaller pieces of the mesh are removed")
+    max_blocks: int = Field(default=12000, ge=16, description="fusion stops there (16^3 voxels, 80 KiB a block)")
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:

@@ -111,7 +111,7 @@ class TsdfMap:
                 extracted.triangle.indices.numpy().astype(np.int64),
                 _array(extracted.vertex.colors),
             )
-            self._mesh = _without_small_components(mesh, self._config.min_component_triangles)
+            self._mesh = _without_small_components(_sorted(mesh), self._config.min_component_triangles)
         if len(self._mesh.triangles) == 0:
             raise SlamError("the map is empty: no piece of surface is larger than min_component_triangles")
         return self._mesh
@@ -121,7 +121,12 @@ class TsdfMap:
         if self._cloud is None:
             self._fuse_lonely_frame()
             point = self._extract(self._grid.extract_point_cloud).point
-            self._cloud = MapCloud(_array(point.positions), _array(point.normals), _array(point.colors))
+            # Open3D's threads finish in any order: sorted, two runs give one file
+            order = np.lexsort(_array(point.positions).T)
+            positions, normals, colours = (
+                _array(part)[order] for part in (point.positions, point.normals, point.colors)
+            )
+            self._cloud = MapCloud(positions, normals, colours)
         return self._cloud
 
     def statistics(self) -> MapStatistics:
@@ -237,12 +242,14 @@ class TsdfMap:
             raise SlamError("the map is empty: no depth passed the filters")
         # one frame alone weighs 1: a short sequence must not ask for more than it has
         weight = min(self._config.min_weight, self._fused) - 0.5
+        unseen = SlamError(f"the map is empty: no surface was seen {self._config.min_weight:g} times")
         try:
-            return extract(weight)
+            extracted = extract(weight)
         except RuntimeError as error:  # Open3D cannot build an empty geometry
-            raise SlamError(
-                f"the map is empty: no surface was seen {self._config.min_weight:g} times"
-            ) from error
+            raise unseen from error
+        if extracted.is_empty():
+            raise unseen
+        return extracted
 
 
 @dataclass(frozen=True)
@@ -282,6 +289,18 @@ def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
         edges[near] |= step
         edges[far] |= step
     return edges
+
+
+def _sorted(mesh: MapMesh) -> MapMesh:
+    """The same mesh in an order that does not depend on how Open3D's threads finished."""
+    order = np.lexsort(mesh.vertices_world.T)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    triangles = rank[mesh.triangles]
+    first = triangles.argmin(axis=1)[:, None]  # turning a triangle keeps the side it faces
+    triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
+    triangles = triangles[np.lexsort(triangles.T[::-1])]
+    return MapMesh(mesh.vertices_world[order], triangles, mesh.colours[order])
 
 
 def _without_small_components(mesh: MapMesh, min_triangles: int) -> MapMesh:

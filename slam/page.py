@@ -28,11 +28,11 @@ code { font: 13px/1.45 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monosp
 .stamp b { letter-spacing: 0.06em; margin-right: 8px; }
 .hint { margin: 18px 0 0; padding: 10px 16px; background: var(--wash); border-left: 4px solid var(--accent);
   border-radius: 4px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 22px 0 0; }
-.card { border: 1px solid var(--line); border-radius: 6px; padding: 10px 14px; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(122px, 1fr)); gap: 10px; margin: 22px 0 0; }
+.card { border: 1px solid var(--line); border-radius: 6px; padding: 9px 12px; }
 .card .name { color: var(--soft); font-size: 12.5px; }
-.card .value { font-size: 22px; line-height: 1.3; font-variant-numeric: tabular-nums; }
-.card .unit { font-size: 13px; color: var(--soft); }
+.card .value { font-size: 20px; line-height: 1.3; font-variant-numeric: tabular-nums; }
+.card .unit { font-size: 12px; color: var(--soft); }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; margin: 10px 0; }
 th, td { padding: 5px 12px; text-align: right; vertical-align: top; border-bottom: 1px solid #e9ecf0; }
 th:first-child, td:first-child { text-align: left; }
@@ -45,7 +45,7 @@ td.missing { color: #8b949e; cursor: help; }
 .bar { display: block; height: 12px; margin-top: 5px; background: var(--accent); border-radius: 2px;
   min-width: 1px; print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 td.track { width: 55%; }
-figure { margin: 12px 0 20px; }
+figure { margin: 12px auto 22px; max-width: 860px; }
 figure img { display: block; width: 100%; height: auto; }
 figcaption { margin-top: 4px; }
 footer { margin-top: 44px; padding-top: 10px; border-top: 1px solid var(--line); }
@@ -89,8 +89,9 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def section(title: str, *pieces: str) -> str:
-    """A headed section of ready pieces; empty ones are left out."""
-    return "\n".join(["<section>", f"<h2>{escape(title)}</h2>", *filter(None, pieces), "</section>"])
+    """A headed section of ready pieces, or nothing where all of them are empty."""
+    filled = [piece for piece in pieces if piece]
+    return "\n".join(["<section>", f"<h2>{escape(title)}</h2>", *filled, "</section>"]) if filled else ""
 
 
 def text(words: str, style: str = "") -> str:
@@ -133,16 +134,15 @@ def table(head: Sequence[str], rows: Iterable[Row | str], style: str = "") -> st
     return "\n".join([*lines, "</tbody>", "</table>"])
 
 
-def bars(head: Sequence[str], rows: Iterable[tuple[str, str, float]]) -> str:
-    """A table of (name, words, share of 1) with each share drawn as a bar."""
+def bars(head: Sequence[str], rows: Iterable[tuple[str, str, str, float]]) -> str:
+    """A table of (name, words, words, share of 1) with each share drawn as a bar."""
     names = "".join(f"<th>{escape(name)}</th>" for name in head)
     lines = ["<table>", f"<thead><tr>{names}<th></th></tr></thead>", "<tbody>"]
-    for name, words, share in rows:
+    for *words, share in rows:
+        cells = "".join(f"<td>{escape(word)}</td>" for word in words)
         width = 100.0 * min(max(share, 0.0), 1.0)
-        lines.append(
-            f"<tr><td>{escape(name)}</td><td>{escape(words)}</td>"
-            f'<td class="track"><span class="bar" style="width: {width:.1f}%"></span></td></tr>'
-        )
+        bar = f'<span class="bar" style="width: {width:.1f}%"></span>'
+        lines.append(f'<tr>{cells}<td class="track">{bar}</td></tr>')
     return "\n".join([*lines, "</tbody>", "</table>"])
 
 

@@ -183,7 +183,7 @@ class SlamPipeline:
         height, width = depth.shape
         thinned = min(mapping.width_px / width, 1.0)
         size = (max(round(width * thinned), 1), max(round(height * thinned), 1))
-        small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+        small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
         seen.keyframes.append(Keyframe(frame.index, image, small))
 

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam import se3
+from slam.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.errors import RunError
 from slam.frames import DepthMap, Image
 from slam.run_folder import TRAJECTORIES, RunFolder
-from slam.se3 import FloatArray
 from slam.trajectory import Trajectory, associate
 
 if TYPE_CHECKING:
@@ -28,9 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
 SUFFIXES = (".png", ".pdf", ".svg")
-REFERENCE = "reference"
-SEGMENT_LENGTHS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-SEGMENT_STEP = 10
 CAMERA_HEIGHTS = "camera heights"
 
 _STYLE = {
@@ -50,21 +45,12 @@ _STYLE = {
     "svg.hashsalt": "erfsfm-slam",
 }
 _LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE: ("Ground truth", {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.5}),
+    REFERENCE: ("Ground truth", {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.2, "zorder": 4}),
     "network": ("Network, chained", {"color": "#e69f00", "linestyle": "-", "linewidth": 1.3}),
     "odometry": ("Odometry", {"color": "#cc79a7", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 1.5}),
     "optimised": ("Optimised", {"color": "#0072b2", "linestyle": "-", "linewidth": 2.0}),
     "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
 }
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Mean error of segments of one length: ``translation`` as a share, ``rotation`` in radians a metre."""
-
-    length_m: float
-    translation: float
-    rotation: float
 
 
 def trajectory_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
@@ -106,8 +92,8 @@ def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory]
             label += " (scaled)"
         axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
     start = trajectories[REFERENCE if has_reference else next(iter(trajectories))].positions[0]
-    marker = {"marker": "o", "s": 42, "facecolor": "white", "edgecolor": "black", "linewidth": 1.3}
-    axes.scatter(start[0], start[2], zorder=5, label="Start", **marker)
+    marker: dict[str, Any] = {"marker": "o", "markersize": 6.5, "markerfacecolor": "white", "markeredgewidth": 1.3}
+    axes.plot(start[0], start[2], color="black", linestyle="", zorder=5, label="Start", **marker)
     unit = "m" if has_reference else unit
     axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     axes.set_aspect("equal", adjustable="datalim")
@@ -120,11 +106,11 @@ def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit
     """Draw the position error on a figure or a part of one."""
     reference = _reference(trajectories)
     axes = canvas.subplots()
-    for name, trajectory in _estimates(aligned(trajectories)):
+    for name, trajectory in estimates(aligned(trajectories)):
         estimate, truth = associate(trajectory, reference)
         error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
         label, look = _LOOKS[name]
-        axes.plot(_travelled(truth), error, label=label, **look)
+        axes.plot(travelled(truth), error, label=label, **look)
     axes.set(xlabel="distance travelled (m)", ylabel="position error (m), 7 dof")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
@@ -137,7 +123,7 @@ def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit:
     reference = _reference(trajectories)
     left, right = canvas.subplots(1, 2)
     lengths: set[float] = set()
-    for name, trajectory in _estimates(aligned(trajectories)):
+    for name, trajectory in estimates(aligned(trajectories)):
         drifts = segment_drifts(*associate(trajectory, reference))
         length = [drift.length_m for drift in drifts]
         lengths.update(length)
@@ -167,9 +153,10 @@ def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Se
         labels: over each frame.
     """
     from matplotlib import colormaps
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     height, width = images[0].shape[:2]
-    columns = min(len(images), 2 if width > 2 * height else 4)
+    columns = min(len(images), 3 if width > 2 * height else 5)
     blocks = -(-len(images) // columns)
     disparities = [_disparity(depth) for depth in depths]
     seen = np.concatenate([disparity.compressed() for disparity in disparities])
@@ -178,8 +165,8 @@ def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Se
     with _figure_style() as new_figure:
         block_width = 7.4 / columns
         size = (7.4, blocks * (2 * block_width * height / width + 0.3))
-        figure = new_figure(figsize=size, layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
+        narrow = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
+        figure = new_figure(figsize=size, layout=narrow)
         grid = figure.subplots(2 * blocks, columns, squeeze=False)
         for axes in grid.flat:
             axes.axis("off")
@@ -213,10 +200,12 @@ def map_figure(
     chosen = chosen[np.argsort(-points[chosen, 1], kind="stable")]
     ground = points[chosen][:, [0, 2]]
     path = trajectory.positions[:, [0, 2]] if trajectory else np.empty((0, 2))
-    corners = np.concatenate([np.percentile(ground, [0.5, 99.5], axis=0), path]) if len(ground) else path
+    corners = np.concatenate([np.percentile(ground, [0.5, 99.5], axis=0) if len(ground) else np.zeros((1, 2)), path])
     low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.04 * float((high - low).max()) or 1.0
     with _figure_style() as new_figure:
-        figure = new_figure(figsize=(7.4, 5.6), layout="constrained")
+        share = float((high - low + margin)[1] / (high - low + margin)[0])
+        figure = new_figure(figsize=(7.4, np.clip(6.4 * share + 1.0, 2.6, 7.0)), layout="constrained")
         axes = figure.subplots()
         rgb = np.clip(colours[chosen], 0.0, 1.0)
         size = float(np.clip(60_000 / max(len(chosen), 1), 0.25, 4.0))
@@ -224,9 +213,8 @@ def map_figure(
         if trajectory:
             axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
             axes.plot(path[:, 0], path[:, 1], **_LOOKS["optimised"][1], label="Optimised trajectory")
-            axes.legend(**_beside())
-        axes.set_aspect("equal", adjustable="datalim")
-        margin = 0.04 * float((high - low).max())
+            figure.legend(loc="outside upper center")
+        axes.set_aspect("equal")
         axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
         axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     return figure
@@ -239,6 +227,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
         RunError: an unknown ``what`` or suffix, or a run without what the figure needs.
     """
     panels = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
+    what = [name.strip() for name in what]
     unknown = [name for name in what if name not in panels]
     if unknown or not what or not runs:
         wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
@@ -285,52 +274,6 @@ def length_unit(run: RunFolder) -> str:
     return "m" if scale.get("value") is not None else "unscaled"
 
 
-def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
-    """Estimates brought to the reference by the best similarity of positions (Umeyama 1991).
-
-    Without a reference they stay as written, only the raw network is brought to the optimised one's scale.
-    """
-    drawn = dict(trajectories)
-    if REFERENCE in drawn:
-        for name, trajectory in _estimates(drawn):
-            estimate, truth = associate(trajectory, drawn[REFERENCE])
-            fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
-            moved = fit.apply_to_poses(trajectory.T_world_camera)
-            drawn[name] = Trajectory(trajectory.stamps, moved, trajectory.timed)
-    elif "network" in drawn and "optimised" in drawn:
-        raw, optimised = associate(drawn["network"], drawn["optimised"])
-        energy = float((raw.positions**2).sum())
-        scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
-        fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
-        moved = fit.apply_to_poses(drawn["network"].T_world_camera)
-        drawn["network"] = Trajectory(drawn["network"].stamps, moved, drawn["network"].timed)
-    return drawn
-
-
-def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
-    """Mean relative error of all segments of each length that the path holds, one start every tenth frame.
-
-    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
-
-    Args:
-        estimate: metric poses, row k beside row k of the reference.
-        reference: true poses.
-    """
-    distance = _travelled(reference)
-    drifts = []
-    for length_m in SEGMENT_LENGTHS_M:
-        starts = np.arange(0, len(reference), SEGMENT_STEP)
-        ends = np.searchsorted(distance, distance[starts] + length_m, side="right")
-        starts, ends = starts[ends < len(reference)], ends[ends < len(reference)]
-        if not len(starts):
-            break
-        T_start_end = [se3.invert(t.T_world_camera[starts]) @ t.T_world_camera[ends] for t in (estimate, reference)]
-        T_error = se3.invert(T_start_end[0]) @ T_start_end[1]
-        translation = float(np.linalg.norm(T_error[:, :3, 3], axis=1).mean()) / length_m
-        drifts.append(Drift(length_m, translation, float(se3.rotation_angle(T_error[:, :3, :3]).mean()) / length_m))
-    return drifts
-
-
 def _figure(
     draw: Callable[[FigureBase, Mapping[str, Trajectory], str], list[Axes]],
     trajectories: Mapping[str, Trajectory],
@@ -366,16 +309,6 @@ def _reference(trajectories: Mapping[str, Trajectory]) -> Trajectory:
     return trajectories[REFERENCE]
 
 
-def _estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Trajectory]]:
-    return [(name, trajectory) for name, trajectory in trajectories.items() if name != REFERENCE]
-
-
-def _travelled(trajectory: Trajectory) -> FloatArray:
-    """Distance travelled ``(N,)`` up to each pose."""
-    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def _disparity(depth: DepthMap) -> Any:
     """1 / depth, masked where there is no depth."""
     known = np.isfinite(depth) & (depth > 0)
@@ -391,7 +324,7 @@ def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
 
 
 def _save(figure: Figure, output: Path) -> None:
-    """Write beside the target and move into place; the file depends on nothing but its content."""
+    """Write beside the target and move into place; without a date, so that alike figures are alike files."""
     kind = output.suffix.lower().removeprefix(".")
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
     partial = output.with_name(f".{output.stem}.{os.getpid()}.partial")
@@ -402,4 +335,5 @@ def _save(figure: Figure, output: Path) -> None:
     except OSError as error:
         raise RunError(f"{output}: cannot be written ({error.strerror or error})") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -174,9 +174,7 @@ class PoseGraph:
         _, component = connected_components(links, directed=False)
         loose = np.flatnonzero(component != component[0])
         if len(loose):
-            raise SlamError(
-                f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on"
-            )
+            raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
 
 
 def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
@@ -189,9 +187,7 @@ def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: Flo
     return np.array(squared)
 
 
-def coverage(
-    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
-) -> dict[str, float]:
+def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float) -> dict[str, float]:
     """Share of factors whose residual at the truth lies inside the 50, 90 and 95 % quantile of chi-square(6).
 
     Args:

@@ -36,7 +36,7 @@ from slam.report import DepthExample, write_report
 from slam.run_folder import RunFolder
 from slam.se3 import apply, umeyama
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.simulated_sequence import SimulatedSequence
+from slam.sequences.excerpt import Excerpt
 from slam.summary import (
     SCHEMA,
     Provenance,
@@ -215,9 +215,9 @@ def _write_map(folder: RunFolder, result: SlamResult, sequence: FrameSequence) -
     except SlamError as error:
         logger.warning("no map: %s", error)
         return _Surface(_no_map(str(error)))
-    points, colours = result.map.cloud()
-    statistics = asdict(result.map.statistics())
-    return _Surface(statistics | _map_quality(points, result, sequence), points, colours)
+    cloud = result.map.cloud()
+    quality = _map_quality(cloud.points_world, result, sequence)
+    return _Surface(asdict(result.map.statistics()) | quality, cloud.points_world, cloud.colours)
 
 
 def _no_map(reason: str) -> dict[str, Any]:
@@ -227,16 +227,17 @@ def _no_map(reason: str) -> dict[str, Any]:
 
 def _map_quality(points: NDArray[np.float64], result: SlamResult, sequence: FrameSequence) -> dict[str, Any]:
     """Distance to the true street and share of it found, the map moved by the trajectory's 7-dof alignment."""
-    if result.reference is None or not isinstance(sequence, SimulatedSequence):
+    base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+    street = getattr(base, "street", None)
+    if result.reference is None or street is None:
         reason = "the true surface is known for the embedded simulated sequence only"
         return null("accuracy_median_m", reason) | null("completeness", reason)
-    street = sequence.street
     to_truth = umeyama(result.reference.positions, result.optimised.positions, with_scale=True)
-    T_street_world = street.T_world_camera[0]
-    points_true = apply(T_street_world, to_truth.scale * points @ to_truth.R_a_b.T + to_truth.t_a_b)
+    T_street_first = street.T_world_camera[first]
+    points_true = apply(T_street_first, to_truth.scale * points @ to_truth.R_a_b.T + to_truth.t_a_b)
     seen = [
         visible_surface(street.render(k).depth, sequence.intrinsics.K, street.T_world_camera[k], step=8)
-        for k in range(0, len(sequence), 10)
+        for k in range(first, first + len(sequence), 10)
     ]
     rng = np.random.default_rng(0)
     sample = points_true[rng.permutation(len(points_true))[:20_000]]

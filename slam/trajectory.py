@@ -10,7 +10,6 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,7 @@ from slam.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
 
-FileFormat = Literal["kitti", "tum"]
-
-_COLUMNS: dict[FileFormat, int] = {"kitti": 12, "tum": 8}
+_COLUMNS = {"kitti": 12, "tum": 8}
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -77,8 +74,8 @@ class Trajectory:
         return Trajectory(self.stamps[rows], self.T_world_camera[rows], self.timed)
 
 
-def read_trajectory(path: Path | str, format: Literal["auto", "kitti", "tum"] = "auto") -> Trajectory:
-    """Read a KITTI file (12 numbers a row) or a TUM file (8), with the format seen from the columns.
+def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
+    """Read a KITTI file (12 numbers a row) or a TUM file (8), or with ``auto`` whichever it holds.
 
     Blank lines and lines that start with ``#`` are skipped. Rotations off by rounding are replaced by the
     nearest rotation.
@@ -89,7 +86,7 @@ def read_trajectory(path: Path | str, format: Literal["auto", "kitti", "tum"] = 
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
-    lines, numbers = _read_numbers(path, None if format == "auto" else cast(FileFormat, format))
+    lines, numbers = _read_numbers(path, _COLUMNS.get(format, 0))
     if numbers.shape[1] == _COLUMNS["kitti"]:
         T_world_camera, stamps = _kitti_poses(numbers), np.arange(len(numbers), dtype=np.float64)
     else:
@@ -189,11 +186,10 @@ def _time_span(trajectory: Trajectory) -> str:
     return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
 
 
-def _read_numbers(path: Path, format: FileFormat | None) -> tuple[list[int], FloatArray]:
-    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; None takes the first row's format."""
+def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
+    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; 0 columns: as many as the first row."""
     lines: list[int] = []
     rows: list[list[float]] = []
-    columns = _COLUMNS[format] if format else 0
     for line, words in _read_words(path):
         columns = columns or len(words)
         _check_columns(f"{path}, line {line}", len(words), columns)

@@ -62,7 +62,7 @@ def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Imag
     grey = rng.random() < 0.3
     values = np.arange(256) / 255
     curve = (np.power(values, gamma) - 0.45) * contrast + 0.45
-    table = np.clip(curve[:, None] * gain * tint * 255, 0, 255).astype(np.uint8)[None]  # (1, 256, 3)
+    table = np.clip(np.rint(curve[:, None] * gain * tint * 255), 0, 255).astype(np.uint8)[None]  # (1, 256, 3)
     if grey:
         images = [cv2.cvtColor(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) for i in images]
         table = np.repeat(table[..., :1], 3, axis=-1)

@@ -6,6 +6,8 @@ Discovery looks at folder names only; an image is decoded when a snippet asks fo
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,19 +17,22 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from erfsfm.config import Fidelity
 from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
 CAMERAS = {"image_2": "P2", "image_3": "P3", "image_0": "P0", "image_1": "P1"}
+IMAGE_FOLDERS = ("images", "image_2", "image_02", "image_0", "image_00", "rgb", "data")  # never a name of a drive
 
 
 @dataclass(frozen=True)
 class Recording:
     """Frames of one drive: ``images`` are files, or one video file whose frames are decoded together.
 
-    ``camera`` belongs to the images as stored; ``depth`` and ``T_world_camera`` are truth, where it is known.
+    ``camera`` belongs to the images as stored. ``depth`` and ``poses_file`` are truth, where it is known: poses
+    of camera 0, in whose frame this camera's origin is seen through ``t_camera_cam0``.
     """
 
     name: str
@@ -36,10 +41,16 @@ class Recording:
     video_frames: int = 0
     depth: tuple[Path, ...] | None = None
     poses_file: Path | None = None
+    t_camera_cam0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: int = 0
 
     def __len__(self) -> int:
         return self.video_frames or len(self.images)
+
+    @property
+    def frames_name(self) -> str:
+        """The name with its frames, as the leak record writes it: ``kitti_odometry/00[0:250]``."""
+        return f"{self.name}[{self.start}:{self.start + len(self)}]"
 
     def part(self, start: int, stop: int) -> Recording:
         """Frames ``start`` to ``stop - 1``."""
@@ -70,9 +81,7 @@ class Recording:
                 f"{self.images[min(index, len(self.images) - 1)]} is {image.shape[1]} x {image.shape[0]}; the camera "
                 f"of {self.name} is {self.camera.width} x {self.camera.height}; all images of a recording need one size"
             )
-        if image.shape[:2] != (height, width):
-            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        return np.ascontiguousarray(image[..., ::-1])
+        return np.ascontiguousarray(resize_image(image, height, width)[..., ::-1])
 
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the recording has no depth."""
@@ -81,16 +90,41 @@ class Recording:
         encoded = cv2.imread(str(self.depth[index]), cv2.IMREAD_UNCHANGED)
         if encoded is None:
             raise DataError(f"{self.depth[index]} is missing or not a readable depth image")
-        return encoded.astype(np.float32) / 256
+        return np.asarray(encoded, dtype=np.float32) / np.float32(256)
 
-    def true_poses(self) -> NDArray[np.float64] | None:
-        """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses."""
+    def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
+        """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.
+
+        Args:
+            fidelity: ``paper`` gives the poses of camera 0, as the reference compares with.
+
+        Raises:
+            DataError: the file is malformed, or has fewer rows than there are frames.
+        """
         if self.poses_file is None:
             return None
-        rows = np.loadtxt(self.poses_file).reshape(-1, 3, 4)[self.start : self.start + len(self)]
+        try:
+            rows = np.loadtxt(self.poses_file, ndmin=2).reshape(-1, 3, 4)
+        except ValueError as error:
+            raise DataError(f"{self.poses_file} must hold 12 numbers a row: {error}") from error
+        rows = rows[self.start : self.start + len(self)]
+        if len(rows) < len(self):
+            raise DataError(f"{self.poses_file} ends before frame {self.start + len(self)} of {self.name}")
         T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
         T_world_camera[:, :3] = rows
+        if fidelity == "default":
+            # the rectified cameras differ by a translation alone: t_cam0_camera = -t_camera_cam0
+            T_world_camera[:, :3, 3] -= T_world_camera[:, :3, :3] @ np.array(self.t_camera_cam0)
         return T_world_camera
+
+
+def resize_image(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """An image ``(H, W, 3)`` at ``height x width``, without crop: the one way in training and in inference."""
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = image.shape[0] >= height and image.shape[1] >= width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width, height), interpolation=method))
 
 
 def discover(root: Path) -> list[Recording]:
@@ -129,30 +163,46 @@ def _odometry(base: Path, sequence: Path) -> list[Recording]:
     present = [c for c in CAMERAS if (sequence / c).is_dir()]
     colour = [c for c in present if c in ("image_2", "image_3")]
     simulation = base / "simulation.json"
-    if simulation.is_file():
-        name = f"simulated/{json.loads(simulation.read_text())['seed']}"
-    else:
-        name = f"kitti_odometry/{sequence.name}"
+    name = f"simulated/{_seed(simulation)}" if simulation.is_file() else f"kitti_odometry/{sequence.name}"
     recordings = []
     for camera_folder in colour or present[:1]:
         images = image_files(sequence / camera_folder)
         if not images:
             raise DataError(f"{sequence / camera_folder} holds no png or jpg; download or extract the images")
+        _require_numbered(images)
         depth = tuple(sorted((sequence / "depth_2").glob("*.png"))) if camera_folder == "image_2" else ()
         poses = base / "poses" / f"{sequence.name}.txt"
+        camera, t_camera_cam0 = _odometry_camera(sequence / "calib.txt", CAMERAS[camera_folder], images[0])
         recordings.append(
             Recording(
                 name,
                 images,
-                _odometry_camera(sequence / "calib.txt", CAMERAS[camera_folder], images[0]),
+                camera,
                 depth=depth if len(depth) == len(images) else None,
                 poses_file=poses if poses.is_file() else None,
+                t_camera_cam0=t_camera_cam0,
             )
         )
     return recordings
 
 
-def _odometry_camera(calib: Path, row: str, image: Path) -> Camera:
+def _seed(simulation: Path) -> int:
+    try:
+        return int(json.loads(simulation.read_text())["seed"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{simulation} must hold the simulation's seed; simulate again") from error
+
+
+def _require_numbered(images: tuple[Path, ...]) -> None:
+    """Frames 0, 1, 2, ...: a gap would be a jump to the networks, an offset a false leak record."""
+    for index, image in enumerate(images):
+        if not image.stem.isdecimal() or int(image.stem) != index:
+            wanted = f"{index:0{len(images[0].stem)}d}"
+            raise DataError(f"{image.parent} has no frame {wanted}: KITTI numbers from 0; found {image.name} there")
+
+
+def _odometry_camera(calib: Path, row: str, image: Path) -> tuple[Camera, tuple[float, float, float]]:
+    """A camera of the rig, and where camera 0 is seen from it: P = K [I | t_camera_cam0]."""
     if not calib.is_file():
         raise DataError(f"no calibration for {image.parent}: wanted {calib} with the row {row}")
     rows = dict(line.split(":", 1) for line in calib.read_text().splitlines() if ":" in line)
@@ -160,8 +210,12 @@ def _odometry_camera(calib: Path, row: str, image: Path) -> Camera:
         P = np.array([float(v) for v in rows[row].split()]).reshape(3, 4)
     except (KeyError, ValueError) as error:
         raise DataError(f"{calib} has no valid row '{row}: 12 numbers'") from error
+    if not (P[0, 0] > 0 and P[1, 1] > 0):
+        raise DataError(f"{calib}: the focal lengths in row '{row}' must be positive")
     height, width = image_size(image)
-    return Camera(width, height, P[0, 0], P[1, 1], P[0, 2], P[1, 2])
+    tx, ty, tz = np.linalg.solve(P[:, :3], P[:, 3])
+    camera = Camera(width, height, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
+    return camera, (float(tx), float(ty), float(tz))
 
 
 def _folder(root: Path) -> Recording | None:
@@ -171,7 +225,8 @@ def _folder(root: Path) -> Recording | None:
     if not (home / "camera.yaml").is_file():
         return None
     camera = _camera_file(home / "camera.yaml")
-    name = f"folder/{home.name}"
+    place = home.absolute()
+    name = f"folder/{place.parent.name if place.name in IMAGE_FOLDERS else place.name}"
     candidates = [home, *sorted(p for p in home.iterdir() if p.is_dir())] if home.is_dir() else []
     for candidate in [] if is_video else candidates:
         images = image_files(candidate)
@@ -184,17 +239,21 @@ def _folder(root: Path) -> Recording | None:
 
 
 def _camera_file(path: Path) -> Camera:
-    content = yaml.safe_load(path.read_text())
     try:
-        camera = Camera(*(content[k] for k in ("width", "height", "fx", "fy", "cx", "cy")))
-    except (KeyError, TypeError) as error:
-        raise DataError(f"{path} must give width, height, fx, fy, cx, cy; {error} is missing") from error
-    if content.get("model", "pinhole") != "pinhole" and any(content.get("distortion") or []):
+        content = yaml.safe_load(path.read_text())
+        width, height = int(content["width"]), int(content["height"])
+        camera = Camera(width, height, *(float(content[k]) for k in ("fx", "fy", "cx", "cy")))
+    except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        what = " ".join(str(error).split())
+        raise DataError(f"{path} must give width, height, fx, fy, cx, cy as numbers; wrong is {what}") from error
+    if not (camera.width > 0 and camera.height > 0 and camera.fx > 0 and camera.fy > 0):
+        raise DataError(f"{path}: width, height, fx and fy must be positive")
+    if content.get("model", "pinhole") == "fisheye" or any(content.get("distortion") or []):
         raise DataError(f"{path} describes a distorted camera: undistort the images before training")
     return camera
 
 
-def _decode_video(path: Path):  # type: ignore[no-untyped-def]
+def _decode_video(path: Path) -> Iterator[NDArray[np.uint8]]:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(f"{path} cannot be read as a video")
@@ -202,12 +261,18 @@ def _decode_video(path: Path):  # type: ignore[no-untyped-def]
         ok, image = capture.read()
         if not ok:
             return
-        yield image
+        yield np.asarray(image, dtype=np.uint8)
 
 
 def image_files(folder: Path) -> tuple[Path, ...]:
-    """The images of a folder, sorted by name."""
-    return tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES))
+    """The images of a folder in natural order: ``2.png`` before ``10.png``."""
+    images = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return tuple(sorted(images, key=_natural_key))
+
+
+def _natural_key(path: Path) -> list[tuple[int, str]]:
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -66,8 +66,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._first_draw = first_draw
         self._cache = ImageCache(config.data.cache_mb)
         length = config.network.sources + 1
-        self._recordings = usable(recordings, length)
-        self._probabilities = _probabilities(self._recordings, length, config.data)
+        self.recordings = usable(recordings, length)
+        self._probabilities = _probabilities(self.recordings, length, config.data)
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -80,7 +80,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3)."""
         rng = np.random.default_rng([self._config.training.seed, number])
-        recording = self._recordings[int(rng.choice(len(self._recordings), p=self._probabilities))]
+        recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
         network = self._config.network
         first = int(rng.integers(len(recording) - network.sources))
         snippet = Snippet(recording, first)
@@ -158,14 +158,19 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     training: list[Recording] = []
     validation: list[Recording] = []
-    ranges = {key: FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()}
-    for recording in (r for root in config.roots for r in discover(root)):
-        if overlapping([recording.name], config.validation):
-            validation.append(recording)
-        elif not overlapping([recording.name], config.exclude):
-            span = ranges.get(recording.name)
-            whole = span is None or (span.start, span.stop) == (0, EVERYTHING)
-            training.append(recording if whole or span is None else recording.part(span.start, span.stop))
+    spans = {key: FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()}
+    ranges = {span.recording: span for span in spans.values()}
+    found = [recording for root in config.roots for recording in discover(root)]
+    for key, span in spans.items():
+        if all(recording.name != span.recording for recording in found):
+            names = ", ".join(sorted({recording.name for recording in found}))
+            raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
+    held_out = [FrameRange.parse(name) for name in config.validation]
+    for recording in found:
+        validation += [_part(recording, span) for span in held_out if span.covers(FrameRange.parse(recording.name))]
+        part = _part(recording, ranges.get(recording.name))
+        if not overlapping([part.frames_name], [*config.validation, *config.exclude]):
+            training.append(part)
     if not training:
         raise DataError(
             f"every recording found is excluded or for validation (data.exclude: {', '.join(config.exclude)})"
@@ -173,15 +178,23 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     return training, validation
 
 
+def _part(recording: Recording, span: FrameRange | None) -> Recording:
+    if span is None or (span.start, span.stop) == (0, EVERYTHING):
+        return recording
+    if span.start >= len(recording):
+        raise DataError(f"{span} begins after the {len(recording)} frames that there are")
+    return recording.part(span.start, span.stop)
+
+
 def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
     """Chance of each recording: by its windows, then by the configured share of its kind."""
-    windows = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
+    windows: NDArray[np.float64] = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
     if not config.weights:
-        return windows / windows.sum()
+        return np.asarray(windows / windows.sum())
     total = np.zeros(len(recordings))
     for prefix, weight in config.weights.items():
         chosen = np.array([r.name.startswith(prefix) for r in recordings])
         if not chosen.any():
             raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
         total += np.where(chosen, weight * windows / windows[chosen].sum(), 0)
-    return total / total.sum()
+    return np.asarray(total / total.sum())

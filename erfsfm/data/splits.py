@@ -45,18 +45,21 @@ class FrameRange:
         """Read a name; raw drives that are odometry sequences become those.
 
         Raises:
-            ConfigError: brackets that hold no range.
+            ConfigError: brackets that hold no range, or an empty one.
         """
         match = _NAME.match(name.strip())
         if match is None:
             raise ConfigError(f"'{name}' names no frames: write kind/recording or kind/recording[start:stop]")
         start = int(match["start"] or 0)
         stop = int(match["stop"] or EVERYTHING)
+        if start >= stop:
+            raise ConfigError(f"'{name}' names no frames: the range must begin before it ends")
         base = match["base"].removesuffix("_sync")
         kind, _, recording = base.partition("/")
         if kind == "kitti_raw" and recording in _RAW_ODOMETRY:
             sequence, first = _RAW_ODOMETRY[recording]
-            return FrameRange(f"kitti_odometry/{sequence}", max(start - first, 0), max(stop - first, 0))
+            stop = EVERYTHING if stop == EVERYTHING else max(stop - first, 0)
+            return FrameRange(f"kitti_odometry/{sequence}", max(start - first, 0), stop)
         return FrameRange(base, start, stop)
 
     def covers(self, other: FrameRange) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +14,7 @@ from erfsfm.config import Fidelity
 from erfsfm.data.recordings import Recording, discover
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
+from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
 
 CAP_M = 80.0
 
@@ -52,6 +53,9 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
     leak = _refuse_leak(networks, recordings, allow_leak)
     frames = [(r, i) for r in recordings for i in range(0, len(r), every)]
     truths = [r.true_depth(i) for r, i in frames]
+    sizes = {t.shape for t in truths if t is not None}
+    if len(sizes) > 1:
+        raise DataError(f"depth maps of different sizes in {root}: evaluate recordings of one size at a time")
     typical = _median_map([t for t in truths if t is not None])
     rows: dict[str, list[DepthErrors]] = {"networks": [], "median depth map": []}
     for (recording, index), truth in zip(frames, truths):
@@ -61,20 +65,29 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
             errors = depth_errors(guess, truth, CAP_M)
             if errors is not None:
                 rows[name].append(errors)
+    if not rows["networks"]:
+        raise DataError(f"no depth between 0 and {CAP_M:g} m in {root}: nothing to compare with")
     return [_depth_row(name, errors, leak) for name, errors in rows.items()]
 
 
 def pose_protocol(
     networks: Networks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
-    """Five-frame snippets of each sequence: the networks, and a straight constant motion."""
+    """Five-frame snippets of each sequence: the networks, and a straight constant motion.
+
+    In paper fidelity the truth is that of camera 0, whichever camera took the images.
+
+    Raises:
+        DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
+            not allowed.
+    """
     found = {r.name.split("/")[-1]: r for r in reversed(discover(root))}
     rows = []
     for name in sequences:
         recording = found.get(name)
         if recording is None:
             raise DataError(f"no sequence {name} in {root}: found {', '.join(sorted(found))}")
-        T_world_camera = recording.true_poses()
+        T_world_camera = recording.true_poses(fidelity)
         if T_world_camera is None:
             raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
         leak = _refuse_leak(networks, [recording], allow_leak)
@@ -88,12 +101,11 @@ def _pose_rows(
     length = networks.sources + 1
     if length != 5:
         raise DataError(f"the snippet protocol wants networks with 4 sources; these have {networks.sources}")
-    camera = recording.camera
-    images = [recording.image(i, camera.height, camera.width) for i in range(len(recording))]
-    starts = range(len(recording) - length + 1)
-    predicted = np.stack([snippet_from_network(networks.poses(images[s : s + length])) for s in starts])
-    true = np.stack([np.linalg.inv(T_world_camera[s]) @ T_world_camera[s : s + length] for s in starts])
-    straight = np.tile(np.eye(4), (len(starts), length, 1, 1))
+    true = snippets_from_trajectory(T_world_camera, length)
+    if len(true) == 0:
+        raise DataError(f"{recording.name} has {len(recording)} frames; a snippet needs {length}")
+    predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in _windows(networks, recording)])
+    straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
     rows = []
     for name, guess in (("networks", predicted), ("straight constant motion", straight)):
@@ -101,6 +113,15 @@ def _pose_rows(
         row = {"method": name, "recording": recording.name, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
         rows.append(row | {"re_mean": errors.re_mean, "re_std": errors.re_std, "snippets": errors.count, "leak": leak})
     return rows
+
+
+def _windows(networks: Networks, recording: Recording) -> Iterator[NDArray[np.float64]]:
+    """What the pose network says of each window; no more images are held than one window has."""
+    images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
+    for index in range(len(recording)):
+        images.append(recording.image(index, recording.camera.height, recording.camera.width))
+        if len(images) == images.maxlen:
+            yield networks.poses(list(images))
 
 
 def _median_map(truths: list[NDArray[np.float32]]) -> NDArray[np.float32]:
@@ -120,10 +141,10 @@ def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, An
 
 
 def _refuse_leak(networks: Networks, recordings: list[Recording], allow_leak: bool) -> bool:
-    names = [f"{r.name}[{r.start}:{r.start + len(r)}]" for r in recordings]
-    leaked = networks.leaks(names)
+    leaked = networks.leaks([r.frames_name for r in recordings])
     if leaked and not allow_leak:
         raise DataError(
-            f"leak: these weights were trained on {', '.join(leaked)}; choose other weights or data, or say --allow-leak"
+            f"leak: these weights were trained on {', '.join(leaked)}; choose other weights or data, or allow it with "
+            "--allow-leak"
         )
     return bool(leaked)

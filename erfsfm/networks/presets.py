@@ -4,10 +4,13 @@ import difflib
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import torch
+
 from erfsfm.errors import ConfigError
 from erfsfm.networks.blocks import Fidelity, Normalisation, Variant
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.pose_net import PoseNet
+from erfsfm.networks.receptive_field import multiply_adds, theoretical
 
 NetworkKind = Literal["depth", "pose"]
 
@@ -18,6 +21,27 @@ class Preset:
 
     kind: NetworkKind
     variant: Variant
+
+
+@dataclass(frozen=True)
+class NetworkSummary:
+    """A network in numbers.
+
+    Attributes:
+        name: preset.
+        kind: what it predicts.
+        parameters: number of weights.
+        multiply_adds: of one forward pass at 416 x 128; None where there is none.
+        multiply_adds_reason: why `multiply_adds` is None, else None.
+        receptive_field: side in pixels at the last encoder layer, at zero offsets.
+    """
+
+    name: str
+    kind: NetworkKind
+    parameters: int
+    multiply_adds: int | None
+    multiply_adds_reason: str | None
+    receptive_field: int
 
 
 PRESETS: dict[str, Preset] = {
@@ -64,6 +88,26 @@ def build(
         return PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch)
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:
+    """Summaries of all presets; only shapes are computed.
+
+    Raises:
+        ConfigError: if an option is unknown or out of range.
+    """
+    summaries = []
+    for name, preset in PRESETS.items():
+        with torch.device("meta"):
+            network = build(name, fidelity, width, sources)
+        operations, reason = None, None
+        try:
+            operations = multiply_adds(network, height=128, width=416)
+        except ConfigError as error:
+            reason = str(error)
+        parameters = sum(parameter.numel() for parameter in network.parameters())
+        summaries.append(NetworkSummary(name, preset.kind, parameters, operations, reason, theoretical(network)))
+    return summaries
 
 
 def _find(name: str) -> Preset:

@@ -65,15 +65,15 @@ class SelfSupervision(lightning.LightningModule):
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
         """Photometric error of every snippet; depth and pose errors where truth is known."""
         target, sources = to_network_range(batch["target"]), to_network_range(batch["sources"])
-        disparity = self.depth_net(target)
-        vectors = self.pose_net(target, list(sources.unbind(dim=1)))
+        disparity = self.depth_net(target).float()
+        vectors = self.pose_net(target, list(sources.unbind(dim=1))).float()
         T_source_target = pose_vector_to_matrix(vectors)
-        self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
-        depth = (1 / disparity).float()
+        with torch.autocast(self.device.type, enabled=False):
+            self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
         self._note("disparity_spread", float(disparity.std() / disparity.mean()))
         if "depth" in batch:
             truth = batch["depth"][0].cpu().numpy()
-            resized = torch.nn.functional.interpolate(1 / depth, truth.shape, mode="bilinear")
+            resized = torch.nn.functional.interpolate(disparity, truth.shape, mode="bilinear")
             errors = depth_errors((1 / resized)[0, 0].cpu().numpy(), truth)
             if errors is not None:
                 self._note("abs_rel", errors.abs_rel)

@@ -9,9 +9,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from erfsfm.config import ExperimentConfig, LossConfig
+from erfsfm.errors import ConfigError
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.geometry.warp import Projection, project_into_source, sample
+from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample
 from erfsfm.losses.consistency import depth_inconsistency
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.regularisation import (
@@ -53,38 +54,90 @@ def to_network_range(image: Tensor) -> Tensor:
 def evaluate_objective(
     depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
 ) -> Outcome:
-    """Predict depth and poses of a batch and say how badly they explain it."""
-    count = batch.sources.shape[1]
-    source_inputs = [to_network_range(batch.sources[:, k]) for k in range(count)]
-    target_input = to_network_range(batch.target)
-    disparities: list[Tensor] = depth_net(target_input)
-    masks: list[Tensor] | None = None
-    if config.network.masks:
-        pose_vectors, masks = pose_net.forward_with_masks(target_input, source_inputs)  # type: ignore[operator]
-    else:
-        pose_vectors = pose_net(target_input, source_inputs)
-    T_source_target = pose_vector_to_matrix(pose_vectors)
+    """Predict depth and poses of a batch and say how badly they explain it.
 
+    The networks may run under autocast; geometry and losses keep the images' precision, for a pixel
+    coordinate does not fit into the eight bits of a bfloat16.
+
+    Args:
+        depth_net: in training mode, where it gives a pyramid of disparities.
+        pose_net: for as many sources as the batch has.
+        batch: what to explain.
+        config: its ``loss`` and ``network`` sections count.
+    """
+    said = _Prediction.of(depth_net, pose_net, batch, config)
+    with torch.autocast(batch.target.device.type, enabled=False):
+        return _judge(said, batch, config)
+
+
+@dataclass(frozen=True)
+class _Prediction:
+    """What the networks say, in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
+
+    disparities: list[Tensor]
+    pose_vectors: Tensor
+    masks: list[Tensor] | None
+    adjacent: tuple[Tensor, ...]
+
+    @staticmethod
+    def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
+        if not depth_net.training:
+            raise ValueError("the objective needs the depth network in training mode")
+        precise = batch.target.dtype
+        sources = [to_network_range(source) for source in batch.sources.unbind(dim=1)]
+        target = to_network_range(batch.target)
+        disparities = [disparity.to(precise) for disparity in depth_net(target)]
+        masks: list[Tensor] | None = None
+        if config.network.masks:
+            pose_vectors, masks = pose_net.forward_with_masks(target, sources)  # type: ignore[operator]
+            masks = [mask.to(precise) for mask in masks]
+            _require_sizes(masks, disparities, config)
+        else:
+            pose_vectors = pose_net(target, sources)
+        adjacent: tuple[Tensor, ...] = ()
+        if config.loss.consistency_weight > 0:
+            nearest = [sources[k] for k in _adjacent(len(sources))]
+            adjacent = depth_net(torch.cat(nearest))[0].to(precise).chunk(len(nearest))
+        return _Prediction(disparities, pose_vectors.to(precise), masks, adjacent)
+
+
+def _require_sizes(masks: list[Tensor], disparities: list[Tensor], config: ExperimentConfig) -> None:
+    for mask, disparity in zip(masks, disparities):
+        if mask.shape[-2:] != disparity.shape[-2:]:
+            raise ConfigError(
+                f"masks of {config.network.pose} in {config.network.fidelity} fidelity have size "
+                f"{tuple(mask.shape[-2:])} where the disparities have {tuple(disparity.shape[-2:])}: "
+                "set network.masks to false or network.fidelity to default"
+            )
+
+
+def _adjacent(count: int) -> tuple[int, int]:
+    """Indices of the sources just before and just after the target."""
+    return count // 2 - 1, count // 2
+
+
+def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
+    T_source_target = pose_vector_to_matrix(said.pose_vectors)
     loss = config.loss
-    terms = dict.fromkeys(("photometric", "smoothness"), batch.target.new_zeros(()))
+    photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: tuple[Tensor, Projection] | None = None
     for level in range(loss.scales):
-        scale = _Level.of(batch, disparities[level], config)
+        scale = _Level.of(batch, said.disparities[level], config)
         warped, projection = scale.warp(T_source_target)
-        mask = masks[level] if masks is not None else None
-        terms["photometric"] = terms["photometric"] + scale.photometric(warped, projection.valid, mask, loss)
-        terms["smoothness"] = terms["smoothness"] + scale.smoothness(loss) / 2**level
+        mask = said.masks[level] if said.masks is not None else None
+        photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
+        smoothness = smoothness + scale.smoothness(loss) / 2**level
         finest = finest or (warped, projection)
     assert finest is not None
-    total = terms["photometric"] + loss.smoothness_weight * terms["smoothness"]
-    if masks is not None and loss.mask_weight > 0:
-        terms["explainability"] = torch.stack([explainability_prior(m) for m in masks]).sum()
+    terms = {"photometric": photometric, "smoothness": smoothness}
+    total = photometric + loss.smoothness_weight * smoothness
+    if said.masks is not None and loss.mask_weight > 0:
+        terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
     if loss.consistency_weight > 0:
-        terms["consistency"] = _consistency(depth_net, source_inputs, finest[1], count)
+        terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
-    shape = (*batch.sources.shape[:3], *batch.target.shape[-2:])
-    return Outcome(total, terms, disparities, T_source_target, finest[0].reshape(shape))
+    return Outcome(total, terms, said.disparities, T_source_target, finest[0].reshape(batch.sources.shape))
 
 
 @dataclass(frozen=True)
@@ -129,7 +182,7 @@ class _Level:
         still: Tensor | None = None
         if loss.auto_mask:
             with torch.no_grad():
-                before, after = self.sources[:, count // 2 - 1], self.sources[:, count // 2]
+                before, after = (self.sources[:, k] for k in _adjacent(count))
                 still = torch.minimum(
                     photometric_error(self.target, before, loss.ssim_weight),
                     photometric_error(self.target, after, loss.ssim_weight),
@@ -155,13 +208,12 @@ class _Level:
         return edge_aware_smoothness(self.disparity, self.target)
 
 
-def _consistency(depth_net: nn.Module, source_inputs: list[Tensor], projection: Projection, count: int) -> Tensor:
-    """Depth agreement of the target with its two adjacent sources."""
-    adjacent = [count // 2 - 1, count // 2]
-    depths = 1 / depth_net(torch.cat([source_inputs[k] for k in adjacent]))[0]  # (2*B, 1, H, W)
+def _consistency(adjacent: tuple[Tensor, ...], projection: Projection, count: int) -> Tensor:
+    """Depth agreement of the target with its two adjacent sources; ``projection`` has ``B * N`` entries."""
     terms = []
-    for k, depth_source in zip(adjacent, depths.chunk(2)):
+    for k, disparity in zip(_adjacent(count), adjacent):
         part = Projection(projection.grid[k::count], projection.z_source[k::count], projection.valid[k::count])
-        disagreement = depth_inconsistency(part.z_source.clamp(min=1e-3), sample(depth_source, part))
-        terms.append(disagreement[part.valid].mean() if part.valid.any() else depth_source.sum() * 0)
+        depth_sampled = sample(1 / disparity, part)
+        disagreement = depth_inconsistency(part.z_source.clamp(min=MINIMUM_Z), depth_sampled)
+        terms.append(disagreement[part.valid].mean() if part.valid.any() else depth_sampled.sum() * 0)
     return torch.stack(terms).mean()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import pickle
 import subprocess
 import warnings
 from pathlib import Path
@@ -12,15 +14,17 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities.warnings import PossibleUserWarning
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 import erfsfm
-from erfsfm.checkpoint import Model, ModelRecord, load_model, save_model
-from erfsfm.config import ExperimentConfig, dump_yaml
+from erfsfm.checkpoint import Model, ModelRecord, load_model, read_record, save_model, write_atomically
+from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
-from erfsfm.errors import ConfigError, TrainingError
+from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.inference import choose_device
 from erfsfm.training.module import SelfSupervision
 
@@ -53,42 +57,62 @@ def train(
         ConfigError, DataError, TrainingError: what a user can mend, in one line.
     """
     checkpoint = output / "checkpoints" / "last.ckpt"
-    done_steps = _prepare_output(config, output, checkpoint, resume)
     training, validation = split_recordings(config.data)
+    done_steps = _prepare_output(config, output, checkpoint, resume)
     lightning.seed_everything(config.training.seed, verbose=False)
     module = SelfSupervision(config)
-    if config.initial_weights and not resume:
-        _start_from(module, config.initial_weights)
-    keeper = WeightKeeper(output, trained_on(training), command)
-    trainer = _trainer(config, output, device, quiet, keeper, bool(validation))
-    batch = config.training.batch
+    batch, workers = config.training.batch, config.data.workers
     draws = SnippetDraws(training, config, config.training.steps * batch, done_steps * batch)
-    workers = config.data.workers
+    seen = trained_on(draws.recordings)
+    if config.initial_weights and not resume:
+        seen = merge([*seen, *_start_from(module, config.initial_weights)])
+    keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = DataLoader(draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*num_workers.*")
-        warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
-        trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
+    trainer = _trainer(config, output, device, quiet, keeper, done_steps)
+    _fit(trainer, module, loader, validation_loader, checkpoint if resume else None)
     keeper.save(module, trainer.global_step)
     return output
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:
     """The leak record of these recordings: names with their frame ranges."""
-    return merge(
-        r.name if r.name.startswith("simulated/") else f"{r.name}[{r.start}:{r.start + len(r)}]" for r in recordings
-    )
+    return merge(r.name if r.name.startswith("simulated/") else r.frames_name for r in recordings)
+
+
+def _fit(
+    trainer: lightning.Trainer,
+    module: SelfSupervision,
+    loader: DataLoader[dict[str, Tensor]],
+    validation_loader: DataLoader[dict[str, Tensor]] | None,
+    checkpoint: Path | None,
+) -> None:
+    """Run the loop; what stops it becomes one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PossibleUserWarning)
+            warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
+            warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
+            trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
+    except DataError as error:
+        # from a worker process it arrives with that process' traceback before its own last line
+        raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.errors.DataError: ")) from error
+    except SystemExit as error:
+        # Lightning turns Ctrl-C into an exit
+        raise TrainingError(f"interrupted at step {trainer.global_step}: go on with --resume") from error
 
 
 class WeightKeeper(Callback):
     """Writes weights that can be used at once: the latest under ``last/``, the best at the top."""
 
-    def __init__(self, output: Path, seen: list[str], command: str) -> None:
+    def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
         self._output = output
         self._seen = seen
         self._command = command
-        self._best = float("inf")
+        self.validates = validates
+        top = output / "model.yaml"
+        self._best = decisive(read_record(top).metrics) if top.is_file() else math.inf
+        self._saved_step = -1
 
     def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Keep what was just validated."""
@@ -96,10 +120,13 @@ class WeightKeeper(Callback):
             self.save(module, trainer.global_step)
 
     def save(self, module: SelfSupervision, step: int) -> None:
-        """Write ``last/``, and the top of the folder where the decisive measure is the best so far.
+        """Write ``last/``; and the top of the folder, where the decisive measure is the best so far.
 
-        True depth decides where validation has it, else the photometric error.
+        Without validation the last is the best.
         """
+        if step == self._saved_step:
+            return
+        self._saved_step = step
         metrics = module.validation_metrics
         record = ModelRecord(
             network=module.config.network,
@@ -113,18 +140,24 @@ class WeightKeeper(Callback):
         )
         model = Model(record, module.depth_net, module.pose_net)
         save_model(self._output / "last", model)
-        decisive = metrics.get("abs_rel", metrics.get("photometric"))
-        if decisive is None or decisive < self._best:
-            self._best = decisive if decisive is not None else self._best
+        measure = decisive(metrics)
+        if not self.validates or measure < self._best or not (self._output / "model.yaml").is_file():
+            self._best = measure
             save_model(self._output, model)
 
-    def state_dict(self) -> dict[str, float]:
-        """The best so far survives a resume."""
-        return {"best": self._best}
+    def state_dict(self) -> dict[str, list[str]]:
+        """What was seen survives a resume, also with other data."""
+        return {"seen": self._seen}
 
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Take the best so far from a checkpoint."""
-        self._best = state_dict["best"]
+    def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
+        """Add what the run had seen before it was interrupted."""
+        self._seen = merge([*self._seen, *state_dict.get("seen", [])])
+
+
+def decisive(metrics: dict[str, float]) -> float:
+    """What a validation is judged by: true depth where it has it, else the photometric error; less is better."""
+    value = metrics.get("abs_rel", metrics.get("photometric", math.inf))
+    return value if math.isfinite(value) else math.inf
 
 
 def licence_of(seen: list[str]) -> str:
@@ -152,36 +185,47 @@ def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, re
         raise TrainingError(
             f"nothing to resume in {output}: no {checkpoint.relative_to(output)}; start without --resume"
         )
-    if not resume and checkpoint.is_file():
-        raise TrainingError(f"{output} holds an unfinished run: go on with --resume or choose another --output")
-    output.mkdir(parents=True, exist_ok=True)
+    if not resume and (checkpoint.is_file() or (output / "model.yaml").is_file()):
+        raise TrainingError(f"{output} holds a run already: go on with --resume or choose another --output")
     written = output / "config.yaml"
-    text = dump_yaml(config)
+    done_steps = 0
     if resume:
-        if written.is_file() and _network_part(written.read_text()) != _network_part(text):
+        if written.is_file() and load_experiment(written).network != config.network:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
+        done_steps = _steps_of(checkpoint)
+    output.mkdir(parents=True, exist_ok=True)
+    write_atomically(written, lambda path: path.write_text(dump_yaml(config)))
+    return done_steps
+
+
+def _steps_of(checkpoint: Path) -> int:
+    """Steps done at a checkpoint. Only tensors and plain values are read: no code in it can run."""
+    try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        missing = {"global_step", "state_dict", "optimizer_states", "loops"} - set(state)
+        if missing:
+            raise KeyError(*sorted(missing))
         return int(state["global_step"])
-    written.write_text(text)
-    return 0
+    except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise TrainingError(
+            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew in another --output"
+        ) from error
 
 
-def _network_part(text: str) -> str:
-    return text.split("\ndata:")[0]
-
-
-def _start_from(module: SelfSupervision, name: str) -> None:
+def _start_from(module: SelfSupervision, name: str) -> list[str]:
+    """Take over trained weights; what they were trained on."""
     model = load_model(name)
     if model.record.network != module.config.network:
         raise ConfigError(
-            f"initial_weights '{name}' are of another network: {model.record.network.model_dump()}; set the same network"
+            f"initial_weights '{name}' are of another network: {model.record.network.model_dump()}; set the same"
         )
     module.depth_net.load_state_dict(model.depth_net.state_dict())
     module.pose_net.load_state_dict(model.pose_net.state_dict())
+    return model.record.trained_on
 
 
 def _trainer(
-    config: ExperimentConfig, output: Path, device: str, quiet: bool, keeper: WeightKeeper, validates: bool
+    config: ExperimentConfig, output: Path, device: str, quiet: bool, keeper: WeightKeeper, done_steps: int
 ) -> lightning.Trainer:
     training = config.training
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -192,7 +236,9 @@ def _trainer(
         save_top_k=1,
         enable_version_counter=False,
     )
-    logs = [CSVLogger(output, "logs", "csv"), TensorBoardLogger(output, "logs", "tensorboard")]
+    # Lightning's CSV log starts by deleting an older one of its name
+    csv = f"csv_from_{done_steps}" if done_steps else "csv"
+    logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     progress = [] if quiet else [TQDMProgressBar(refresh_rate=5)]
     return lightning.Trainer(
         accelerator="gpu" if choose_device(device).type == "cuda" else "cpu",
@@ -201,7 +247,7 @@ def _trainer(
         max_steps=training.steps,
         gradient_clip_val=training.gradient_clip or None,
         check_val_every_n_epoch=None,
-        val_check_interval=training.validate_every if validates else None,
+        val_check_interval=training.validate_every if keeper.validates else None,
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
+from slam.se3 import FloatArray, nearest_rotation
 
 _ITERATIONS = 10
+_TRIMMINGS = 4
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -68,6 +69,21 @@ def parallax_px(
     turned = turned[:, :2] / np.where(turned[:, 2:] > 1e-6, turned[:, 2:], 1e-6)
     difference = (rays_current[:, :2] - turned) * [intrinsics.fx, intrinsics.fy]
     return np.asarray(np.linalg.norm(difference, axis=1))
+
+
+def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> FloatArray:
+    """``R_current_previous`` that explains the matched rays ``(M, 3)`` best without any translation.
+
+    Orthogonal Procrustes on unit rays, trimmed to the better three quarters so that movers do not turn it.
+    """
+    unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
+    unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
+    kept = np.ones(len(unit_previous), dtype=bool)
+    for _ in range(_TRIMMINGS):
+        R_current_previous = nearest_rotation(unit_current[kept].T @ unit_previous[kept])
+        error = np.linalg.norm(unit_current - unit_previous @ R_current_previous.T, axis=1)
+        kept = error <= np.quantile(error, 0.75)
+    return R_current_previous
 
 
 def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, two_view: TwoView) -> FloatArray:

@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
-from slam.frontend.epipolar import TwoView, estimate_two_view, parallax_px, triangulated_depth
+from slam.frontend.epipolar import (
+    TwoView,
+    estimate_two_view,
+    parallax_px,
+    rotation_between,
+    triangulated_depth,
+)
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.se3 import FloatArray, invert, make
@@ -55,9 +61,7 @@ class GeometricOdometry:
         if len(tracks.previous) < self._config.min_inliers:
             return Refusal(f"only {len(tracks.previous)} corners could be followed")
         depth = self._trusted(_sample(depth_previous_unscaled, tracks.previous), height_unscaled)
-        measured = (
-            self._still(tracks, depth) or self._by_essential(tracks, depth) or self._by_points(tracks, depth)
-        )
+        measured = self._still(tracks, depth) or self._by_essential(tracks, depth) or self._by_points(tracks, depth)
         if isinstance(measured, Refusal):
             return measured
         T_previous_current, sigmas, source = measured
@@ -87,12 +91,15 @@ class GeometricOdometry:
     def _by_essential(self, tracks: Tracks, depth: FloatArray) -> _Measured | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         rays_previous, rays_current = self._rays(tracks.previous), self._rays(tracks.current)
+        # an essential matrix of a pure rotation invents a translation: only believe one that is needed
+        turned = rotation_between(rays_previous, rays_current)
+        unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
+        if np.median(unexplained) < self._config.min_parallax_px:
+            return None
         two_view = estimate_two_view(rays_previous, rays_current, self._intrinsics.fx, self._config.inlier_px)
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
             return None
         parallax = parallax_px(rays_previous, rays_current, two_view.R_current_previous, self._intrinsics)
-        if np.median(parallax[two_view.inliers]) < self._config.min_parallax_px:
-            return None
         triangulated = triangulated_depth(rays_previous, rays_current, two_view)
         measures = two_view.inliers & (triangulated > 0) & np.isfinite(depth)
         measures &= parallax > self._config.min_point_parallax_px

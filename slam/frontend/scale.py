@@ -211,9 +211,7 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig) ->
     return best
 
 
-def _inliers(
-    rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray, config: ScaleConfig
-) -> NDArray[np.bool_]:
+def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray, config: ScaleConfig) -> NDArray[np.bool_]:
     """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
     predicted = planes @ rays.T
     relative = np.abs(predicted / inverse_depth - 1.0)

@@ -40,21 +40,15 @@ class CameraFile(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not isinstance(self.camera_height_m, str | None) and not self.camera_height_m > 0:
-            raise ValueError(
-                f"camera_height_m: must be greater than 0 or 'unknown', is {self.camera_height_m}"
-            )
+            raise ValueError(f"camera_height_m: must be greater than 0 or 'unknown', is {self.camera_height_m}")
         if not (0 < self.cx < self.width and 0 < self.cy < self.height):
-            raise ValueError(
-                f"cx, cy: ({self.cx:g}, {self.cy:g}) lies outside the {self.width}x{self.height} image"
-            )
+            raise ValueError(f"cx, cy: ({self.cx:g}, {self.cy:g}) lies outside the {self.width}x{self.height} image")
         allowed = _COEFFICIENTS.get(self.model)
         if allowed is None and any(self.distortion):
             raise ValueError("distortion: needs model opencv or fisheye; a pinhole has none")
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
-            raise ValueError(
-                f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}"
-            )
+            raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
         return self
 
     @property

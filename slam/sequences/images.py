@@ -108,9 +108,7 @@ def require_numbered(paths: list[Path]) -> None:
     digits = len(paths[0].stem)
     for index, path in enumerate(paths):
         if not path.stem.isdecimal():
-            raise SequenceError(
-                f"{path} is not named by its number ({index:0{digits}d}{path.suffix}): rename it"
-            )
+            raise SequenceError(f"{path} is not named by its number ({index:0{digits}d}{path.suffix}): rename it")
         if int(path.stem) != index:
             raise _missing(path.parent, f"{index:0{digits}d}{path.suffix}", len(paths))
 

@@ -53,8 +53,7 @@ class CalibrationFile:
             raise SequenceError(f"{self.path} row {key}: {error}; it needs {count} numbers") from error
         if len(numbers) != count or not np.isfinite(numbers).all():
             raise SequenceError(
-                f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones; "
-                f"restore the file"
+                f"{self.path} row {key} has {len(numbers)} numbers: it needs {count} finite ones; restore the file"
             )
         return numbers.reshape(shape)
 
@@ -72,9 +71,7 @@ class CalibrationFile:
         fx, fy, cx, cy = P[0, 0], P[1, 1], P[0, 2], P[1, 2]
         skew_free = P[0, 1] == P[1, 0] == P[2, 0] == P[2, 1] == 0 and P[2, 2] == 1
         if not (fx > 0 and fy > 0 and skew_free):
-            raise SequenceError(
-                f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file"
-            )
+            raise SequenceError(f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file")
         if not (0 < cx < width and 0 < cy < height):
             raise SequenceError(
                 f"{self.path} row {key} has its principal point at ({cx:g}, {cy:g}), outside the "

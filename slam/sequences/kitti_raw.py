@@ -106,9 +106,7 @@ def open_kitti_raw(drive: Path, camera: CameraFile | None) -> Recording:
         name=name,
         images=images,
         intrinsics=intrinsics,
-        stamps=fallback_stamps(times_path, len(paths))
-        if image_times is None
-        else image_times - image_times[0],
+        stamps=fallback_stamps(times_path, len(paths)) if image_times is None else image_times - image_times[0],
         sources=drive_sources(name),
         reference=_reference(drive, len(paths), image_times, T_camera_lidar),
         camera_height_m=_camera_height(drive, camera),

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from slam import se3
 from slam.errors import SequenceError
 from slam.foreign import import_open3d
-from slam.sequences.street.geometry import Float32Array, FloatArray, Mesh
-from slam.sequences.street.light import draw_weather, sky
-from slam.sequences.street.optics import kitti_intrinsics, pixel_rays
-from slam.sequences.street.painter import Hits, facing_normals, paint
-from slam.sequences.street.route import plan_drive
-from slam.sequences.street.town import build_town
+from slam.sequences.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.sequences.simulation.light import draw_weather, sky
+from slam.sequences.simulation.optics import kitti_intrinsics, pixel_rays
+from slam.sequences.simulation.painter import Hits, facing_normals, paint
+from slam.sequences.simulation.route import plan_drive
+from slam.sequences.simulation.town import build_town
 
 Route = Literal["loop", "grid", "straight"]
 Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]

@@ -11,7 +11,7 @@ Node = tuple[int, int]
 BoolArray = NDArray[np.bool_]
 
 MARGIN = 42.0  # depth of the outermost lots, metres
-SMALLEST_BLOCK = 24.0  # between two street centres, metres
+SMALLEST_BLOCK = 22.0  # between two street centres, metres
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,26 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
         return nodes[::-1] if rng.random() < 0.5 else nodes
 
 
-def grid_walk(rng: np.random.Generator, side: int, edges: int) -> list[Node]:
-    """A walk on ``side`` x ``side`` nodes without U-turns that drives streets again, also the other way."""
+def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> list[Node]:
+    """A walk on ``side`` x ``side`` nodes without U-turns that drives streets again, also the other way.
+
+    Args:
+        rng: decides the way.
+        side: nodes along each side.
+        edges: within which the streets are driven again.
+        spare: further edges, in case the drive comes so far.
+    """
     best: tuple[float, list[Node]] = (-1.0, [])
     for _ in range(300):
         walk = [(int(rng.integers(side)), int(rng.integers(side)))]
-        while len(walk) <= edges:
+        while len(walk) <= edges + spare:
             x, y = walk[-1]
             steps = [(x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)]
             steps = [s for s in steps if 0 <= s[0] < side and 0 <= s[1] < side and s not in walk[-2:-1]]
             walk.append(steps[rng.integers(len(steps))])
         driven: set[tuple[Node, Node]] = set()
         same = opposite = 0
-        for step in zip(walk[:-1], walk[1:]):
+        for step in zip(walk[:edges], walk[1 : edges + 1]):
             same += step in driven
             opposite += step[::-1] in driven
             driven.add(step)

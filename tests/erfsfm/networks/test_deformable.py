@@ -71,7 +71,7 @@ CASES = [
     ((6, 5), (3, 3), (2, 2), (1, 1), (1, 1), 2, 1, 0.3),
     ((7, 7), (3, 2), (2, 1), (0, 2), (2, 1), 1, 2, 1.0),
     ((5, 5), (3, 3), (1, 2), (2, 2), (2, 2), 4, 2, 2.0),
-    ((4, 4), (3, 3), (1, 1), (1, 1), (1, 1), 1, 1, 100.0),  # mostly outside
+    ((4, 4), (3, 3), (1, 1), (1, 1), (1, 1), 1, 1, 8.0),  # mostly outside
     ((1, 5), (3, 3), (2, 2), (1, 1), (1, 1), 1, 1, 0.7),
     ((4, 1), (3, 3), (1, 1), (1, 1), (1, 1), 1, 1, 0.7),
     ((1, 1), (3, 3), (1, 1), (1, 1), (1, 1), 2, 2, 0.7),
@@ -83,7 +83,7 @@ CASES = [
 @pytest.mark.parametrize("case", CASES)
 def test_values_and_gradients_equal_the_definition(case, chunk, monkeypatch):
     monkeypatch.setattr(deformable, "_CPU_CHUNK", chunk)
-    size, kernel, stride, padding, dilation, *_ = case
+    stride, padding, dilation = case[2:5]
     tensors = make_case(*case)
     ours = deform_conv2d(**tensors, stride=stride, padding=padding, dilation=dilation)
     wanted = reference(**tensors, stride=stride, padding=padding, dilation=dilation)

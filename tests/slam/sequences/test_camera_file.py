@@ -46,9 +46,7 @@ def test_exponent_without_dot_is_a_number(tmp_path: Path, camera_yaml: str) -> N
         ("{yaml}model: opencv\ndistortion: [a, 0, 0, 0]\n", "distortion: "),
     ],
 )
-def test_errors_are_one_line_and_name_the_key(
-    tmp_path: Path, camera_yaml: str, text: str, message: str
-) -> None:
+def test_errors_are_one_line_and_name_the_key(tmp_path: Path, camera_yaml: str, text: str, message: str) -> None:
     path = written(tmp_path, text.replace("{yaml}", camera_yaml))
     with pytest.raises(SequenceError) as caught:
         read_camera_file(path)

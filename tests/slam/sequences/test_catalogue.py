@@ -40,9 +40,7 @@ def test_environment(tmp_path: Path, odometry, monkeypatch: pytest.MonkeyPatch) 
     odometry(tmp_path / "kitti", name="09")
     monkeypatch.chdir(tmp_path)
     for dataset in (None, Path("KITTI")):
-        with pytest.raises(
-            SequenceError, match=r"sequence 09 is looked for in \$KITTI_ODOMETRY, which is not set"
-        ):
+        with pytest.raises(SequenceError, match=r"sequence 09 is looked for in \$KITTI_ODOMETRY, which is not set"):
             open_sequence(dataset, "09", None, None)
     monkeypatch.setenv("KITTI_ODOMETRY", str(tmp_path / "kitti"))
     assert open_sequence(None, "09", None, None).name == "09"

@@ -24,10 +24,8 @@ def test_layouts_and_formats(tmp_path: Path, odometry, layout: str, suffix: str)
     assert sequence.provenance() == ("kitti_odometry/00[0:6]",)
 
 
-@pytest.mark.parametrize("camera, x_m", [(0, 0.0), (1, 0.5), (2, -0.06), (3, 0.47)])
-def test_each_camera_has_its_intrinsics_and_reference(
-    tmp_path: Path, odometry, camera: int, x_m: float
-) -> None:
+@pytest.mark.parametrize("camera", [0, 1, 2, 3])
+def test_each_camera_has_its_intrinsics_and_reference(tmp_path: Path, odometry, camera: int) -> None:
     folder = odometry(tmp_path, camera=camera)
     rows = (folder / "calib.txt").read_text().splitlines()
     rows[camera] = rows[camera].replace("30 0 20", "31 0 20", 1).replace("30 12", "31 12")

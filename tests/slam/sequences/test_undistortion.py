@@ -105,9 +105,7 @@ class Blank:
 
 def test_other_size_suggests_scaled_values() -> None:
     camera = CameraFile(width=40, height=24, fx=30, fy=30, cx=19.5, cy=11.5, fps=5)
-    with pytest.raises(
-        SequenceError, match=r"are 80x48, .* for 40x24: .*width: 80, height: 48, fx: 60, .*cx: 39.5"
-    ):
+    with pytest.raises(SequenceError, match=r"are 80x48, .* for 40x24: .*width: 80, height: 48, fx: 60, .*cx: 39.5"):
         calibrated(Blank(80, 48), camera, "here")
 
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam.sequences.street.geometry import Float32Array, Material
-from slam.sequences.street.noise import Texels, band, cell_hash, fractal, stripes
+from slam.sequences.simulation.geometry import Float32Array, Material
+from slam.sequences.simulation.noise import Texels, band, cell_hash, fractal, stripes
 
 Shader = Callable[[Texels, Float32Array, Float32Array], Float32Array]
 

@@ -1,0 +1,212 @@
+"""How much of the image a network's encoder sees, and what a forward pass costs.
+
+The paper compares its networks by the field of one pixel of the last encoder layer (its figure 4).
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from erfsfm.networks.blocks import Encoder, Layer
+from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.pose_net import PoseNet
+
+Network = DepthNet | PoseNet
+
+# Shares of the largest gradient below this are rounding of the sampling positions in float64, not field.
+_ROUNDING = 1e-11
+
+
+@dataclass(frozen=True)
+class MeasuredField:
+    """Which image pixels move one output pixel.
+
+    Attributes:
+        pixel: (row, column) of the output pixel in the last encoder layer.
+        map_size: (height, width) of that layer.
+        top: first image row with a gradient; so are `left`, and `bottom`, `right` the last ones.
+        coverage: share of the image's pixels with a gradient.
+        gradient: gradient magnitude summed over the input channels, ``(H, W)``.
+    """
+
+    pixel: tuple[int, int]
+    map_size: tuple[int, int]
+    top: int
+    bottom: int
+    left: int
+    right: int
+    coverage: float
+    gradient: Tensor
+
+    @property
+    def rows(self) -> int:
+        """Height of the bounding box, 0 for an empty field."""
+        return self.bottom - self.top + 1
+
+    @property
+    def columns(self) -> int:
+        """Width of the bounding box, 0 for an empty field."""
+        return self.right - self.left + 1
+
+
+def theoretical(network: Network) -> int:
+    """Side of the receptive field after the last encoder layer in pixels; deformable at zero offsets."""
+    return field_after(network.encoder_layers())
+
+
+def field_after(layers: Sequence[Layer]) -> int:
+    """Side of the receptive field after some layers in pixels.
+
+    r += (k - 1) d j;  j *= s        with the jump j of the layer's input in pixels
+    """
+    field, jump = 1, 1
+    for layer in layers:
+        field += (layer.kernel - 1) * layer.dilation * jump
+        jump *= layer.stride
+    return field
+
+
+def measured(
+    network: Network,
+    size: tuple[int, int] = (128, 416),
+    pixel: tuple[int, int] | None = None,
+    offsets_px: float | Literal["learned"] = 0.0,
+    stages: int | None = None,
+) -> MeasuredField:
+    """Bounding box and coverage by input gradients, with constant positive weights and a white image.
+
+    Weights are one over the fan-in, so that no activation overflows; the network given is left alone.
+
+    Args:
+        network: any depth or pose network.
+        size: image (height, width).
+        pixel: (row, column) of the observed output; its map's centre if None.
+        offsets_px: how far deformable taps are pushed outwards from the kernel's centre, rows and
+            columns alike, in pixels of the layer's input; ``learned`` keeps the network's own offsets.
+        stages: observe the output of this many encoder stages, all if None.
+    """
+    encoder = copy.deepcopy(network.encoder).double().eval()
+    for module in encoder.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.reset_running_stats()
+            module.reset_parameters()
+    predictors = _set_offsets(encoder, offsets_px)
+    for module in encoder.modules():
+        if isinstance(module, nn.Conv2d) and module not in predictors:
+            nn.init.constant_(module.weight, 1 / module.weight[0].numel())
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    image = torch.ones(1, network.input_channels, *size, dtype=torch.float64)
+    return field_of(encoder, image.to(next(encoder.parameters()).device), pixel, _ROUNDING, stages)
+
+
+def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = None) -> MeasuredField:
+    """Gradient-weighted field of the network as it is, its weights and offsets included.
+
+    Args:
+        network: any depth or pose network.
+        image: the encoder's input, ``(1, C, H, W)``; for a pose network target and sources stacked.
+        pixel: (row, column) of the observed output; its map's centre if None.
+    """
+    training = network.encoder.training
+    network.encoder.eval()
+    try:
+        return field_of(network.encoder, image, pixel)
+    finally:
+        network.encoder.train(training)
+
+
+def field_of(
+    encoder: Encoder,
+    image: Tensor,
+    pixel: tuple[int, int] | None = None,
+    rounding: float = 0.0,
+    stages: int | None = None,
+) -> MeasuredField:
+    """Field of one pixel of channel 0 of an encoder's output, by input gradients.
+
+    Args:
+        encoder: the encoder as it is.
+        image: its input, ``(1, C, H, W)``.
+        pixel: (row, column) of the observed output; its map's centre if None.
+        rounding: share of the largest gradient up to which a gradient counts as zero.
+        stages: observe the output of this many stages, all if None.
+    """
+    image = image.detach().clone().requires_grad_()
+    output = encoder(image)[(stages or len(encoder.stages)) - 1]
+    map_size = (output.shape[2], output.shape[3])
+    row, column = pixel or (map_size[0] // 2, map_size[1] // 2)
+    if not (0 <= row < map_size[0] and 0 <= column < map_size[1]):
+        raise ValueError(f"pixel must lie in the map of size {map_size}; got {(row, column)}")
+    (gradient,) = torch.autograd.grad(output[0, 0, row, column], image)
+    gradient = gradient[0].abs().sum(dim=0)  # (H, W)
+    seen = gradient > rounding * gradient.max()
+    top, bottom = _extent(seen.any(dim=1))
+    left, right = _extent(seen.any(dim=0))
+    coverage = float(seen.double().mean())
+    return MeasuredField((row, column), map_size, top, bottom, left, right, coverage, gradient)
+
+
+def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
+    """Multiply-adds of one forward pass in evaluation mode: convolutions of every kind, no sampling.
+
+    The network is copied to the meta device, so that only shapes are computed.
+
+    Raises:
+        ConfigError: if the network cannot run forward.
+    """
+    shadow = copy.deepcopy(network).to("meta").eval()
+    total = 0
+
+    def count(places: Callable[[Tensor, Tensor], int], each: int) -> Callable[..., None]:
+        def hook(_module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+            nonlocal total
+            total += places(inputs[0], output) * each
+
+        return hook
+
+    for module in shadow.modules():
+        if isinstance(module, nn.ConvTranspose2d):  # every input place spreads the whole kernel
+            module.register_forward_hook(count(lambda before, _: before[0, 0].numel(), module.weight.numel()))
+        elif isinstance(module, nn.Conv2d):
+            module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), module.weight.numel()))
+        elif isinstance(module, DeformableConv2d):  # its kernel is used, not called
+            weights = module.kernel.weight.numel()
+            module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), weights))
+    image = torch.empty(1, 3, height, width, device="meta")
+    with torch.no_grad():
+        if isinstance(shadow, PoseNet):
+            shadow(image, [image] * shadow.sources)
+        else:
+            shadow(image)
+    return total
+
+
+def _set_offsets(encoder: Encoder, offsets_px: float | Literal["learned"]) -> set[nn.Module]:
+    """Fix the offsets of all deformable layers; return the convolutions that predict them."""
+    predictors: set[nn.Module] = set()
+    for module in encoder.modules():
+        if not isinstance(module, DeformableConv2d):
+            continue
+        predictors |= {module.offset, module.modulator}
+        if isinstance(offsets_px, str):
+            continue
+        module.reset_offsets()
+        side = module.kernel.kernel_size[0]
+        outwards = torch.sign(torch.arange(side) - (side - 1) / 2) * offsets_px
+        taps = torch.stack(torch.meshgrid(outwards, outwards, indexing="ij"), dim=-1)  # (k, k, [dy, dx])
+        assert module.offset.bias is not None
+        with torch.no_grad():
+            module.offset.bias.copy_(taps.flatten())
+    return predictors
+
+
+def _extent(seen: Tensor) -> tuple[int, int]:
+    """First and last true place; (0, -1) if there is none."""
+    places = seen.nonzero()[:, 0]
+    return (int(places[0]), int(places[-1])) if len(places) else (0, -1)

@@ -1,0 +1,298 @@
+"""How far a trajectory is from the truth: the object T of ``metrics.json``, with evo as a second opinion.
+
+The paper's snippets, absolute errors under five alignments (Umeyama 1991), KITTI's segment errors (Geiger
+et al. 2012) and the errors of single steps. This is the only file that imports evo, and only inside a
+function: every other number stands without it.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
+from slam import se3
+from slam.errors import ConfigError, TrajectoryError
+from slam.se3 import FloatArray
+from slam.trajectory import Trajectory, matching_tolerance_s, read_trajectory
+
+Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
+ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
+
+Metric = float | int | str
+"""A number, or in words why there is none."""
+
+SEGMENT_LENGTHS_M = np.arange(100.0, 900.0, 100.0)
+SEGMENT_STEP = 10
+SNIPPET_LENGTH = 5
+
+_SNIPPET_KEYS = ("ate_mean", "ate_std", "re_mean", "re_std", "count")
+_ALIGN_KEYS = ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale")
+_EVO_KEYS = ("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference")
+# With fewer frames an alignment leaves no freedom for an error, and its zero would mean nothing.
+_FEWEST_FRAMES: dict[Alignment, int] = {"none": 1, "first": 2, "scale": 2, "6dof": 2, "7dof": 3}
+_NO_REFERENCE = "there is no reference trajectory"
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """An estimate brought to a reference, both ``(N, 4, 4)`` and with one world."""
+
+    T_world_estimate: FloatArray
+    T_world_reference: FloatArray
+    scale: Metric
+
+
+def trajectory_metrics(
+    estimate: Trajectory, reference: Trajectory | None, snippet5: SnippetErrors | None = None
+) -> dict[str, Any]:
+    """The object T of ``metrics.json`` (``design.md``, section 7), ready for JSON.
+
+    Every number that cannot be computed is None, with the reason in a sibling ``<name>_reason``.
+
+    Args:
+        estimate: the trajectory to judge.
+        reference: the truth of the same frames, row k beside row k (see `slam.trajectory.associate`).
+        snippet5: the paper's protocol where it was measured directly; by default cut from the estimate.
+
+    Raises:
+        TrajectoryError: if the two have different lengths.
+    """
+    reason = _why_not(estimate, reference)
+    if reference is None or reason:
+        aligned_metrics = {name: _null(_ALIGN_KEYS, reason) for name in ALIGNMENTS}
+        snippets = _snippet_record(snippet5) if snippet5 else _null(_SNIPPET_KEYS, reason)
+        return {"snippet5": snippets, "align": aligned_metrics, "evo": _null(_EVO_KEYS, reason)}
+    T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
+    ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
+    return {
+        "snippet5": _snippet_record(snippet5 or _cut_snippets(T_world_estimate, T_world_reference)),
+        "align": {name: _record(metrics) for name, metrics in ours.items()},
+        "evo": _record(_evo_metrics(T_world_estimate, T_world_reference, ours["7dof"])),
+    }
+
+
+def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment) -> Aligned:
+    """Bring an estimate to a reference, both ``(N, 4, 4)``.
+
+    ``none`` as written; ``first`` both rebased to their first pose; ``scale`` then also one factor,
+    s = sum(g . p) / sum(p . p); ``6dof`` and ``7dof`` the best rigid motion and the best similarity of the
+    positions. The scale of an estimate that stands still is undefined; it is left as it is.
+    """
+    if alignment in ("first", "scale"):
+        T_world_reference = se3.invert(T_world_reference[0]) @ T_world_reference
+        T_world_estimate = se3.invert(T_world_estimate[0]) @ T_world_estimate
+    scaled = alignment in ("scale", "7dof")
+    still = _stands_still(T_world_estimate)
+    fit = se3.Similarity(1.0, np.eye(3), np.zeros(3))
+    g, p = T_world_reference[:, :3, 3], T_world_estimate[:, :3, 3]
+    if alignment in ("6dof", "7dof"):
+        fit = se3.umeyama(g, p, with_scale=scaled and not still)
+    elif scaled and not still:
+        fit = se3.Similarity(float((g * p).sum() / (p * p).sum()), np.eye(3), np.zeros(3))
+    scale: Metric = "the estimate does not move, so its scale is undefined" if scaled and still else fit.scale
+    return Aligned(fit.apply_to_poses(T_world_estimate), T_world_reference, scale)
+
+
+def evo_commands(estimate: Path | str, reference: Path | str, format: str = "auto") -> list[str]:
+    """The evo commands that give the numbers of ``evo`` for two files; none for files of two formats.
+
+    Raises:
+        TrajectoryError: if a file cannot be read in this format.
+    """
+    a, b = read_trajectory(estimate, format), read_trajectory(reference, format)
+    if a.timed != b.timed:
+        return []
+    files = f"{'tum' if a.timed else 'kitti'} {shlex.quote(str(reference))} {shlex.quote(str(estimate))}"
+    options = "--align --correct_scale"
+    if a.timed:
+        options += f" --t_max_diff {matching_tolerance_s(a, b):.9g}"
+    steps = f"evo_rpe {files} {options} --delta 1 --delta_unit f --pose_relation"
+    return [f"evo_ape {files} {options}", f"{steps} trans_part", f"{steps} angle_deg"]
+
+
+def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
+    """What of T lies above its limit, one line each; a number that is missing counts as above.
+
+    Args:
+        metrics: the object T.
+        limits: ``METRIC=VALUE`` each; METRIC is a path as ``align.7dof.ate_rmse_m`` or ``snippet5.ate_mean``,
+            and a bare name such as ``ate_rmse_m`` means the one under ``7dof``.
+
+    Raises:
+        ConfigError: if a limit is malformed or there is no such metric.
+    """
+    lines = []
+    for limit in limits:
+        name, _, text = (part.strip() for part in limit.partition("="))
+        try:
+            most = float(text)
+        except ValueError:
+            most = math.nan
+        if not name or math.isnan(most):
+            raise ConfigError(f"a limit is METRIC=VALUE with a number for VALUE; got '{limit}'")
+        path = f"align.7dof.{name}" if name in _ALIGN_KEYS else name
+        section, _, key = path.rpartition(".")
+        if path not in _metric_paths():
+            raise ConfigError(
+                f"there is no metric '{name}'; use {', '.join(_ALIGN_KEYS)} (under 7dof), "
+                f"align.{{{','.join(ALIGNMENTS)}}}.NAME, snippet5.NAME or evo.NAME"
+            )
+        record: Any = metrics
+        for part in section.split("."):
+            record = record[part]
+        if record[key] is None:
+            lines.append(f"{path} is not known ({record.get(f'{key}_reason')}), limit {most:g}")
+        elif record[key] > most:
+            lines.append(f"{path} is {record[key]:.6g}, over the limit {most:g}")
+    return lines
+
+
+def _metric_paths() -> set[str]:
+    """Every dotted path to a number of T."""
+    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in _ALIGN_KEYS}
+    return paths | {f"snippet5.{key}" for key in _SNIPPET_KEYS} | {f"evo.{key}" for key in _EVO_KEYS}
+
+
+def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
+    """Why nothing can be measured; empty where something can."""
+    if reference is None:
+        return _NO_REFERENCE
+    if len(estimate) != len(reference):
+        raise TrajectoryError(
+            f"the estimate has {len(estimate)} poses and the reference {len(reference)}: match them first"
+        )
+    for name, trajectory in (("estimate", estimate), ("reference", reference)):
+        if not np.isfinite(trajectory.T_world_camera).all():
+            return f"the {name} has poses that are not finite"
+    return ""
+
+
+def _alignment_metrics(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment
+) -> dict[str, Metric]:
+    """The object A: errors of all rows after one alignment."""
+    frames, fewest = len(T_world_estimate), _FEWEST_FRAMES[alignment]
+    if frames < fewest:
+        return dict.fromkeys(_ALIGN_KEYS, f"this alignment needs {fewest} frames; there are {frames}")
+    if alignment in ("scale", "7dof") and _stands_still(T_world_reference):
+        return dict.fromkeys(_ALIGN_KEYS, "the reference does not move, so scaling would hide every error")
+    aligned = align(T_world_estimate, T_world_reference, alignment)
+    offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
+    return {
+        "ate_rmse_m": float(np.sqrt((offsets**2).sum(axis=1).mean())),
+        **_segment_metrics(aligned.T_world_estimate, aligned.T_world_reference),
+        **_step_metrics(aligned.T_world_estimate, aligned.T_world_reference),
+        "scale": aligned.scale,
+    }
+
+
+def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, Metric]:
+    """KITTI's drift: mean error of all segments of 100 to 800 m of true path, a start every ten frames."""
+    steps = np.linalg.norm(np.diff(T_world_reference[:, :3, 3], axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(steps)])  # (N,), metres
+    starts, lengths = np.meshgrid(np.arange(0, len(distance), SEGMENT_STEP), SEGMENT_LENGTHS_M)
+    ends = np.searchsorted(distance, distance[starts] + lengths, side="right")  # first frame beyond
+    fits = ends < len(distance)
+    if not fits.any():
+        reason = f"no segment of {SEGMENT_LENGTHS_M[0]:.0f} m fits into the path of {distance[-1]:.1f} m"
+        return {"t_rel_percent": reason, "r_rel_deg_per_100m": reason}
+    translation, rotation = _relative_errors(T_world_estimate, T_world_reference, starts[fits], ends[fits])
+    return {
+        "t_rel_percent": float(100.0 * (translation / lengths[fits]).mean()),
+        "r_rel_deg_per_100m": float(100.0 * np.rad2deg(rotation / lengths[fits]).mean()),
+    }
+
+
+def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, Metric]:
+    """Mean error from each frame to the next."""
+    first = np.arange(len(T_world_estimate) - 1)
+    if not first.size:
+        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), "a single frame makes no step")
+    translation, rotation = _relative_errors(T_world_estimate, T_world_reference, first, first + 1)
+    return {"rpe_trans_m": float(translation.mean()), "rpe_rot_deg": float(np.rad2deg(rotation).mean())}
+
+
+def _relative_errors(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, starts: Any, ends: Any
+) -> tuple[FloatArray, FloatArray]:
+    """Translation (metres) and rotation (radians) errors ``(M,)`` of motions between pairs of rows.
+
+    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+    """
+    T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
+    T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
+    T_error = se3.invert(T_start_end_estimate) @ T_start_end_reference
+    return np.linalg.norm(T_error[:, :3, 3], axis=1), se3.rotation_angle(T_error[:, :3, :3])
+
+
+def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> SnippetErrors | None:
+    """The paper's protocol on consecutive rows; None where they do not fill a snippet."""
+    if len(T_world_estimate) < SNIPPET_LENGTH:
+        return None
+    predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
+    return snippet_errors(predicted, snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH))
+
+
+def _snippet_record(errors: SnippetErrors | None) -> dict[str, Any]:
+    if errors is None:
+        return {**_null(_SNIPPET_KEYS[:-1], f"a snippet needs {SNIPPET_LENGTH} frames"), "count": 0}
+    values = asdict(errors)
+    return _record({key: values[key] for key in _SNIPPET_KEYS})
+
+
+def _evo_metrics(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: Mapping[str, Metric]
+) -> dict[str, Metric]:
+    """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
+    if isinstance(ours["ate_rmse_m"], str):
+        return dict.fromkeys(_EVO_KEYS, ours["ate_rmse_m"])
+    try:
+        from evo import EvoException
+        from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+        from evo.core.trajectory import PosePath3D
+    except ImportError as error:
+        return dict.fromkeys(_EVO_KEYS, f"evo cannot be imported ({error})")
+    estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
+    try:
+        estimate.align(reference, correct_scale=True)
+        values: dict[str, Metric] = {}
+        for key, metric, statistic in (
+            ("ape_rmse_m_7dof", APE(PoseRelation.translation_part), StatisticsType.rmse),
+            ("rpe_trans_m", RPE(PoseRelation.translation_part, 1, Unit.frames), StatisticsType.mean),
+            ("rpe_rot_deg", RPE(PoseRelation.rotation_angle_deg, 1, Unit.frames), StatisticsType.mean),
+        ):
+            metric.process_data((reference, estimate))
+            values[key] = float(metric.get_statistic(statistic))
+    except EvoException as error:
+        return dict.fromkeys(_EVO_KEYS, f"evo refuses: {error}")
+    pairs = (("ape_rmse_m_7dof", "ate_rmse_m"), ("rpe_trans_m", "rpe_trans_m"), ("rpe_rot_deg", "rpe_rot_deg"))
+    differences = [abs(float(values[theirs]) - float(ours[mine])) for theirs, mine in pairs]
+    return {**values, "difference": max(differences)}
+
+
+def _stands_still(T_world_camera: FloatArray) -> bool:
+    """Whether all positions are one, up to rounding."""
+    positions = T_world_camera[:, :3, 3]
+    return bool(np.ptp(positions, axis=0).max() <= 1e-12 * max(1.0, np.abs(positions).max()))
+
+
+def _null(keys: Sequence[str], reason: str) -> dict[str, Any]:
+    return _record(dict.fromkeys(keys, reason))
+
+
+def _record(metrics: Mapping[str, Metric]) -> dict[str, Any]:
+    """Numbers under their names; words and numbers that are not finite become None and a reason."""
+    record: dict[str, Any] = {}
+    for name, metric in metrics.items():
+        reason = metric if isinstance(metric, str) else "" if math.isfinite(metric) else "the result is not finite"
+        record[name] = None if reason else metric
+        if reason:
+            record[f"{name}_reason"] = reason
+    return record

@@ -1,0 +1,107 @@
+"""Parts of a run as files for other programs: PLY, KITTI or TUM, g2o."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from slam import se3
+from slam.errors import RunError
+from slam.run_folder import RunFolder
+from slam.se3 import FloatArray
+from slam.trajectory import Trajectory, write_kitti, write_tum
+
+WHATS = ("mesh", "cloud", "trajectory", "graph")
+UPS = ("y-down", "z")
+# x right, y ahead, z up, from a camera's x right, y down, z ahead
+R_UP_WORLD: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+class RotatePly(Protocol):
+    """Writes a PLY whose vertices and normals are those of another, turned by ``R_up_world`` ``(3, 3)``."""
+
+    def __call__(self, source: Path, target: Path, R_up_world: FloatArray, /) -> None:
+        """Read ``source``, turn it and write ``target``, which ends in ``.ply``."""
+        ...
+
+
+def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: RotatePly) -> Path:
+    """Write one part of a run as one file, whole or not at all; missing parent folders are made.
+
+    Args:
+        folder: the run.
+        what: ``mesh`` or ``cloud`` (PLY), ``trajectory`` (the optimised one: TUM where ``output`` ends in
+            ``.tum`` or ``.tum.txt``, else KITTI) or ``graph`` (g2o).
+        output: the file.
+        up: ``y-down`` as the run has it, or ``z``: x right, y ahead, z up. A trajectory's cameras keep
+            their own axes, only the world is turned.
+        rotate_ply: turns a PLY (``slam.mapping.rotate_ply``).
+
+    Returns:
+        The file written.
+
+    Raises:
+        RunError: an unknown ``what`` or ``up``, a part that the run lacks, or a file that cannot be written.
+    """
+    if what == "colmap":
+        raise RunError(
+            "--what colmap is not built yet: export --what trajectory and --what cloud, and take fx, fy, cx, cy "
+            "from the camera.yaml or calib.txt of the sequence"
+        )
+    if what not in WHATS:
+        raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(WHATS)}")
+    if up not in UPS:
+        raise RunError(f"--up {up!r} is unknown: choose {' or '.join(UPS)}")
+    if output.is_dir():
+        raise RunError(f"{output} is a folder: give the name of a file to write")
+    if what in ("mesh", "cloud"):
+        _export_ply(folder.require(f"map_{what}.ply"), output, up, rotate_ply)
+    elif what == "trajectory":
+        _export_trajectory(folder, output, up)
+    else:
+        if up != "y-down":
+            raise RunError("a graph is exported as the run has it: leave --up out or give --up y-down")
+        source = folder.require("graph.g2o")
+        _write(output, lambda path: shutil.copyfile(source, path))
+    return output
+
+
+def _export_ply(source: Path, output: Path, up: str, rotate_ply: RotatePly) -> None:
+    if output.suffix.lower() != ".ply":
+        raise RunError(f"meshes and clouds are written as PLY; got '{output.name}', give a name that ends in .ply")
+    if up == "y-down":
+        _write(output, lambda path: shutil.copyfile(source, path))
+    else:
+        _write(output, lambda path: rotate_ply(source, path, R_UP_WORLD))
+
+
+def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
+    folder.require("trajectory_optimised.tum.txt")
+    trajectory = folder.trajectory("optimised")
+    if trajectory is None:
+        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    if up == "z":
+        T_up_world = se3.make(R_UP_WORLD, np.zeros(3))
+        trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
+    write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
+    _write(output, lambda path: write(path, trajectory))
+
+
+def _write(output: Path, fill: Callable[[Path], object]) -> None:
+    """Let ``fill`` write beside the target, then move into place; the suffix stays what it is."""
+    partial = output.with_name(f".{os.getpid()}.partial.{output.name}")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        fill(partial)
+        partial.replace(output)
+    except OSError as error:
+        raise RunError(f"{output}: cannot be written ({error.strerror or error})") from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -1,1 +1,0 @@
-"""The parts of the simulated street world: plan, town, drive, textures, hazards and LiDAR."""

@@ -1,0 +1,100 @@
+"""Variations of a snippet: the camera follows the images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from erfsfm.config import DataConfig
+from erfsfm.data.augmentation import augment
+from erfsfm.geometry.camera import Camera
+
+CAMERA = Camera(width=160, height=96, fx=110.0, fy=120.0, cx=77.0, cy=50.0)
+POINTS = np.random.default_rng(2).uniform([-0.3, -0.15, 1.0], [0.3, 0.15, 1.5], (5, 3))
+
+
+def project(camera: Camera, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    x, y, w = camera.K.astype(np.float64) @ point
+    return np.array([x, y]) / w
+
+
+def blob(centre: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """A white spot on black whose centre of gravity is ``centre``."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    spot = np.exp(-((u - centre[0]) ** 2 + (v - centre[1]) ** 2) / 18)
+    return np.repeat(np.rint(spot * 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    grey = image[..., 0].astype(np.float64)
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    return np.array([(u * grey).sum(), (v * grey).sum()]) / grey.sum()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("flip", [0.0, 1.0])
+@pytest.mark.parametrize("zoom", [1.0, 1.15, 1.3])
+def test_points_are_where_the_camera_says(seed: int, flip: float, zoom: float) -> None:
+    images = [blob(project(CAMERA, point)) for point in POINTS]
+    config = DataConfig(flip=flip, zoom=zoom)
+    varied, camera = augment(images, CAMERA, config, "default", np.random.default_rng(seed))
+    assert (camera.width, camera.height) == (160, 96)
+    for image, point in zip(varied, POINTS):
+        assert image.shape == (96, 160, 3)
+        assert image.dtype == np.uint8
+        seen = project(camera, point * [-1, 1, 1] if flip else point)
+        np.testing.assert_allclose(centre_of(image), seen, atol=0.1)
+
+
+def test_the_papers_flip_is_one_pixel_off() -> None:
+    images = [blob(project(CAMERA, POINTS[0]))]
+    varied, camera = augment(images, CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0))
+    assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(1, abs=0.05)
+
+
+def test_nothing_to_vary_leaves_all_as_it_was() -> None:
+    images = [blob(project(CAMERA, point)) for point in POINTS]
+    varied, camera = augment(images, CAMERA, DataConfig(flip=0, zoom=1), "default", np.random.default_rng(0))
+    assert camera == CAMERA
+    assert all((a == b).all() for a, b in zip(varied, images))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_colour_is_one_change_for_all_frames(seed: int) -> None:
+    rng = np.random.default_rng(9)
+    image = rng.integers(0, 256, (96, 160, 3), dtype=np.uint8)
+    config = DataConfig(flip=0, zoom=1, colour_jitter=0.3)
+    (first, second), camera = augment([image, image.copy()], CAMERA, config, "default", np.random.default_rng(seed))
+    assert camera == CAMERA
+    assert (first == second).all()
+    assert (first != image).any()
+    assert first.dtype == np.uint8
+
+
+def test_weak_colour_changes_are_weak() -> None:
+    image = np.random.default_rng(9).integers(0, 256, (96, 160, 3), dtype=np.uint8)
+    config = DataConfig(flip=0, zoom=1, colour_jitter=1e-9)
+    for seed in range(4):
+        (varied,), _ = augment([image], CAMERA, config, "default", np.random.default_rng(seed))
+        if (varied[..., 0] == varied[..., 1]).all():
+            continue  # turned grey
+        assert (varied == image).all()
+
+
+def test_the_generator_is_the_only_chance() -> None:
+    images = [blob(project(CAMERA, point)) for point in POINTS]
+    config = DataConfig(colour_jitter=0.2)
+    first, camera = augment(images, CAMERA, config, "default", np.random.default_rng(4))
+    again, same_camera = augment(images, CAMERA, config, "default", np.random.default_rng(4))
+    other, other_camera = augment(images, CAMERA, config, "default", np.random.default_rng(5))
+    assert camera == same_camera != other_camera
+    assert all((a == b).all() for a, b in zip(first, again))
+    assert any((a != b).any() for a, b in zip(first, other))
+
+
+def test_inputs_are_left_alone() -> None:
+    images = [blob(project(CAMERA, point)) for point in POINTS]
+    before = [image.copy() for image in images]
+    augment(images, CAMERA, DataConfig(flip=1, colour_jitter=0.5), "default", np.random.default_rng(1))
+    assert all((a == b).all() for a, b in zip(images, before))

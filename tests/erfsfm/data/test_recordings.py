@@ -1,0 +1,348 @@
+"""What is found under a root, and what is said where nothing is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from erfsfm.data.recordings import Recording, discover, image_files, resize_image
+from erfsfm.errors import DataError
+
+CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
+
+
+def write_images(folder: Path, count: int = 3, size: tuple[int, int] = (32, 48), suffix: str = ".png") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for index in range(count):
+        image = np.zeros((*size, 3), np.uint8)
+        image[..., 2] = 200  # red, in OpenCV's order
+        image[..., 1] = index
+        cv2.imwrite(str(folder / f"{index:04d}{suffix}"), image)
+    return folder
+
+
+def write_camera(folder: Path, **changes: object) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "camera.yaml").write_text(yaml.safe_dump(CAMERA | changes))
+    return folder
+
+
+def one(root: Path) -> Recording:
+    (recording,) = discover(root)
+    return recording
+
+
+def refusal(root: Path) -> str:
+    with pytest.raises(DataError) as caught:
+        for recording in discover(root):
+            for index in range(len(recording)):
+                recording.image(index, recording.camera.height, recording.camera.width)
+                recording.true_depth(index)
+            recording.true_poses()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("prefix", ["", "dataset"])
+def test_kitti_root(tmp_path: Path, write_root: Callable[..., Path], prefix: str) -> None:
+    write_root(tmp_path / prefix, sequences=("00", "09"), frames=4)
+    recordings = discover(tmp_path)
+    assert [r.name for r in recordings] == ["kitti_odometry/00", "kitti_odometry/09"]
+    assert [len(r) for r in recordings] == [4, 4]
+    camera = recordings[0].camera
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (96, 64, 60, 62, 47.5, 31.5)
+    assert isinstance(camera.fx, float)
+
+
+def test_the_sequences_folder_itself(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=2)
+    assert one(tmp_path / "sequences").name == "kitti_odometry/00"
+
+
+@pytest.mark.parametrize(
+    ("folders", "expected"),
+    [
+        (("image_0", "image_1", "image_2", "image_3"), ["image_2", "image_3"]),
+        (("image_0", "image_3"), ["image_3"]),
+        (("image_0", "image_1"), ["image_0"]),
+        (("image_1",), ["image_1"]),
+    ],
+)
+def test_colour_before_grey(
+    tmp_path: Path, write_root: Callable[..., Path], folders: tuple[str, ...], expected: list[str]
+) -> None:
+    write_root(tmp_path, frames=2, cameras=folders)
+    assert [r.images[0].parent.name for r in discover(tmp_path)] == expected
+    assert {r.name for r in discover(tmp_path)} == {"kitti_odometry/00"}
+
+
+def test_jpeg(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=3, suffix=".jpg")
+    assert [p.name for p in one(tmp_path).images] == ["000000.jpg", "000001.jpg", "000002.jpg"]
+
+
+def test_simulated_root_is_named_by_its_seed(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=3, seed=17, depth=True)
+    recording = one(tmp_path)
+    assert recording.name == "simulated/17"
+    assert recording.frames_name == "simulated/17[0:3]"
+    depth = recording.true_depth(1)
+    assert depth is not None
+    assert depth.dtype == np.float32
+    assert float(depth[0, 0]) == pytest.approx(5.9, abs=1 / 256)
+
+
+def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=6, depth=True, step=(0.0, 0.0, 0.5))
+    whole = one(tmp_path)
+    part = whole.part(2, 5)
+    assert len(part) == 3
+    assert (part.start, part.frames_name) == (2, "kitti_odometry/00[2:5]")
+    assert part.part(1, 3).frames_name == "kitti_odometry/00[3:5]"
+    poses, depth = part.true_poses(), part.true_depth(0)
+    assert poses is not None
+    assert depth is not None
+    np.testing.assert_allclose(poses[:, 2, 3], [1.0, 1.5, 2.0])
+    assert float(depth[0, 0]) == pytest.approx(5.0)
+    assert (part.image(0, 64, 96) == whole.image(2, 64, 96)).all()
+    assert len(whole.part(4, 10**9)) == 2
+
+
+def test_poses_are_those_of_the_camera_that_looked(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    """P2 with 60 px * 0.5 m in its last column: camera 2 is half a metre left of camera 0, which turns left."""
+    write_root(tmp_path, frames=2)
+    (tmp_path / "sequences/00/calib.txt").write_text("P2: 60 0 47.5 30 0 62 31.5 0 0 0 1 0\n")
+    (tmp_path / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n0 0 -1 3 0 1 0 0 1 0 0 0\n")
+    recording = one(tmp_path)
+    assert recording.t_camera_cam0 == pytest.approx((0.5, 0, 0))
+    poses, paper = recording.true_poses(), recording.true_poses("paper")
+    assert poses is not None
+    assert paper is not None
+    np.testing.assert_allclose(poses[:, :3, 3], [[-0.5, 0, 0], [3, 0, -0.5]], atol=1e-12)
+    np.testing.assert_allclose(paper[:, :3, 3], [[0, 0, 0], [3, 0, 0]])
+
+
+def test_no_truth(tmp_path: Path) -> None:
+    recording = one(write_images(write_camera(tmp_path)))
+    assert recording.true_depth(0) is None
+    assert recording.true_poses() is None
+
+
+def test_depth_of_other_frames_is_left_out(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=3, depth=True)
+    (tmp_path / "sequences/00/depth_2/000001.png").unlink()
+    assert one(tmp_path).depth is None
+
+
+@pytest.mark.parametrize("inside", ["", "images"])
+def test_image_folder(tmp_path: Path, inside: str) -> None:
+    root = write_camera(tmp_path / "my_drive")
+    write_images(root / inside)
+    recording = one(root)
+    assert recording.name == "folder/my_drive"
+    assert len(recording) == 3
+    image = recording.image(1, 32, 48)
+    assert image[0, 0].tolist() == [200, 1, 0], "RGB"
+    assert recording.image(1, 16, 24).shape == (16, 24, 3)
+
+
+def test_a_folder_called_images_has_its_parents_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_images(write_camera(tmp_path / "my_drive" / "images"))
+    assert one(folder).name == "folder/my_drive"
+    monkeypatch.chdir(folder)
+    assert one(Path()).name == "folder/my_drive"
+
+
+def test_natural_order(tmp_path: Path) -> None:
+    for name in ("10.png", "2.png", "1.png", "._1.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [p.name for p in image_files(tmp_path)] == ["1.png", "2.png", "10.png"]
+
+
+def test_grey_images_have_three_channels(tmp_path: Path) -> None:
+    write_camera(tmp_path)
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((32, 48), 77, np.uint8))
+    assert (one(tmp_path).image(0, 32, 48) == 77).all()
+
+
+def write_video(path: Path, frames: int = 4) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (48, 32))
+    for index in range(frames):
+        writer.write(np.full((32, 48, 3), 40 * index, np.uint8))
+    writer.release()
+
+
+@pytest.mark.parametrize("give", ["drive.avi", ""])
+def test_video(tmp_path: Path, give: str) -> None:
+    root = write_camera(tmp_path / "trip")
+    write_video(root / "drive.avi")
+    recording = one(root / give)
+    assert recording.name == "folder/trip"
+    assert len(recording) == 4
+    assert float(recording.image(2, 32, 48).mean()) == pytest.approx(80, abs=3)
+    with pytest.raises(DataError, match="is a video"):
+        recording.part(0, 2)
+
+
+def test_a_collection_of_roots(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path / "b", frames=2, seed=4)
+    write_root(tmp_path / "a" / "dataset", frames=2, seed=3)
+    write_images(write_camera(tmp_path / "c"))
+    assert [r.name for r in discover(tmp_path)] == ["simulated/3", "simulated/4", "folder/c"]
+
+
+def test_order_does_not_depend_on_the_file_system(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=1, sequences=("07", "02", "05"))
+    assert [r.name[-2:] for r in discover(tmp_path)] == ["02", "05", "07"]
+
+
+# what goes wrong, in one line each
+
+
+def test_missing_root(tmp_path: Path) -> None:
+    assert "does not exist" in refusal(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("content", [[], ["readme.txt"], ["sequences/"], ["sequences/00/"]])
+def test_nothing_to_learn_from(tmp_path: Path, content: list[str]) -> None:
+    for name in content:
+        if name.endswith("/"):
+            (tmp_path / name).mkdir(parents=True)
+        else:
+            (tmp_path / name).write_text("")
+    assert "nothing to learn from" in refusal(tmp_path)
+
+
+def test_a_file_is_no_root(tmp_path: Path) -> None:
+    (tmp_path / "x.zip").write_bytes(b"PK")
+    assert "nothing to learn from" in refusal(tmp_path / "x.zip")
+
+
+def test_empty_image_folder(tmp_path: Path) -> None:
+    (tmp_path / "sequences/00/image_2").mkdir(parents=True)
+    assert "holds no png or jpg" in refusal(tmp_path)
+
+
+def test_no_calibration(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path)
+    (tmp_path / "sequences/00/calib.txt").unlink()
+    assert "calib.txt" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("line", ["P0: 1 2 3", "P2: 1 2 3", "P2: a b c d e f g h i j k l", "P2: " + "0 " * 12, ""])
+def test_bad_calibration(tmp_path: Path, write_root: Callable[..., Path], line: str) -> None:
+    write_root(tmp_path)
+    (tmp_path / "sequences/00/calib.txt").write_text(line + "\n")
+    assert "P2" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["remove", "rename"])
+def test_gaps(tmp_path: Path, write_root: Callable[..., Path], damage: str) -> None:
+    write_root(tmp_path)
+    frame = tmp_path / "sequences/00/image_2/000003.png"
+    if damage == "remove":
+        frame.unlink()
+    else:
+        frame.rename(frame.with_name("left.png"))
+    assert "no frame 000003" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"seed": null}', "{"])
+def test_bad_simulation_file(tmp_path: Path, write_root: Callable[..., Path], text: str) -> None:
+    write_root(tmp_path)
+    (tmp_path / "simulation.json").write_text(text)
+    assert "seed" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["1 2 3\n", "a b c\n", "1 0 0 0 0 1 0 0 0 0 1 0\n"])
+def test_bad_poses(tmp_path: Path, write_root: Callable[..., Path], text: str) -> None:
+    write_root(tmp_path)
+    (tmp_path / "poses/00.txt").write_text(text)
+    assert "poses/00.txt" in refusal(tmp_path)
+
+
+def test_unreadable_image(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path)
+    (tmp_path / "sequences/00/image_2/000002.png").write_bytes(b"not an image")
+    assert "000002.png" in refusal(tmp_path)
+
+
+def test_unreadable_first_image(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path)
+    (tmp_path / "sequences/00/image_2/000000.png").write_bytes(b"")
+    assert "000000.png" in refusal(tmp_path)
+
+
+def test_unreadable_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, depth=True)
+    (tmp_path / "sequences/00/depth_2/000004.png").write_bytes(b"x")
+    assert "000004.png" in refusal(tmp_path)
+
+
+def test_image_of_another_size(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path)
+    cv2.imwrite(str(tmp_path / "sequences/00/image_2/000002.png"), np.zeros((10, 20, 3), np.uint8))
+    assert "20 x 10" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"fx": None}, "camera.yaml"),
+        ({"fx": "wide"}, "wide"),
+        ({"fx": -3}, "positive"),
+        ({"width": 0}, "positive"),
+        ({"model": "opencv", "distortion": [0.1, 0, 0, 0]}, "undistort"),
+        ({"model": "fisheye", "distortion": [0, 0, 0, 0]}, "undistort"),
+        ({"distortion": [0.1, 0, 0, 0]}, "undistort"),
+    ],
+)
+def test_bad_camera_file(tmp_path: Path, changes: dict[str, object], words: str) -> None:
+    write_images(write_camera(tmp_path, **changes))
+    assert words in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "width: 3", "- 1", "a: [", "just words"])
+def test_camera_file_without_a_camera(tmp_path: Path, text: str) -> None:
+    write_images(tmp_path)
+    (tmp_path / "camera.yaml").write_text(text)
+    assert "camera.yaml" in refusal(tmp_path)
+
+
+def test_undistorted_opencv_camera_is_a_pinhole(tmp_path: Path) -> None:
+    write_images(write_camera(tmp_path, model="opencv", distortion=[0, 0, 0, 0]))
+    assert one(tmp_path).camera.fx == 40
+
+
+def test_folder_without_camera_file(tmp_path: Path) -> None:
+    assert "camera.yaml" in refusal(write_images(tmp_path))
+
+
+def test_broken_video(tmp_path: Path) -> None:
+    (write_camera(tmp_path) / "x.mp4").write_bytes(b"no video")
+    assert "x.mp4" in refusal(tmp_path)
+
+
+def test_resize_image_up_is_smooth() -> None:
+    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
+    grown = resize_image(ramp, 16, 64)
+    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
+    assert resize_image(ramp, 8, 16) is ramp
+
+
+def test_resize_image_down_averages() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[::2] = 100
+    assert (resize_image(image, 4, 4) == 50).all()
+
+
+def test_simulation_file_with_more_in_it(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=1)
+    (tmp_path / "simulation.json").write_text(json.dumps({"seed": 3, "route": "loop"}))
+    assert one(tmp_path).name == "simulated/3"

@@ -1,0 +1,314 @@
+"""Draws, windows, validation and who trains on what."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from erfsfm.config import DataConfig, ExperimentConfig
+from erfsfm.data.recordings import discover
+from erfsfm.data.snippets import (
+    ImageCache,
+    SnippetDraws,
+    ValidationSnippets,
+    as_tensors,
+    split_recordings,
+    usable,
+)
+from erfsfm.errors import DataError
+
+FRAMES = 9
+
+
+def experiment(batch: int = 2, sources: int = 2, **data: Any) -> ExperimentConfig:
+    return ExperimentConfig.model_validate(
+        {
+            "network": {"height": 32, "width": 48, "sources": sources},
+            "data": {"workers": 0, "cache_mb": 10} | data,
+            "training": {"batch": batch},
+        }
+    )
+
+
+@pytest.fixture
+def coded(tmp_path: Path) -> Path:
+    """Folders ``a`` and ``b`` whose frame k is painted 20 k, and the second colour says which folder."""
+    for code, name in enumerate("ab"):
+        folder = tmp_path / name
+        folder.mkdir()
+        camera = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5}
+        (folder / "camera.yaml").write_text(yaml.safe_dump(camera))
+        for index in range(FRAMES):
+            image = np.full((32, 48, 3), (0, 200 * code, 20 * index), np.uint8)
+            cv2.imwrite(str(folder / f"{index}.png"), image)
+    return tmp_path
+
+
+def frames_of(sample: dict[str, Tensor]) -> list[int]:
+    """Frame numbers in time order of a sample of ``coded``."""
+    colours = [*sample["sources"][:, 0].mean(dim=(1, 2))]
+    colours.insert(len(colours) // 2, sample["target"][0].mean())
+    return [round(float(c) * 255 / 20) for c in colours]
+
+
+def folder_of(sample: dict[str, Tensor]) -> str:
+    return "b" if float(sample["target"][1].mean()) > 0.1 else "a"
+
+
+def equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> bool:
+    return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
+
+
+@pytest.mark.parametrize("sources", [2, 4])
+def test_windows_are_consecutive_frames_with_the_target_in_the_middle(coded: Path, sources: int) -> None:
+    draws = SnippetDraws(discover(coded), experiment(sources=sources), 200)
+    starts = set()
+    for number in range(200):
+        sample = draws.draw(number)
+        frames = frames_of(sample)
+        assert frames == list(range(frames[0], frames[0] + sources + 1))
+        assert sample["target"].shape == (3, 32, 48)
+        assert sample["sources"].shape == (sources, 3, 32, 48)
+        assert sample["K"].shape == (3, 3)
+        assert sample["target"].dtype == sample["K"].dtype == torch.float32
+        starts.add((folder_of(sample), frames[0]))
+    assert len(starts) == 2 * (FRAMES - sources), "every window of both recordings comes up"
+
+
+def test_a_draw_depends_on_seed_and_number_alone(coded: Path) -> None:
+    draws = SnippetDraws(discover(coded), experiment(), 20)
+    forwards = [draws.draw(number) for number in range(20)]
+    fresh = SnippetDraws(discover(coded), experiment(cache_mb=0), 20)
+    backwards = [fresh.draw(number) for number in reversed(range(20))][::-1]
+    assert all(equal(a, b) for a, b in zip(forwards, backwards))
+    config = experiment()
+    reseeded = config.model_copy(update={"training": config.training.model_copy(update={"seed": 1})})
+    other = SnippetDraws(discover(coded), reseeded, 20)
+    assert not all(equal(a, other.draw(number)) for number, a in enumerate(forwards))
+
+
+def batches(coded: Path, workers: int, first: int = 0, draws: int = 10) -> list[dict[str, Tensor]]:
+    config = experiment(batch=2)
+    return list(DataLoader(SnippetDraws(discover(coded), config, draws, first), 2, num_workers=workers))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_change_nothing(coded: Path, workers: int) -> None:
+    alone, shared = batches(coded, 0), batches(coded, workers)
+    assert len(alone) == len(shared) == 5
+    assert all(equal(a, b) for a, b in zip(alone, shared))
+
+
+def test_resuming_sees_what_it_would_have_seen(coded: Path) -> None:
+    whole = batches(coded, 0)
+    for workers in (0, 2):
+        tail = batches(coded, workers, first=6)
+        assert len(tail) == 2
+        assert all(equal(a, b) for a, b in zip(whole[3:], tail))
+
+
+def test_a_last_batch_may_be_smaller(coded: Path) -> None:
+    assert [len(b["target"]) for b in batches(coded, 0, draws=5)] == [2, 2, 1]
+    assert batches(coded, 0, first=5, draws=5) == []
+
+
+def test_camera_of_a_draw_is_the_resized_one(coded: Path) -> None:
+    config = ExperimentConfig.model_validate(
+        {"network": {"height": 64, "width": 96, "sources": 2}, "data": {"flip": 0, "zoom": 1}}
+    )
+    K = SnippetDraws(discover(coded), config, 1).draw(0)["K"]
+    expected = discover(coded)[0].camera.resized(96, 64).K
+    np.testing.assert_array_equal(K.numpy(), expected)
+
+
+def test_by_default_recordings_count_by_their_windows(coded: Path) -> None:
+    long, short = discover(coded)
+    draws = SnippetDraws([long, short.part(0, 4)], experiment(), 400)
+    counts = Counter(folder_of(draws.draw(number)) for number in range(400))
+    assert counts["b"] / 400 == pytest.approx(2 / 9, abs=0.06)
+
+
+def test_weights_set_the_shares(coded: Path) -> None:
+    long, short = discover(coded)
+    config = experiment(weights={"folder/a": 1, "folder/b": 3})
+    draws = SnippetDraws([long, short.part(0, 4)], config, 400)
+    counts = Counter(folder_of(draws.draw(number)) for number in range(400))
+    assert counts["b"] / 400 == pytest.approx(3 / 4, abs=0.06)
+
+
+def test_weights_of_nothing_are_refused(coded: Path) -> None:
+    with pytest.raises(DataError, match="kitti"):
+        SnippetDraws(discover(coded), experiment(weights={"kitti": 1}), 1)
+
+
+def test_too_short_recordings_are_left_out(coded: Path) -> None:
+    first, second = discover(coded)
+    assert usable([first.part(0, 4), second], 5) == [second]
+    with pytest.raises(DataError, match="5 consecutive frames") as caught:
+        usable([first.part(0, 4)], 5)
+    assert "folder/a (4 frames)" in str(caught.value)
+    with pytest.raises(DataError, match="no recording"):
+        usable([], 5)
+
+
+def test_as_tensors_puts_the_target_apart() -> None:
+    images = [np.full((2, 2, 3), 51 * k, np.uint8) for k in range(5)]
+    sample = as_tensors(images, np.eye(3, dtype=np.float32))
+    assert float(sample["target"].mean()) == pytest.approx(0.4)
+    assert sample["sources"].mean(dim=(1, 2, 3)).tolist() == pytest.approx([0, 0.2, 0.6, 0.8])
+
+
+def test_cache_decodes_once_while_there_is_room(coded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = discover(coded)[0]
+    decoded: list[int] = []
+    original = type(recording).image
+
+    def counting(self: Any, index: int, height: int, width: int) -> Any:
+        decoded.append(index)
+        return original(self, index, height, width)
+
+    monkeypatch.setattr(type(recording), "image", counting)
+    roomy, none = ImageCache(10), ImageCache(0)
+    for cache in (roomy, none):
+        for index in (0, 1, 0, 1):
+            assert (cache.image(recording, index, 32, 48) == original(recording, index, 32, 48)).all()
+    assert decoded == [0, 1, 0, 1, 0, 1]
+
+
+def test_cache_forgets_the_oldest(coded: Path) -> None:
+    recording = discover(coded)[0]
+    cache = ImageCache(1)  # holds 2 images of 512 x 256 x 3 bytes
+    first = cache.image(recording, 0, 256, 512)
+    second = cache.image(recording, 1, 256, 512)
+    assert cache.image(recording, 0, 256, 512) is first
+    cache.image(recording, 2, 256, 512)
+    assert cache.image(recording, 0, 256, 512) is first
+    assert cache.image(recording, 1, 256, 512) is not second
+
+
+# validation
+
+
+def test_validation_is_even_and_always_the_same(coded: Path) -> None:
+    config = experiment(validation_snippets=3)
+    snippets = ValidationSnippets(discover(coded)[:1], config)
+    assert [frames_of(snippets[k]) for k in range(len(snippets))] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+    assert equal(snippets[1], ValidationSnippets(discover(coded)[:1], config)[1])
+    assert set(snippets[0]) == {"target", "sources", "K"}
+
+
+def test_validation_of_a_few_windows_takes_all(coded: Path) -> None:
+    assert len(ValidationSnippets(discover(coded)[:1], experiment(sources=4))) == FRAMES - 4
+
+
+def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=5, depth=True, step=(0.05, 0.0, 0.1))
+    (recording,) = discover(tmp_path)
+    sample = ValidationSnippets([recording.part(0, 5)], experiment(sources=4))[0]
+    assert sample["depth"].shape == (64, 96), "at its stored size"
+    assert float(sample["depth"][3, 3]) == pytest.approx(6 - 0.2, abs=1 / 256)
+    T_source_target = sample["T_source_target"]
+    assert T_source_target.shape == (4, 4, 4)
+    steps = torch.tensor([2, 1, -1, -2]).double()  # target minus source
+    torch.testing.assert_close(T_source_target[:, 0, 3], 0.05 * steps)
+    torch.testing.assert_close(T_source_target[:, 2, 3], 0.1 * steps)
+
+
+def test_validation_truth_of_a_part(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=8, depth=True, step=(0.0, 0.0, 0.1))
+    (recording,) = discover(tmp_path)
+    sample = ValidationSnippets([recording.part(3, 6)], experiment())[0]
+    assert float(sample["depth"][3, 3]) == pytest.approx(6 - 0.4, abs=1 / 256)
+
+
+# who trains on what
+
+
+def names(config: DataConfig) -> tuple[list[str], list[str]]:
+    training, validation = split_recordings(config)
+    return [r.frames_name for r in training], [r.frames_name for r in validation]
+
+
+@pytest.fixture
+def kitti(tmp_path: Path, write_root: Callable[..., Path]) -> Path:
+    return write_root(tmp_path / "kitti", frames=6, sequences=("00", "03", "09", "10"), size=(8, 8))
+
+
+def test_test_sequences_are_never_trained_on(kitti: Path) -> None:
+    assert names(DataConfig(roots=[kitti])) == (["kitti_odometry/00[0:6]"], [])
+
+
+def test_ranges(kitti: Path) -> None:
+    config = DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "1:4"}, exclude=[])
+    training, _ = names(config)
+    assert training[0] == "kitti_odometry/00[1:4]"
+    assert len(training) == 4
+
+
+@pytest.mark.parametrize("span", [":", "0:", ":1000"])
+def test_open_ranges(kitti: Path, span: str) -> None:
+    assert names(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": span}))[0] == ["kitti_odometry/00[0:6]"]
+
+
+def test_ranges_may_name_the_raw_drive(kitti: Path) -> None:
+    config = DataConfig(roots=[kitti], ranges={"kitti_raw/2011_10_03_drive_0027_sync": "2:5"})
+    assert names(config)[0] == ["kitti_odometry/00[2:5]"]
+
+
+def test_misspelt_ranges_are_refused(kitti: Path) -> None:
+    with pytest.raises(DataError, match="kitti_odometry/0'"):
+        split_recordings(DataConfig(roots=[kitti], ranges={"kitti_odometry/0": "0:3"}))
+
+
+def test_ranges_beyond_the_end_are_refused(kitti: Path) -> None:
+    with pytest.raises(DataError, match="after the 6 frames"):
+        split_recordings(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "6:"}))
+
+
+def test_exclude_by_raw_drive(kitti: Path) -> None:
+    config = DataConfig(roots=[kitti], exclude=["kitti_raw/2011_10_03_drive_0027_sync", "kitti_odometry/09"])
+    assert names(config)[0] == ["kitti_odometry/03[0:6]", "kitti_odometry/10[0:6]"]
+
+
+def test_exclude_a_part(kitti: Path) -> None:
+    """Frames kept back do not forbid the frames before them, once those are named."""
+    held_back = ["kitti_odometry/00[4:]", "kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"]
+    with pytest.raises(DataError, match="excluded"):
+        split_recordings(DataConfig(roots=[kitti], exclude=held_back))
+    config = DataConfig(roots=[kitti], exclude=held_back, ranges={"kitti_odometry/00": "0:4"})
+    assert names(config)[0] == ["kitti_odometry/00[0:4]"]
+
+
+def test_validation_recordings_only_validate(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    for seed in (499, 500, 599):
+        write_root(tmp_path / str(seed), frames=2, seed=seed, size=(8, 8))
+    training, validation = names(DataConfig(roots=[tmp_path]))
+    assert training == ["simulated/499[0:2]"]
+    assert validation == ["simulated/500[0:2]", "simulated/599[0:2]"]
+
+
+def test_validation_of_held_back_frames(kitti: Path) -> None:
+    config = DataConfig(
+        roots=[kitti], ranges={"kitti_odometry/00": "0:4"}, validation=["kitti_odometry/00[4:]", "kitti_odometry/09"]
+    )
+    assert names(config) == (["kitti_odometry/00[0:4]"], ["kitti_odometry/00[4:6]", "kitti_odometry/09[0:6]"])
+
+
+def test_several_roots_add_up(kitti: Path, coded: Path) -> None:
+    training, _ = names(DataConfig(roots=[coded / "a", kitti]))
+    assert training == ["folder/a[0:9]", "kitti_odometry/00[0:6]"]
+
+
+def test_no_root() -> None:
+    with pytest.raises(DataError, match="--dataset"):
+        split_recordings(DataConfig())

@@ -1,0 +1,100 @@
+"""Names of recordings, and whether two share a frame."""
+
+from __future__ import annotations
+
+import pytest
+
+from erfsfm.data.splits import ODOMETRY_RAW, FrameRange, merge, overlapping
+from erfsfm.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("name", "seen", "leaks"),
+    [
+        ("kitti_odometry/00", "kitti_odometry/00", True),
+        ("kitti_odometry/00", "kitti_odometry/01", False),
+        ("kitti_odometry/00[0:250]", "kitti_odometry/00[249:300]", True),
+        ("kitti_odometry/00[0:250]", "kitti_odometry/00[250:]", False),
+        ("kitti_odometry/00[:10]", "kitti_odometry/00[5:6]", True),
+        ("kitti_odometry/00", "kitti_odometry/00[7:8]", True),
+        ("kitti_raw/2011_10_03_drive_0027", "kitti_odometry/00", True),
+        ("kitti_raw/2011_10_03_drive_0027_sync", "kitti_odometry/00[100:200]", True),
+        ("kitti_raw/2011_10_03_drive_0027[0:100]", "kitti_odometry/00[100:200]", False),
+        ("kitti_raw/2011_09_30_drive_0028[0:1100]", "kitti_odometry/08", False),
+        ("kitti_raw/2011_09_30_drive_0028[1100:1101]", "kitti_odometry/08[0:1]", True),
+        ("kitti_raw/2011_09_30_drive_0028[1100:1101]", "kitti_odometry/08[1:]", False),
+        ("kitti_raw/2011_09_26_drive_0013", "kitti_odometry/00", False),
+        ("kitti_raw/2011_09_26_drive_0013", "kitti_raw/2011_09_26_drive_0013_sync", True),
+        ("simulated/17", "simulated/0-499", True),
+        ("simulated/500", "simulated/0-499", False),
+        ("simulated/499-600", "simulated/0-499", True),
+        ("simulated/17", "simulated/17", True),
+        ("simulated/1", "simulated/17", False),
+        ("folder/17", "simulated/17", False),
+        ("folder/my_drive", "folder/my_drive[0:40]", True),
+    ],
+)
+def test_leaks(name: str, seen: str, leaks: bool) -> None:
+    assert overlapping([name], [seen]) == ([name] if leaks else [])
+    assert overlapping([seen], [name]) == ([seen] if leaks else []), "either way round"
+
+
+@pytest.mark.parametrize("sequence", sorted(ODOMETRY_RAW))
+def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
+    drive, first, past_last = ODOMETRY_RAW[sequence]
+    whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]")
+    assert whole == FrameRange(f"kitti_odometry/{sequence}", 0, past_last - first)
+
+
+def test_frames_of_the_table() -> None:
+    """The lengths of the benchmark."""
+    lengths = [stop - start for _, start, stop in ODOMETRY_RAW.values()]
+    assert lengths == [4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201]
+
+
+def test_only_what_leaks_is_named() -> None:
+    assert overlapping(["folder/a", "folder/b"], ["folder/b", "folder/c"]) == ["folder/b"]
+    assert overlapping(["folder/a"], []) == []
+
+
+@pytest.mark.parametrize("name", ["kitti_odometry/00[", "kitti_odometry/00[a:b]", "x[1]", "", "x[1:2]y"])
+def test_bad_brackets(name: str) -> None:
+    with pytest.raises(ConfigError, match="names no frames") as caught:
+        FrameRange.parse(name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("span", ["5:5", "9:3"])
+def test_empty_ranges_are_refused(span: str) -> None:
+    with pytest.raises(ConfigError, match="begin before it ends"):
+        FrameRange.parse(f"kitti_odometry/00[{span}]")
+
+
+@pytest.mark.parametrize(
+    "name", ["kitti_odometry/00", "kitti_odometry/00[0:250]", "kitti_odometry/00[250:]", "simulated/0-9", "folder/a b"]
+)
+def test_names_round_trip(name: str) -> None:
+    assert str(FrameRange.parse(name)) == name
+    assert FrameRange.parse(str(FrameRange.parse(name))) == FrameRange.parse(name)
+
+
+def test_a_whole_raw_drive_is_the_whole_sequence() -> None:
+    assert str(FrameRange.parse("kitti_raw/2011_09_30_drive_0028_sync")) == "kitti_odometry/08"
+
+
+def test_merge() -> None:
+    names = ["simulated/3", "simulated/1", "simulated/2", "simulated/7", "folder/b", "folder/a", "folder/b"]
+    assert merge(names) == ["simulated/1-3", "simulated/7", "folder/a", "folder/b"]
+    assert merge([]) == []
+
+
+def test_merge_round_trip() -> None:
+    names = [*(f"simulated/{seed}" for seed in (0, 1, 2, 9, 10)), "kitti_odometry/00[0:250]", "folder/x"]
+    record = merge(names)
+    assert merge(record) == record
+    assert overlapping(names, record) == names
+    assert overlapping(["simulated/3", "simulated/8", "kitti_odometry/00[250:]"], record) == []
+
+
+def test_merge_names_raw_drives_by_their_sequence() -> None:
+    assert merge(["kitti_raw/2011_10_03_drive_0027_sync[0:10]"]) == ["kitti_odometry/00[0:10]"]

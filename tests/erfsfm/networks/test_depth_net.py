@@ -1,0 +1,118 @@
+import pytest
+import torch
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.blocks import Layer
+from erfsfm.networks.depth_net import DepthNet
+
+VARIANTS = ["plain", "dilated", "dfc", "dfcv2"]
+
+
+def sizes(outputs):
+    return [tuple(output.shape[2:]) for output in outputs]
+
+
+@pytest.mark.parametrize(
+    "pyramid",
+    [
+        [(128, 416), (64, 208), (32, 104), (16, 52)],
+        [(75, 248), (38, 124), (19, 62), (10, 31)],
+        [(94, 310), (47, 155), (24, 78), (12, 39)],
+        [(188, 620), (94, 310), (47, 155), (24, 78)],
+        [(376, 1241), (188, 621), (94, 311), (47, 156)],
+    ],
+)
+def test_pyramid_sizes_of_the_paper(pyramid):
+    assert sizes(DepthNet(width=0.05)(torch.zeros(1, 3, *pyramid[0]))) == pyramid
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (31, 65), (64, 1)])
+def test_any_size(variant, size):
+    disparities = DepthNet(variant, width=0.1)(torch.zeros(2, 3, *size))
+    assert [d.shape[:2] for d in disparities] == [(2, 1)] * 4
+    assert sizes(disparities)[0] == size
+
+
+def test_encoder_sizes():
+    stages = DepthNet(width=0.05).encoder(torch.zeros(1, 3, 128, 416))
+    assert sizes(stages) == [(64, 208), (32, 104), (16, 52), (8, 26), (4, 13), (2, 7), (1, 4)]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_evaluation_gives_the_finest_alone(variant):
+    torch.manual_seed(0)
+    network = DepthNet(variant, width=0.1)
+    image = torch.rand(2, 3, 40, 56) * 2 - 1
+    disparities = network(image)
+    alone = network.eval()(image)
+    assert isinstance(alone, torch.Tensor)
+    torch.testing.assert_close(alone, disparities[0])
+
+
+def test_disparity_lies_in_its_range():
+    torch.manual_seed(0)
+    network = DepthNet(width=0.1)
+    for bias, wanted in [(-1e3, 0.01), (0.0, 5.01), (1e3, 10.01)]:
+        for head in network.heads:
+            torch.nn.init.zeros_(head.weight)
+            torch.nn.init.constant_(head.bias, bias)
+        for disparity in network(torch.rand(1, 3, 16, 16)):
+            torch.testing.assert_close(disparity, torch.full_like(disparity, wanted))
+
+
+def test_zero_offsets_start_as_the_plain_network():
+    torch.manual_seed(0)
+    deformable = DepthNet("dfcv2", width=0.1).eval()
+    plain = DepthNet("plain", width=0.1).eval()
+    weights = {
+        name.replace(".kernel.weight", ".weight"): value
+        for name, value in deformable.state_dict().items()
+        if ".offset." not in name and ".modulator." not in name
+    }
+    missing = plain.load_state_dict(weights, strict=False)
+    assert not missing.unexpected_keys
+    assert all(name.endswith(".0.bias") for name in missing.missing_keys)  # zero in the plain one
+    image = torch.rand(1, 3, 64, 96)
+    torch.testing.assert_close(deformable(image), plain(image), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("normalisation", ["none", "batch"])
+def test_every_weight_learns(variant, normalisation):
+    torch.manual_seed(0)
+    network = DepthNet(variant, width=0.25, normalisation=normalisation)
+    image = torch.rand(2, 3, 129, 131) * 2 - 1
+    loss = sum((disparity * torch.rand_like(disparity)).mean() for disparity in network(image))
+    loss.backward()
+    silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not silent
+
+
+def test_batch_norm_everywhere_but_the_heads():
+    network = DepthNet(width=0.1, normalisation="batch")
+    norms = sum(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
+    assert norms == 14 + 7 + 7
+
+
+def test_variants_change_their_stages():
+    def changed(variant):
+        return [i for i, layer in enumerate(DepthNet(variant, width=0.05).encoder_layers()) if layer.deformable]
+
+    assert changed("plain") == changed("dilated") == []
+    assert changed("dfc") == list(range(8))
+    assert changed("dfcv2") == list(range(6, 14))
+    dilated = DepthNet("dilated", width=0.05).encoder_layers()
+    assert dilated[:4] == [Layer(7, 2, 2), Layer(7, 1, 2), Layer(5, 2, 2), Layer(5, 1, 2)]
+    assert {layer.dilation for layer in dilated[4:]} == {1}
+
+
+def test_paper_dilated_builds_and_refuses_to_run():
+    network = DepthNet("dilated", "paper", width=0.05)
+    with pytest.raises(ConfigError, match="erf-depthnet-dilated cannot run in paper fidelity"):
+        network(torch.zeros(1, 3, 128, 416))
+
+
+def test_wrong_image_is_named():
+    with pytest.raises(ValueError, match=r"image must have shape \(B, 3, H, W\); got \(1, 4, 8, 8\)"):
+        DepthNet(width=0.05)(torch.zeros(1, 4, 8, 8))

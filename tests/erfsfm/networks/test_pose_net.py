@@ -1,0 +1,142 @@
+import pytest
+import torch
+
+from erfsfm.networks.blocks import Layer
+from erfsfm.networks.pose_net import PoseNet
+
+VARIANTS = ["plain", "dilated", "dfc", "dfcv2"]
+
+
+def images(count, size=(32, 48), batch=2):
+    torch.manual_seed(0)
+    target, *sources = (torch.rand(batch, 3, *size) * 2 - 1 for _ in range(count + 1))
+    return target, sources
+
+
+def stage_sizes(network, size):
+    stages = network.encoder(torch.zeros(1, network.input_channels, *size))
+    return [tuple(stage.shape[2:]) for stage in stages]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("fidelity", ["default", "paper"])
+def test_shape(variant, fidelity):
+    target, sources = images(4, (128, 160))
+    assert PoseNet(variant, fidelity, width=0.1)(target, sources).shape == (2, 4, 6)
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_numbers_of_sources(count):
+    assert PoseNet(width=0.1, sources=count)(*images(count)).shape == (2, count, 6)
+
+
+@pytest.mark.parametrize("count", [0, 9, -1])
+def test_impossible_numbers_of_sources(count):
+    with pytest.raises(ValueError, match=f"sources must be 1 to 8; got {count}"):
+        PoseNet(sources=count)
+
+
+def test_wrong_number_of_sources():
+    target, sources = images(3)
+    with pytest.raises(ValueError, match="takes 4 sources; got 3"):
+        PoseNet(width=0.1)(target, sources)
+
+
+def test_wrong_size_of_a_source():
+    target, sources = images(2)
+    with pytest.raises(ValueError, match="one shape"):
+        PoseNet(width=0.1, sources=2)(target, [sources[0], sources[1][..., :-1]])
+
+
+def test_stack_is_target_first_then_sources_in_order():
+    network = PoseNet(width=0.1, sources=2)
+    seen = []
+    network.encoder.register_forward_pre_hook(lambda _, arguments: seen.append(arguments[0]))
+    target, sources = images(2)
+    network(target, sources)
+    assert torch.equal(seen[0], torch.cat([target, *sources], dim=1))
+
+
+def test_poses_are_hundredths_in_order():
+    network = PoseNet(width=0.1, sources=2)
+    torch.nn.init.zeros_(network.pose_head.weight)
+    with torch.no_grad():
+        network.pose_head.bias.copy_(torch.arange(12.0))
+    poses = network(*images(2))
+    torch.testing.assert_close(poses[0], torch.arange(12.0).view(2, 6) / 100)
+
+
+PLAIN_SIZES = [(64, 208), (32, 104), (16, 52), (8, 26), (4, 13), (2, 7), (1, 4)]
+PAPER_DILATED_SIZES = [(61, 205), (29, 101), (14, 50), (6, 24), (3, 12), (2, 6), (1, 3)]
+
+
+@pytest.mark.parametrize(
+    "variant, fidelity, wanted",
+    [
+        ("plain", "paper", PLAIN_SIZES),
+        ("plain", "default", PLAIN_SIZES),
+        ("dilated", "default", PLAIN_SIZES),
+        ("dilated", "paper", PAPER_DILATED_SIZES),
+        ("dfc", "default", PLAIN_SIZES),
+        ("dfcv2", "default", PLAIN_SIZES),
+    ],
+)
+def test_stage_sizes(variant, fidelity, wanted):
+    assert stage_sizes(PoseNet(variant, fidelity, width=0.1), (128, 416)) == wanted
+
+
+@pytest.mark.parametrize("size", [(1, 1), (75, 248), (94, 310), (33, 64)])
+def test_default_dilated_keeps_the_plain_sizes(size):
+    assert stage_sizes(PoseNet("dilated", width=0.1), size) == stage_sizes(PoseNet(width=0.1), size)
+
+
+def test_variants_change_their_stages():
+    def changed(variant):
+        return [i for i, layer in enumerate(PoseNet(variant, width=0.1).encoder_layers()) if layer.deformable]
+
+    assert changed("plain") == changed("dilated") == []
+    assert changed("dfc") == [2, 3, 4, 5, 6]
+    assert changed("dfcv2") == [0, 1, 2, 3]
+    paper = PoseNet("dilated", "paper", width=0.1).encoder_layers()
+    assert paper[:5] == [Layer(7, 2, 2), Layer(5, 2, 2), Layer(3, 2, 2), Layer(3, 2, 2), Layer(3, 2, 1)]
+
+
+@pytest.mark.parametrize("size", [(128, 416), (75, 248), (32, 48)])
+def test_masks_match_the_disparity_pyramid(size):
+    network = PoseNet(width=0.1, sources=2, mask_branch=True)
+    target, sources = images(2, size)
+    poses, masks = network.forward_with_masks(target, sources)
+    torch.testing.assert_close(poses, network(target, sources))
+    height, width = size
+    for mask in masks:
+        assert mask.shape == (2, 2, height, width)
+        assert mask.min() > 0 and mask.max() < 1
+        height, width = -(-height // 2), -(-width // 2)
+    assert len(masks) == 4
+
+
+def test_paper_dilated_masks_miss_the_pyramid_as_published():
+    network = PoseNet("dilated", "paper", width=0.1, sources=1, mask_branch=True)
+    _, masks = network.forward_with_masks(*images(1, (128, 416), batch=1))
+    assert [tuple(mask.shape[2:]) for mask in masks] == [(96, 384), (48, 192), (24, 96), (12, 48)]
+
+
+def test_masks_need_their_branch():
+    with pytest.raises(ValueError, match="without a mask branch"):
+        PoseNet(width=0.1, sources=1).forward_with_masks(*images(1))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("normalisation", ["none", "batch"])
+def test_every_weight_learns(variant, normalisation):
+    network = PoseNet(variant, width=0.5, sources=2, normalisation=normalisation, mask_branch=True)
+    poses, masks = network.forward_with_masks(*images(2, (130, 161)))
+    (poses.sum() + sum((mask * torch.rand_like(mask)).sum() for mask in masks)).backward()
+    silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not silent
+
+
+@pytest.mark.parametrize("mask_branch, wanted", [(False, 7), (True, 12)])
+def test_batch_norm_everywhere_but_the_heads(mask_branch, wanted):
+    network = PoseNet(width=0.1, normalisation="batch", mask_branch=mask_branch)
+    assert sum(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules()) == wanted

@@ -1,0 +1,125 @@
+import pytest
+import torch
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.pose_net import PoseNet
+from erfsfm.networks.presets import PRESETS, build, describe
+
+
+def count(name, **options):
+    with torch.device("meta"):
+        return sum(parameter.numel() for parameter in build(name, **options).parameters())
+
+
+@pytest.mark.parametrize("fidelity", ["default", "paper"])
+@pytest.mark.parametrize(
+    "name, wanted",
+    [
+        ("depthnet", 31_596_900),
+        ("erf-depthnet-dilated", 31_596_900),
+        ("erf-depthnet-dfc", 32_168_565),
+        ("erf-depthnet-dfcv2", 32_371_132),
+    ],
+)
+def test_depth_parameters(name, fidelity, wanted):
+    assert count(name, fidelity=fidelity) == wanted
+
+
+@pytest.mark.parametrize("fidelity", ["default", "paper"])
+@pytest.mark.parametrize(
+    "name, four, four_masked, two, two_masked",
+    [
+        ("posenet", 1_598_456, 3_352_504, 1_590_668, 3_340_388),
+        ("erf-posenet-dilated", 1_598_456, 3_352_504, 1_590_668, 3_340_388),
+        ("erf-posenet-dfc", 1_776_479, 3_530_527, 1_768_691, 3_518_411),
+        ("erf-posenet-dfcv2", 1_759_865, 3_513_913, 1_708_859, 3_458_579),
+    ],
+)
+def test_pose_parameters(name, fidelity, four, four_masked, two, two_masked):
+    assert count(name, fidelity=fidelity) == four
+    assert count(name, fidelity=fidelity, mask_branch=True) == four_masked
+    assert count(name, fidelity=fidelity, sources=2) == two
+    assert count(name, fidelity=fidelity, sources=2, mask_branch=True) == two_masked
+
+
+def test_encoder_block_parameters():
+    network = build("depthnet")
+    stages = [sum(p.numel() for p in stage.parameters()) for stage in network.encoder.stages]
+    assert stages == [54_944, 153_728, 221_440, 885_248, 3_539_968, 4_719_616, 4_719_616]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_kind(name):
+    with torch.device("meta"):
+        assert isinstance(build(name), DepthNet if PRESETS[name].kind == "depth" else PoseNet)
+
+
+def test_same_seed_same_weights():
+    torch.manual_seed(3)
+    first = build("erf-posenet-dfc", width=0.25).state_dict()
+    torch.manual_seed(3)
+    second = build("erf-posenet-dfc", width=0.25).state_dict()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_fidelity_decides_where_offsets_start():
+    for fidelity, neutral in [("default", True), ("paper", False)]:
+        state = build("erf-posenet-dfc", fidelity=fidelity, width=0.25).state_dict()
+        weights = [value for name, value in state.items() if name.endswith(("offset.weight", "modulator.weight"))]
+        assert len(weights) == 10
+        assert all((not value.any()) == neutral for value in weights)
+
+
+def test_width_scales_hidden_channels_and_not_the_heads():
+    depth = build("depthnet", width=0.25)
+    assert depth.encoder.stages[0][0][0].weight.shape == (8, 3, 7, 7)
+    assert [head.out_channels for head in depth.heads] == [1] * 4
+    pose = build("posenet", width=0.25, sources=3)
+    assert pose.encoder.stages[0][0][0].weight.shape == (4, 12, 7, 7)
+    assert pose.pose_head.weight.shape == (18, 64, 1, 1)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"name": "possnet"}, "unknown network 'possnet' .did you mean 'posenet'.*; known: depthnet, erf-depthnet-"),
+        ({"name": "erf-posenet-dfc2"}, "did you mean 'erf-posenet-dfc"),
+        ({"name": "x"}, "unknown network 'x'; known: depthnet"),
+        ({"name": "posenet", "fidelity": "exact"}, "fidelity must be one of default, paper; got 'exact'"),
+        ({"name": "posenet", "normalisation": "group"}, "normalisation must be one of none, batch"),
+        ({"name": "posenet", "width": 0.0}, "width must be above 0"),
+        ({"name": "posenet", "width": float("nan")}, "width must be above 0"),
+        ({"name": "posenet", "sources": 9}, "sources must be 1 to 8; got 9"),
+    ],
+)
+def test_known_errors(options, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        build(**options)
+    assert "\n" not in str(caught.value)
+
+
+def test_descriptions_in_both_fidelities():
+    for fidelity in ("default", "paper"):
+        summaries = {summary.name: summary for summary in describe(fidelity)}
+        assert list(summaries) == list(PRESETS)
+        assert summaries["depthnet"].parameters == 31_596_900
+        assert summaries["depthnet"].multiply_adds == pytest.approx(3.67e9, rel=2e-3)
+        assert summaries["posenet"].multiply_adds == pytest.approx(0.256e9, rel=2e-3)
+        assert summaries["posenet"].receptive_field == 263
+        dilated = summaries["erf-depthnet-dilated"]
+        assert dilated.receptive_field == 829
+        if fidelity == "paper":
+            assert dilated.multiply_adds is None and "cannot run" in str(dilated.multiply_adds_reason)
+            assert summaries["erf-posenet-dilated"].receptive_field == 301
+        else:
+            assert dilated.multiply_adds == summaries["depthnet"].multiply_adds
+            assert dilated.multiply_adds_reason is None
+            assert summaries["erf-posenet-dilated"].multiply_adds == summaries["posenet"].multiply_adds
+            assert summaries["erf-posenet-dilated"].receptive_field == 339
+
+
+def test_description_follows_width_and_sources():
+    summaries = {summary.name: summary for summary in describe(width=0.5, sources=2)}
+    assert summaries["posenet"].parameters == count("posenet", width=0.5, sources=2)
+    assert summaries["posenet"].receptive_field == 263

@@ -1,0 +1,176 @@
+import itertools
+
+import pytest
+import torch
+
+from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.presets import build
+from erfsfm.networks.receptive_field import effective, field_after, measured, multiply_adds, theoretical
+
+
+def small(name, fidelity="default"):
+    """The field does not depend on the width: all channels carry the same constant weights."""
+    return build(name, fidelity, width=0.1)
+
+
+@pytest.mark.parametrize(
+    "name, fidelity, wanted",
+    [
+        ("posenet", "paper", 263),
+        ("posenet", "default", 263),
+        ("erf-posenet-dfc", "default", 263),
+        ("erf-posenet-dfcv2", "paper", 263),
+        ("erf-posenet-dilated", "paper", 301),
+        ("erf-posenet-dilated", "default", 339),
+        ("depthnet", "paper", 787),
+        ("erf-depthnet-dfc", "default", 787),
+        ("erf-depthnet-dfcv2", "default", 787),
+        ("erf-depthnet-dilated", "default", 829),
+    ],
+)
+def test_theoretical(name, fidelity, wanted):
+    assert theoretical(small(name, fidelity)) == wanted
+
+
+@pytest.mark.parametrize(
+    "name, wanted",
+    [
+        ("posenet", [7, 15, 23, 39, 71, 135, 263]),
+        ("erf-posenet-dilated", [13, 29, 45, 77, 109, 173, 301]),
+        ("depthnet", [7, 19, 27, 43, 51, 67, 83, 115, 147, 211, 275, 403, 531, 787]),
+    ],
+)
+def test_theoretical_layer_by_layer(name, wanted):
+    layers = small(name, "paper").encoder_layers()
+    assert [field_after(layers[: i + 1]) for i in range(len(layers))] == wanted
+
+
+@pytest.mark.parametrize(
+    "name, fidelity, size, pixel, map_size, box, coverage",
+    [
+        ("posenet", "default", (128, 416), (0, 2), (1, 4), (128, 263), 0.632),
+        ("posenet", "default", (188, 620), None, (2, 5), (188, 263), 0.424),
+        ("erf-posenet-dilated", "paper", (128, 416), (0, 1), (1, 3), (127, 297), 0.179),
+        ("erf-posenet-dilated", "paper", (188, 620), None, None, (185, 301), 0.120),
+        ("erf-posenet-dilated", "default", (128, 416), (0, 2), (1, 4), (128, 327), 0.733),
+        ("depthnet", "default", (128, 416), None, (1, 4), (128, 416), 1.0),
+        ("erf-depthnet-dfc", "default", (128, 416), None, (1, 4), (128, 416), 1.0),
+    ],
+)
+def test_measured(name, fidelity, size, pixel, map_size, box, coverage):
+    field = measured(small(name, fidelity), size, pixel)
+    assert pixel is None or field.pixel == pixel
+    assert map_size is None or field.map_size == map_size
+    assert (field.rows, field.columns) == box
+    assert field.coverage == pytest.approx(coverage, abs=6e-4)
+
+
+def test_measured_columns_of_the_plain_pose_network():
+    field = measured(small("posenet"))
+    assert (field.pixel, field.left, field.right) == ((0, 2), 125, 387)
+
+
+@pytest.mark.parametrize(
+    "stages, box, coverage",
+    [(4, (115, 115), 0.248), (5, (128, 211), 0.507), (6, (128, 394), 0.947), (7, (128, 416), 1.0)],
+)
+def test_measured_stage_by_stage(stages, box, coverage):
+    field = measured(small("depthnet"), stages=stages)
+    assert (field.rows, field.columns) == box
+    assert field.coverage == pytest.approx(coverage, abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    "name, offsets_px, columns, coverage",
+    [
+        ("erf-posenet-dfc", 0.0, 263, 0.632),
+        ("erf-posenet-dfc", 0.5, 415, 0.998),
+        ("erf-posenet-dfc", 1.0, 415, 0.998),
+        ("erf-posenet-dfc", 2.0, 416, 1.0),
+        ("erf-posenet-dfcv2", 0.0, 263, 0.632),
+        ("erf-posenet-dfcv2", 0.5, 293, 0.704),
+        ("erf-posenet-dfcv2", 1.0, 293, 0.694),
+        ("erf-posenet-dfcv2", 2.0, 321, 0.767),
+    ],
+)
+def test_measured_with_taps_pushed_outwards(name, offsets_px, columns, coverage):
+    field = measured(small(name), offsets_px=offsets_px)
+    assert (field.rows, field.columns) == (128, columns)
+    assert field.coverage == pytest.approx(coverage, abs=6e-4)
+
+
+def test_learned_offsets_are_kept():
+    torch.manual_seed(0)
+    network = small("erf-posenet-dfc")
+    assert measured(network, offsets_px="learned").columns == 263  # still neutral
+    for module in network.modules():
+        if isinstance(module, DeformableConv2d):
+            torch.nn.init.normal_(module.offset.bias, std=2.0)
+    assert measured(network, offsets_px="learned").columns > 263
+
+
+@pytest.mark.parametrize(
+    "name, fidelity, share", [("erf-posenet-dilated", "paper", 0.25), ("erf-posenet-dilated", "default", 1.0)]
+)
+def test_share_of_the_image_that_the_pose_can_see(name, fidelity, share):
+    network = small(name, fidelity)
+    height, width = measured(network).map_size
+    seen = torch.zeros(128, 416, dtype=torch.bool)
+    for pixel in itertools.product(range(height), range(width)):
+        seen |= measured(network, pixel=pixel).gradient > 0
+    assert seen.double().mean() == pytest.approx(share, abs=1e-6)
+
+
+def test_on_a_large_image_gradients_reach_exactly_the_theoretical_side():
+    for name, fidelity in [("posenet", "default"), ("erf-posenet-dilated", "paper")]:
+        network = small(name, fidelity)
+        field = measured(network, (700, 700))
+        assert field.rows == field.columns == theoretical(network)
+
+
+def test_measuring_leaves_the_network_alone():
+    network = build("erf-posenet-dfc", width=0.1, normalisation="batch")
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    field = measured(network)
+    assert field.coverage == pytest.approx(0.632, abs=6e-4)
+    assert network.training and network.encoder.training
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+
+
+def test_effective_field_lies_inside_the_measured_one():
+    torch.manual_seed(0)
+    network = small("posenet")
+    field = effective(network, torch.rand(1, 15, 128, 416))
+    possible = measured(network).gradient > 0
+    assert field.coverage > 0 and not (field.gradient[~possible] > 0).any()
+    assert network.encoder.training
+
+
+def test_empty_field():
+    network = small("posenet")
+    torch.nn.init.zeros_(network.encoder.stages[6][0][0].weight)
+    field = effective(network, torch.rand(1, 15, 128, 416))
+    assert (field.rows, field.columns, field.coverage) == (0, 0, 0.0)
+
+
+def test_pixel_outside_the_map_is_named():
+    with pytest.raises(ValueError, match=r"pixel must lie in the map of size \(1, 4\); got \(1, 0\)"):
+        measured(small("posenet"), pixel=(1, 0))
+
+
+def test_multiply_adds():
+    depth = build("depthnet")
+    assert multiply_adds(depth) == pytest.approx(3.67e9, rel=2e-3)
+    assert multiply_adds(depth, 188, 620) == pytest.approx(8.16e9, rel=2e-3)
+    assert depth.training and next(depth.parameters()).device.type == "cpu"
+    assert multiply_adds(build("posenet")) == pytest.approx(0.256e9, rel=2e-3)
+
+
+def test_multiply_adds_of_deformable_layers_include_their_predictors():
+    plain, deformable = small("posenet"), small("erf-posenet-dfc")
+    extra = 0
+    size = [(16, 52), (8, 26), (4, 13), (2, 7), (1, 4)]
+    for (height, width), stage in zip(size, list(deformable.encoder.stages)[2:]):
+        layer = stage[0][0]
+        extra += height * width * (layer.offset.weight.numel() + layer.modulator.weight.numel())
+    assert multiply_adds(deformable) == multiply_adds(plain) + extra

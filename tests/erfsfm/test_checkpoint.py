@@ -1,0 +1,213 @@
+"""Trained networks on disk, whole and damaged."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+
+import erfsfm.checkpoint as checkpoint
+from erfsfm.checkpoint import (
+    Model,
+    ModelRecord,
+    build_networks,
+    find_weights,
+    load_model,
+    save_model,
+    weights_sha256,
+    write_atomically,
+)
+from erfsfm.config import NetworkConfig
+from erfsfm.errors import CheckpointError
+
+FILES = ("depth.safetensors", "pose.safetensors")
+
+
+def fresh(**network: Any) -> Model:
+    settings = {"depth_width": 0.0625, "pose_width": 0.125, "normalisation": "batch", "sources": 2}
+    config = NetworkConfig.model_validate(settings | network)
+    depth_net, pose_net = build_networks(config)
+    record = ModelRecord(network=config, trained_on=["simulated/0-9", "kitti_odometry/00[0:250]"], step=12)
+    return Model(record, depth_net, pose_net)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    save_model(tmp_path / "weights", fresh())
+    return tmp_path / "weights"
+
+
+def refusal(name: str | Path) -> str:
+    with pytest.raises(CheckpointError) as caught:
+        load_model(name)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def states(model: Model) -> list[torch.Tensor]:
+    return [*model.depth_net.state_dict().values(), *model.pose_net.state_dict().values()]
+
+
+@pytest.mark.parametrize(
+    "network", [{}, {"masks": True}, {"depth": "erf-depthnet-dfcv2", "pose": "erf-posenet-dfc", "fidelity": "paper"}]
+)
+def test_round_trip(tmp_path: Path, network: dict[str, Any]) -> None:
+    model = fresh(**network)
+    save_model(tmp_path, model)
+    loaded = load_model(tmp_path)
+    assert loaded.record == model.record
+    assert all(torch.equal(a, b) for a, b in zip(states(loaded), states(model), strict=True))
+    assert not loaded.depth_net.training
+    assert not loaded.pose_net.training
+
+
+def test_what_is_written(folder: Path) -> None:
+    assert sorted(p.name for p in folder.iterdir()) == ["depth.safetensors", "model.yaml", "pose.safetensors"]
+    record = yaml.safe_load((folder / "model.yaml").read_text())
+    assert record["format"] == 1
+    assert record["trained_on"] == ["simulated/0-9", "kitti_odometry/00[0:250]"]
+
+
+def test_half_precision(tmp_path: Path) -> None:
+    """Half the size, weights to three digits, the statistics of batch normalisation exact."""
+    model = fresh()
+    for name, value in model.depth_net.state_dict().items():
+        if "running_var" in name:
+            value.fill_(1e-7)  # half precision would round it to a tenth of its digits
+    save_model(tmp_path / "full", model)
+    save_model(tmp_path / "half", model, half=True)
+    sizes = [(tmp_path / name / "depth.safetensors").stat().st_size for name in ("full", "half")]
+    assert sizes[1] < 0.65 * sizes[0]
+    loaded = load_model(tmp_path / "half")
+    for (name, value), reference in zip(loaded.depth_net.state_dict().items(), model.depth_net.state_dict().values()):
+        assert value.dtype == reference.dtype
+        if "running_" in name or not value.is_floating_point():
+            assert torch.equal(value, reference)
+        else:
+            torch.testing.assert_close(value, reference, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("keep", [0, 7, 0.5, -1])
+def test_half_copied(folder: Path, name: str, keep: float) -> None:
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content[: int(len(content) * keep) if isinstance(keep, float) else keep])
+    message = refusal(folder)
+    assert "damaged" in message
+    assert name in message
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_missing_file(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    assert f"{name} is missing" in refusal(folder)
+
+
+def test_missing_and_unknown_tensors(folder: Path) -> None:
+    path = folder / "pose.safetensors"
+    tensors = load_file(path)
+    first = sorted(tensors)[0]
+    tensors.pop(first)
+    save_file(tensors, path)
+    message = refusal(folder)
+    assert "1 tensors missing" in message
+    assert first in message
+    save_file({**load_file(path), first: torch.zeros(1), "extra": torch.zeros(1)}, path)
+    assert "1 unknown" in refusal(folder)
+
+
+def edit_record(folder: Path, **network: Any) -> None:
+    record = yaml.safe_load((folder / "model.yaml").read_text())
+    record["network"] |= network
+    (folder / "model.yaml").write_text(yaml.safe_dump(record))
+
+
+def test_another_width(folder: Path) -> None:
+    edit_record(folder, depth_width=0.125)
+    message = refusal(folder)
+    assert "must have shape" in message
+    assert "width" in message
+
+
+def test_another_preset(folder: Path) -> None:
+    edit_record(folder, pose="erf-posenet-dfc")
+    assert "architecture" in refusal(folder)
+
+
+def test_swapped_files(folder: Path) -> None:
+    depth, pose = (folder / name for name in FILES)
+    shutil.move(depth, folder / "x")
+    shutil.move(pose, depth)
+    shutil.move(folder / "x", pose)
+    assert "architecture" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "- 1", "a: [", "format: 1\n", "format: 2\nnetwork: {}\ntrained_on: []\n", "\x00\x01"]
+)
+def test_bad_record(folder: Path, text: str) -> None:
+    (folder / "model.yaml").write_text(text)
+    assert "not a model record of format 1" in refusal(folder)
+
+
+def test_misspelt_key_in_the_record(folder: Path) -> None:
+    edit_record(folder, heigth=3)
+    assert "heigth" in refusal(folder)
+
+
+def test_unknown_name_lists_the_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_model(tmp_path / "small", fresh())
+    monkeypatch.setattr(checkpoint, "SHIPPED", tmp_path)
+    assert "one of small" in refusal("smal")
+    assert find_weights("small") == tmp_path / "small"
+    assert load_model("small").record.step == 12
+
+
+def test_a_folder_without_weights(tmp_path: Path) -> None:
+    assert "holds no model.yaml" in refusal(tmp_path)
+
+
+def test_every_shipped_model_loads() -> None:
+    for record in checkpoint.SHIPPED.glob("*/model.yaml"):
+        model = load_model(record.parent.name)
+        assert model.record.trained_on, "the leak record"
+        assert model.record.licence
+
+
+def test_fingerprint_sees_both_files(folder: Path, tmp_path: Path) -> None:
+    before = weights_sha256(folder)
+    assert len(before) == 64
+    assert weights_sha256(shutil.copytree(folder, tmp_path / "copy")) == before
+    for name in FILES:
+        save_model(tmp_path / "other", fresh())
+        changed = shutil.copytree(folder, tmp_path / f"changed_{name}")
+        shutil.copy(tmp_path / "other" / name, changed / name)
+        assert weights_sha256(changed) != before
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_text("old")
+
+    def fail(temporary: Path) -> None:
+        temporary.write_text("half")
+        raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        write_atomically(path, fail)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+    write_atomically(path, lambda temporary: temporary.write_text("new"))
+    assert path.read_text() == "new"
+
+
+def test_written_files_can_be_read_by_others(tmp_path: Path) -> None:
+    """As any file of this user: a temporary file's own mode is for its owner alone."""
+    write_atomically(tmp_path / "x", lambda temporary: temporary.write_text(""))
+    (tmp_path / "y").write_text("")
+    assert (tmp_path / "x").stat().st_mode == (tmp_path / "y").stat().st_mode

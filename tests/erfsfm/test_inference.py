@@ -1,0 +1,214 @@
+"""The door to the networks: what goes in, what comes out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+from erfsfm.config import NetworkConfig
+from erfsfm.errors import CheckpointError, ConfigError, DataError
+from erfsfm.inference import (
+    DepthPosePredictor,
+    choose_device,
+    colour_disparity,
+    read_image,
+    save_depth,
+    save_image,
+)
+
+RNG = np.random.default_rng(3)
+
+
+def model(sources: int = 4) -> Model:
+    config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64, sources=sources)  # type: ignore[arg-type]
+    torch.manual_seed(0)
+    return Model(ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), *build_networks(config))
+
+
+@pytest.fixture
+def predictor() -> DepthPosePredictor:
+    return DepthPosePredictor(model())
+
+
+def image(height: int = 40, width: int = 70) -> NDArray[np.uint8]:
+    return RNG.integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("size", [(32, 64), (376, 1241), (33, 47), (8, 300), (480, 640)])
+def test_depth_of_any_size(predictor: DepthPosePredictor, size: tuple[int, int]) -> None:
+    depth = predictor.depth(image(*size))
+    assert depth.shape == size
+    assert depth.dtype == np.float32
+    assert np.isfinite(depth).all()
+    assert (depth > 0).all()
+
+
+class Echo(nn.Module):
+    """Disparity that is the red channel; poses that are each source's mean colours."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[Tensor] = []
+
+    def forward(self, image: Tensor, sources: list[Tensor] | None = None) -> Tensor:
+        self.seen.append(image)
+        if sources is None:
+            return (image[:, :1] + 1) / 2 + 0.1
+        rows = [torch.cat([s.mean(dim=(2, 3)), torch.zeros(1, 3)], dim=1) for s in sources]
+        return torch.stack(rows, dim=1)
+
+
+def echo(sources: int = 4) -> tuple[DepthPosePredictor, Echo]:
+    net = Echo()
+    return DepthPosePredictor(Model(model(sources).record, net, net)), net
+
+
+def test_networks_see_rgb_from_minus_one_to_one() -> None:
+    predictor, net = echo()
+    red = np.zeros((32, 64, 3), np.uint8)
+    red[..., 0] = 255
+    depth = predictor.depth(red)
+    assert net.seen[0].shape == (1, 3, 32, 64)
+    assert net.seen[0][0, :, 0, 0].tolist() == [1, -1, -1]
+    np.testing.assert_allclose(depth, 1 / 1.1, rtol=1e-6)
+
+
+def test_disparity_is_what_is_interpolated() -> None:
+    predictor, _ = echo()
+    split = np.zeros((32, 64, 3), np.uint8)
+    split[:, 32:, 0] = 255
+    depth = predictor.depth(np.repeat(np.repeat(split, 3, 0), 3, 1))
+    between = depth[48, 95:97]  # a pixel left and right of the edge, at thirds between 0.1 and 1.1
+    np.testing.assert_allclose(between, [1 / (0.1 + 1 / 3), 1 / (0.1 + 2 / 3)], rtol=1e-5)
+
+
+def test_poses_shape_and_type(predictor: DepthPosePredictor) -> None:
+    T_source_target = predictor.poses([image() for _ in range(5)])
+    assert T_source_target.shape == (4, 4, 4)
+    assert T_source_target.dtype == np.float64
+    R = T_source_target[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    assert (T_source_target[:, 3] == [0, 0, 0, 1]).all()
+
+
+def flat(value: int) -> NDArray[np.uint8]:
+    return np.full((20, 30, 3), value, np.uint8)
+
+
+@pytest.mark.parametrize("sources", [2, 4])
+def test_rows_follow_the_sources_in_time_order(sources: int) -> None:
+    predictor, net = echo(sources)
+    values = [51 * k for k in range(sources + 1)]
+    T_source_target = predictor.poses([flat(value) for value in values])
+    middle = values.pop(sources // 2)
+    assert float(net.seen[0].mean()) == pytest.approx(middle / 127.5 - 1, abs=1e-6), "the target"
+    np.testing.assert_allclose(T_source_target[:, 0, 3], [v / 127.5 - 1 for v in values], atol=1e-6)
+
+
+def test_swapping_frames_swaps_rows() -> None:
+    predictor, _ = echo()
+    frames = [image() for _ in range(5)]
+    forwards = predictor.poses(frames)
+    np.testing.assert_array_equal(predictor.poses(frames[::-1]), forwards[::-1])
+
+
+def test_real_networks_tell_sources_apart(predictor: DepthPosePredictor) -> None:
+    frames = [image() for _ in range(5)]
+    swapped = [frames[k] for k in (1, 0, 2, 3, 4)]
+    assert not np.allclose(predictor.poses(frames), predictor.poses(swapped))
+
+
+@pytest.mark.parametrize("count", [0, 1, 4, 6])
+def test_another_number_of_images_is_refused(predictor: DepthPosePredictor, count: int) -> None:
+    with pytest.raises(ValueError, match=f"must have 5 images; got {count}"):
+        predictor.poses([image() for _ in range(count)])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.zeros((32, 64), np.uint8),
+        np.zeros((32, 64, 4), np.uint8),
+        np.zeros((32, 64, 3), np.float32),
+        np.zeros((1, 3, 32, 64), np.uint8),
+    ],
+)
+def test_other_arrays_are_refused(predictor: DepthPosePredictor, wrong: NDArray[np.uint8]) -> None:
+    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 RGB; got"):
+        predictor.depth(wrong)
+
+
+def test_views_are_as_good_as_copies(predictor: DepthPosePredictor) -> None:
+    big = image(64, 128)
+    view = big[::2, ::-2]
+    np.testing.assert_array_equal(predictor.depth(view), predictor.depth(view.copy()))
+
+
+def test_answers_repeat_and_inputs_stay(predictor: DepthPosePredictor) -> None:
+    frame = image()
+    before = frame.copy()
+    np.testing.assert_array_equal(predictor.depth(frame), predictor.depth(frame))
+    np.testing.assert_array_equal(frame, before)
+
+
+def test_from_weights(tmp_path: Path) -> None:
+    made = model()
+    save_model(tmp_path, made)
+    loaded = DepthPosePredictor.from_weights(tmp_path)
+    frame = image()
+    np.testing.assert_array_equal(loaded.depth(frame), DepthPosePredictor(made).depth(frame))
+    assert len(loaded.sha256) == 64
+    assert loaded.sources == 4
+    assert DepthPosePredictor.from_weights(str(tmp_path)).record == loaded.record
+
+
+def test_from_nothing(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError):
+        DepthPosePredictor.from_weights(tmp_path / "nowhere")
+
+
+def test_leaks(predictor: DepthPosePredictor) -> None:
+    names = ["kitti_odometry/00[249:260]", "kitti_odometry/00[250:260]", "kitti_raw/2011_10_03_drive_0027"]
+    assert predictor.leaks(names) == [names[0], names[2]]
+
+
+def test_devices() -> None:
+    assert choose_device("cpu").type == "cpu"
+    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    with pytest.raises(ConfigError, match="auto, cpu or cuda"):
+        choose_device("tpu")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_no_gpu_here() -> None:
+    with pytest.raises(ConfigError, match="use cpu"):
+        DepthPosePredictor(model(), "cuda")
+
+
+def test_images_and_depth_on_disk(tmp_path: Path) -> None:
+    picture, depth = image(), np.linspace(1, 9, 12, dtype=np.float32).reshape(3, 4)
+    save_image(tmp_path / "a.png", picture)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), picture)
+    save_depth(tmp_path / "a.npy", depth)
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), depth)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npy", "a.png"]
+
+
+def test_unreadable_image(tmp_path: Path) -> None:
+    (tmp_path / "x.png").write_bytes(b"no")
+    for path in (tmp_path / "x.png", tmp_path / "absent.png"):
+        with pytest.raises(DataError, match=path.name):
+            read_image(path)
+
+
+def test_near_is_bright() -> None:
+    depth = np.linspace(1, 50, 200, dtype=np.float32).reshape(10, 20)
+    brightness = colour_disparity(depth).astype(int).sum(axis=2).ravel()
+    assert brightness[0] > brightness[50] > brightness[-1]
+    assert colour_disparity(np.full((4, 5), 3.0, np.float32)).shape == (4, 5, 3)

@@ -1,0 +1,341 @@
+"""The objective on a scene whose depth and motion are known."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+
+from erfsfm.checkpoint import build_networks
+from erfsfm.config import ExperimentConfig
+from erfsfm.errors import ConfigError
+from erfsfm.training.objective import Outcome, SnippetBatch, evaluate_objective
+
+PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the target is at the origin
+
+
+class FixedDepth(nn.Module):
+    """One disparity everywhere, whatever the image."""
+
+    def __init__(self, disparity: float) -> None:
+        super().__init__()
+        self.disparity = nn.Parameter(torch.tensor(disparity, dtype=torch.float64))
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        height, width = image.shape[-2:]
+        return [
+            self.disparity.expand(len(image), 1, math.ceil(height / 2**s), math.ceil(width / 2**s)) for s in range(4)
+        ]
+
+
+class FixedPose(nn.Module):
+    """The same motion whatever the images; masks of one value."""
+
+    def __init__(self, vectors: Tensor, mask: float = 1.0, shrink: int = 0) -> None:
+        super().__init__()
+        self.vectors = nn.Parameter(vectors)
+        self.mask = mask
+        self.shrink = shrink
+
+    def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
+        assert len(sources) == self.vectors.shape[0]
+        return self.vectors.expand(len(target), -1, -1)
+
+    def forward_with_masks(self, target: Tensor, sources: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
+        height, width = (math.ceil((n - self.shrink)) for n in target.shape[-2:])
+        masks = [
+            target.new_full((len(target), len(sources), math.ceil(height / 2**s), math.ceil(width / 2**s)), self.mask)
+            for s in range(4)
+        ]
+        return self(target, sources), masks
+
+
+def true_poses() -> Tensor:
+    """``T_source_target`` of cameras that do not turn: minus their places."""
+    return torch.tensor([[*(-np.array(place)), 0, 0, 0] for place in PLACES], dtype=torch.float64)
+
+
+def experiment(masks: bool = False, fidelity: str = "default", **loss: Any) -> ExperimentConfig:
+    return ExperimentConfig.model_validate(
+        {"network": {"sources": 2, "masks": masks, "fidelity": fidelity}, "loss": {"smoothness_weight": 0.0} | loss}
+    )
+
+
+@pytest.fixture
+def batch(plane) -> SnippetBatch:
+    def tensor(place: Any) -> Tensor:
+        return torch.from_numpy(plane.colours(np.array(place))).permute(2, 0, 1)
+
+    target = tensor((0, 0, 0))[None].expand(2, -1, -1, -1)
+    sources = torch.stack([tensor(place) for place in PLACES])[None].expand(2, -1, -1, -1, -1)
+    return SnippetBatch(target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3))
+
+
+def judge(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> Outcome:
+    depth_net, pose_net = FixedDepth(disparity).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
+    return evaluate_objective(depth_net, pose_net, batch, config)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.85])
+def test_truth_is_best(batch: SnippetBatch, plane, reduction: str, ssim_weight: float) -> None:
+    config = experiment(reduction=reduction, ssim_weight=ssim_weight, scales=2)
+    truth = float(judge(batch, config, 1 / plane.distance, true_poses()).total)
+    assert 0 <= truth < 0.02
+    turned = true_poses()
+    turned[:, 4] = 0.05
+    wrong = {
+        "too near": judge(batch, config, 1.4 / plane.distance, true_poses()),
+        "too far": judge(batch, config, 0.6 / plane.distance, true_poses()),
+        "backwards": judge(batch, config, 1 / plane.distance, -true_poses()),
+        "turned": judge(batch, config, 1 / plane.distance, turned),
+        "swapped": judge(batch, config, 1 / plane.distance, true_poses().flip(0)),
+    }
+    for name, outcome in wrong.items():
+        assert float(outcome.total) > 2 * truth, name
+
+
+def test_what_it_returns(batch: SnippetBatch, plane) -> None:
+    outcome = judge(batch, experiment(), 1 / plane.distance, true_poses())
+    assert outcome.total.shape == ()
+    assert set(outcome.terms) == {"photometric", "smoothness"}
+    assert outcome.T_source_target.shape == (2, 2, 4, 4)
+    assert outcome.warped.shape == batch.sources.shape
+    assert [tuple(d.shape[-2:]) for d in outcome.disparities] == [(64, 96), (32, 48), (16, 24), (8, 12)]
+    inner = (outcome.warped - batch.target[:, None]).abs()[..., 16:-16, 24:-24]
+    assert float(inner.max()) < 0.03, "warped[:, k] is source k seen from the target"
+
+
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: str) -> None:
+    for factor in (0.9, 1.1):
+        depth_net = FixedDepth(factor / plane.distance)
+        pose_net = FixedPose(factor * true_poses())
+        evaluate_objective(depth_net, pose_net, batch, experiment(reduction=reduction)).total.backward()
+        assert depth_net.disparity.grad is not None
+        assert pose_net.vectors.grad is not None
+        assert float(depth_net.disparity.grad) * (factor - 1) > 0
+        assert float((pose_net.vectors.grad * true_poses()).sum()) * (factor - 1) > 0
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_every_weight_of_both_networks_learns(masks: bool) -> None:
+    config = ExperimentConfig.model_validate(
+        {
+            "network": {"sources": 2, "masks": masks, "depth_width": 0.0625, "pose_width": 0.125},
+            "loss": {"mask_weight": 0.2 * masks, "consistency_weight": 0.1, "ssim_weight": 0.5},
+        }
+    )
+    depth_net, pose_net = build_networks(config.network)
+    K = torch.tensor([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]).expand(2, 3, 3)
+    batch = SnippetBatch(torch.rand(2, 3, 32, 64), torch.rand(2, 2, 3, 32, 64), K)
+    evaluate_objective(depth_net, pose_net, batch, config).total.backward()
+    for net in (depth_net, pose_net):
+        for name, weight in net.named_parameters():
+            assert weight.grad is not None, name
+            assert torch.isfinite(weight.grad).all(), name
+        assert any(float(weight.grad.abs().sum()) > 0 for weight in net.parameters() if weight.grad is not None)
+
+
+def bilinear(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    """Look-up in ``(H, W, 3)`` at pixel (x, y) inside it."""
+    column, row = min(int(x), image.shape[1] - 2), min(int(y), image.shape[0] - 2)
+    a, b = x - column, y - row
+    top = (1 - a) * image[row, column] + a * image[row, column + 1]
+    bottom = (1 - a) * image[row + 1, column] + a * image[row + 1, column + 1]
+    return (1 - b) * top + b * bottom
+
+
+def naive_photometric(batch: SnippetBatch, disparities: list[Tensor], vectors: np.ndarray) -> float:
+    """The reference's loss pixel by pixel: mean |target - warp| valid, summed over scales and sources."""
+    total = 0.0
+    for level, disparity in enumerate(disparities):
+        ratio = 2**level
+        height, width = disparity.shape[-2:]
+        for b, K_full in enumerate(batch.K.numpy()):
+            K = K_full.copy()
+            K[:2] /= ratio
+
+            def shrink(image: Tensor) -> np.ndarray:
+                blocks = image.numpy().reshape(3, height, ratio, width, ratio)  # noqa: B023
+                return blocks.mean(axis=(2, 4)).transpose(1, 2, 0)
+
+            target = shrink(batch.target[b])
+            for n, vector in enumerate(vectors):
+                source = shrink(batch.sources[b, n])
+                R = Rotation.from_euler("XYZ", vector[3:]).as_matrix()
+                error = np.zeros((height, width))
+                for v in range(height):
+                    for u in range(width):
+                        depth = 1 / float(disparity[b, 0, v, u])
+                        X = R @ (depth * np.linalg.solve(K, [u, v, 1])) + vector[:3]
+                        x, y, _ = K @ X / X[2]
+                        if 0 <= x <= width - 1 and 0 <= y <= height - 1:
+                            error[v, u] = np.abs(target[v, u] - bilinear(source, x, y)).mean()
+                total += error.mean() / len(batch.K)
+    return total
+
+
+def test_mean_is_the_papers_formula() -> None:
+    generator = torch.Generator().manual_seed(5)
+    disparities = [torch.rand(2, 1, 32 >> s, 40 >> s, generator=generator).double() * 0.2 + 0.1 for s in range(4)]
+    vectors = torch.tensor([[0.4, -0.2, 0.5, 0.02, -0.05, 0.03], [-0.6, 0.1, -0.7, -0.02, 0.04, 0.1]]).double()
+    K = torch.tensor([[[35.0, 0, 19], [0, 33, 17], [0, 0, 1]], [[45.0, 0, 21], [0, 44, 15], [0, 0, 1]]]).double()
+    images = torch.rand(2, 3, 3, 32, 40, generator=generator).double()
+    batch = SnippetBatch(images[:, 0], images[:, 1:], K)
+
+    class Given(nn.Module):
+        def forward(self, image: Tensor) -> list[Tensor]:
+            return disparities
+
+    outcome = evaluate_objective(Given(), FixedPose(vectors).requires_grad_(False), batch, experiment(fidelity="paper"))
+    expected = naive_photometric(batch, disparities, vectors.numpy())
+    assert float(outcome.terms["photometric"]) == pytest.approx(expected, rel=1e-9)
+    assert float(outcome.total) == pytest.approx(expected, rel=1e-9), "smoothness has no weight here"
+
+
+def test_smoothness_halves_from_scale_to_scale() -> None:
+    """u^2 as disparity at every level has second differences of 2 everywhere: 2 (1 + 1/2 + 1/4 + 1/8)."""
+
+    class Parabola(nn.Module):
+        def forward(self, image: Tensor) -> list[Tensor]:
+            return [(torch.arange(64 >> s) ** 2 + 1).double().expand(1, 1, 32 >> s, 64 >> s) for s in range(4)]
+
+    images = torch.rand(1, 3, 3, 32, 64).double()
+    batch = SnippetBatch(images[:, 0], images[:, 1:], torch.eye(3).double()[None])
+    config = experiment(smoothness="disparity-second-order", smoothness_weight=0.5)
+    outcome = evaluate_objective(Parabola(), FixedPose(true_poses()).requires_grad_(False), batch, config)
+    assert float(outcome.terms["smoothness"]) == pytest.approx(2 * (1 + 1 / 2 + 1 / 4 + 1 / 8))
+    assert float(outcome.total) == pytest.approx(
+        float(outcome.terms["photometric"]) + 0.5 * float(outcome.terms["smoothness"])
+    )
+
+
+@pytest.mark.parametrize("smoothness", ["depth-second-order", "disparity-second-order", "disparity-edge-aware"])
+def test_a_flat_depth_is_smooth(batch: SnippetBatch, plane, smoothness: str) -> None:
+    outcome = judge(batch, experiment(smoothness=smoothness, smoothness_weight=1.0), 0.25, true_poses())
+    assert float(outcome.terms["smoothness"]) == pytest.approx(0, abs=1e-12)
+
+
+def test_minimum_is_at_most_the_mean_of_the_sources(batch: SnippetBatch) -> None:
+    """Where everything is visible: no motion, so that the sources themselves are compared."""
+    vectors = torch.zeros(2, 6).double()
+    minimum = judge(batch, experiment(reduction="minimum"), 0.25, vectors)
+    mean = judge(batch, experiment(reduction="mean"), 0.25, vectors)
+    assert 0 < float(minimum.total) <= float(mean.total) / 2
+
+
+def test_minimum_forgives_an_occluded_source(batch: SnippetBatch, plane) -> None:
+    sources = batch.sources.clone()
+    sources[:, 0, :, 20:40, 30:60] = 0
+    hidden = SnippetBatch(batch.target, sources, batch.K)
+    for reduction, forgives in (("minimum", True), ("mean", False)):
+        config = experiment(reduction=reduction, scales=1)
+        clear = float(judge(batch, config, 1 / plane.distance, true_poses()).total)
+        covered = float(judge(hidden, config, 1 / plane.distance, true_poses()).total)
+        assert (covered < 1.5 * clear) is forgives
+
+
+def test_nothing_visible_costs_nothing(batch: SnippetBatch) -> None:
+    """All points behind both sources: no error, and gradients that are numbers."""
+    vectors = torch.tensor([[0, 0, -100.0, 0, 0, 0]] * 2).double()
+    for reduction in ("minimum", "mean"):
+        pose_net, depth_net = FixedPose(vectors), FixedDepth(0.25)
+        config = experiment(reduction=reduction, consistency_weight=0.1, ssim_weight=0.85)
+        outcome = evaluate_objective(depth_net, pose_net, batch, config)
+        outcome.total.backward()
+        assert float(outcome.total.detach()) == 0
+        assert pose_net.vectors.grad is not None
+        assert torch.isfinite(pose_net.vectors.grad).all()
+
+
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+def test_auto_mask_ignores_a_still_world(batch: SnippetBatch, reduction: str) -> None:
+    still = SnippetBatch(batch.target, batch.target[:, None].expand_as(batch.sources), batch.K)
+    masked = judge(still, experiment(reduction=reduction, auto_mask=True), 0.25, true_poses())
+    assert float(masked.total) == 0
+    assert float(judge(still, experiment(reduction=reduction), 0.25, true_poses()).total) > 0.01
+
+
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+def test_auto_mask_keeps_what_moves(batch: SnippetBatch, plane, reduction: str) -> None:
+    """A passenger's view: the left half travels with the camera, the right half passes by."""
+    sources = batch.sources.clone()
+    sources[..., :48] = batch.target[:, None, :, :, :48]
+    half_still = SnippetBatch(batch.target, sources, batch.K)
+    config = experiment(reduction=reduction, auto_mask=True, scales=1)
+    depth_net = FixedDepth(1.1 / plane.distance)
+    evaluate_objective(depth_net, FixedPose(true_poses()), half_still, config).total.backward()
+    assert depth_net.disparity.grad is not None
+    assert float(depth_net.disparity.grad) > 0, "the moving half still says: further away"
+    plain = judge(half_still, experiment(reduction=reduction, scales=1), 1 / plane.distance, true_poses())
+    masked = judge(half_still, config, 1 / plane.distance, true_poses())
+    assert float(masked.total) < 0.3 * float(plain.total), "the still half no longer disturbs the truth"
+
+
+def test_masks_weigh_the_error_and_are_held_up(batch: SnippetBatch) -> None:
+    plain = float(judge(batch, experiment(), 0.3, true_poses()).total)
+    config = experiment(masks=True, mask_weight=0.1)
+    depth_net, pose_net = FixedDepth(0.3), FixedPose(true_poses(), mask=0.5)
+    with torch.no_grad():
+        outcome = evaluate_objective(depth_net, pose_net, batch, config)
+    assert float(outcome.terms["photometric"]) == pytest.approx(plain / 2)
+    assert float(outcome.terms["explainability"]) == pytest.approx(4 * math.log(2))
+    assert float(outcome.total) == pytest.approx(plain / 2 + 0.4 * math.log(2))
+
+
+def test_masks_of_another_size_are_refused(batch: SnippetBatch) -> None:
+    with pytest.raises(ConfigError, match=r"network\.masks"):
+        evaluate_objective(FixedDepth(0.3), FixedPose(true_poses(), shrink=8), batch, experiment(masks=True))
+
+
+def test_consistency_by_hand(batch: SnippetBatch, plane) -> None:
+    """One depth d for all frames contradicts a motion of z along the axis by |z| / (2 d - z)."""
+    d = plane.distance
+    config = experiment(consistency_weight=2.0)
+    outcome = judge(batch, config, 1 / d, true_poses())
+    before, after = (-place[2] for place in PLACES)  # t_z of T_source_target
+    expected = (abs(before) / (2 * d + before) + abs(after) / (2 * d + after)) / 2
+    assert float(outcome.terms["consistency"]) == pytest.approx(expected, rel=1e-6)
+    assert float(outcome.total) == pytest.approx(float(outcome.terms["photometric"]) + 2 * expected, rel=1e-6)
+    sideways = true_poses() * torch.tensor([1, 1, 0, 0, 0, 0])
+    assert float(judge(batch, config, 1 / d, sideways).terms["consistency"]) == pytest.approx(0, abs=1e-9)
+
+
+def test_consistency_pairs_each_source_with_its_own_depth() -> None:
+    """Disparities that encode which image was asked: target, before, after of each sample."""
+
+    class Labelled(nn.Module):
+        def forward(self, image: Tensor) -> list[Tensor]:
+            label = (image[:, :1, :1, :1] + 1) / 2  # the colour of the image, in (0, 1]
+            return [label.expand(-1, 1, 32 >> s, 48 >> s) for s in range(4)]
+
+    shades = torch.tensor([[0.5, 0.5, 0.25], [0.8, 0.4, 0.8]])  # target, before, after
+    images = shades[:, :, None, None, None].expand(2, 3, 3, 32, 48).double()
+    K = torch.tensor([[30.0, 0, 24], [0, 30, 16], [0, 0, 1]]).double()
+    batch = SnippetBatch(images[:, 0], images[:, 1:], K.expand(2, 3, 3))
+    still = FixedPose(torch.zeros(2, 6).double()).requires_grad_(False)
+    outcome = evaluate_objective(Labelled(), still, batch, experiment(consistency_weight=1.0))
+    # sample 1: before agrees, after 2 m against 4 m: 1/3; sample 2: before 1.25 m against 2.5 m: 1/3, after agrees
+    assert float(outcome.terms["consistency"]) == pytest.approx((1 / 6 + 1 / 6) / 2)
+
+
+def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> None:
+    single = SnippetBatch(batch.target.float(), batch.sources.float(), batch.K.float())
+    config = experiment(ssim_weight=0.85, consistency_weight=0.1)
+    depth_net, pose_net = FixedDepth(1 / plane.distance).float(), FixedPose(true_poses().float())
+    precise = evaluate_objective(depth_net, pose_net, single, config)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = evaluate_objective(depth_net, pose_net, single, config)
+    assert mixed.total.dtype == torch.float32
+    assert torch.equal(mixed.total, precise.total)
+
+
+def test_evaluation_mode_is_refused(batch: SnippetBatch) -> None:
+    with pytest.raises(ValueError, match="training mode"):
+        evaluate_objective(FixedDepth(0.3).eval(), FixedPose(true_poses()), batch, experiment())

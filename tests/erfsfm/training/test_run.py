@@ -1,0 +1,428 @@
+"""A whole training on a toy drive: its folder, its resume, its refusals."""
+
+from __future__ import annotations
+
+import csv
+import os
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from erfsfm.checkpoint import load_model
+from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.errors import ConfigError, DataError, TrainingError
+from erfsfm.inference import DepthPosePredictor
+from erfsfm.training.module import SelfSupervision
+from erfsfm.training.run import decisive, licence_of, train
+
+Small = dict[str, dict[str, object]]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Any:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("drives")
+
+
+@pytest.fixture
+def world(drives: Path, write_root: Callable[..., Path]) -> Path:
+    """A drive of 10 frames with depth and poses."""
+    return drives / "world" if (drives / "world").exists() else write_root(drives / "world", frames=10, depth=True)
+
+
+@pytest.fixture
+def held_out(drives: Path, write_root: Callable[..., Path]) -> Path:
+    """A simulated drive with a seed that validates."""
+    root = drives / "held_out"
+    return root if root.exists() else write_root(root, frames=8, depth=True, seed=500)
+
+
+def configure(small: Small, roots: list[Path], **sections: dict[str, Any]) -> ExperimentConfig:
+    data = {"roots": roots, "validation": ["simulated/500-599"], "validation_snippets": 3}
+    tree = {
+        name: small.get(name, {}) | ({"data": data}.get(name, {})) | sections.get(name, {})
+        for name in {*small, *sections}
+    }
+    return ExperimentConfig.model_validate(tree)
+
+
+def weights_of(folder: Path) -> list[Tensor]:
+    model = load_model(folder)
+    return [*model.depth_net.state_dict().values(), *model.pose_net.state_dict().values()]
+
+
+def same(first: Path, second: Path) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(weights_of(first), weights_of(second), strict=True))
+
+
+class Interrupt(Exception):
+    """A power cut."""
+
+
+def cut_power_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """The process dies in the midst of the step after ``step`` steps."""
+    original = SelfSupervision.training_step
+
+    def dying(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        if self.global_step == step:
+            raise Interrupt
+        return original(self, batch, index)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", dying)
+
+
+def interrupted(monkeypatch: pytest.MonkeyPatch, config: ExperimentConfig, output: Path, step: int) -> None:
+    with monkeypatch.context() as patched:
+        cut_power_at(patched, step)
+        with pytest.raises(Interrupt):
+            train(config, output, device="cpu")
+
+
+def test_the_folder_can_be_used(small: Small, world: Path, held_out: Path, tmp_path: Path) -> None:
+    config = configure(small, [world, held_out])
+    output = train(config, tmp_path / "run", device="cpu", command="erfsfm train")
+    assert output == tmp_path / "run"
+    predictor = DepthPosePredictor.from_weights(output)
+    record = predictor.record
+    assert record.trained_on == ["kitti_odometry/00[0:10]"], "not what only validates"
+    assert record.licence.startswith("CC BY-NC-SA")
+    assert record.command == "erfsfm train"
+    assert record.network == config.network
+    wanted = {"photometric", "abs_rel", "depth_scale", "depth_scale_spread", "disparity_spread"}
+    assert wanted <= record.metrics.keys()
+    assert all(np.isfinite(value) for value in record.metrics.values())
+    assert predictor.depth(np.zeros((50, 80, 3), np.uint8)).shape == (50, 80)
+    assert load_model(output / "last").record.step == 4
+    assert load_experiment(output / "config.yaml") == config
+    with (output / "logs" / "csv" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    steps = [int(row["step"]) for row in rows if row["loss"]]
+    assert steps == [0, 1, 2, 3]
+    assert any(row["validation/abs_rel"] for row in rows)
+
+
+def test_five_frames_are_validated_by_the_snippet_protocol(small: Small, held_out: Path, tmp_path: Path) -> None:
+    small["network"]["sources"] = 4
+    config = configure(small, [held_out], training={"steps": 2}, data={"validation": ["simulated/500[0:5]"]})
+    config = config.model_copy(update={"data": config.data.model_copy(update={"ranges": {"simulated/500": "5:8"}})})
+    with pytest.raises(DataError, match="5 consecutive frames"):
+        train(config, tmp_path / "short", device="cpu")
+    config = configure(small, [held_out, held_out.parent / "world"], training={"steps": 2})
+    metrics = load_model(train(config, tmp_path / "run", device="cpu")).record.metrics
+    assert {"snippet_ate", "snippet_re"} <= metrics.keys()
+
+
+def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
+    config = configure(small, [world], training={"steps": 2})
+    for name in ("a", "b"):
+        train(config, tmp_path / name, device="cpu")
+    assert same(tmp_path / "a", tmp_path / "b")
+    other = configure(small, [world], training={"steps": 2, "seed": 1})
+    train(other, tmp_path / "c", device="cpu")
+    assert not same(tmp_path / "a", tmp_path / "c")
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+@pytest.mark.parametrize("normalisation", ["none", "batch"])
+def test_resume_ends_with_the_very_same_weights(
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    schedule: str,
+    normalisation: str,
+) -> None:
+    """Interrupted at step 5 of 6; the last checkpoint is of step 4, where there also was a validation."""
+    small["network"]["normalisation"] = normalisation
+    training = {"steps": 6, "schedule": schedule, "learning_rate": 1e-3, "gradient_clip": 1.0}
+    config = configure(small, [world, held_out], training=training)
+    train(config, tmp_path / "whole", device="cpu")
+    interrupted(monkeypatch, config, tmp_path / "cut", 5)
+    steps: list[int] = []
+    original = SelfSupervision.training_step
+
+    def watching(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        steps.append(self.global_step)
+        return original(self, batch, index)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", watching)
+    train(config, tmp_path / "cut", resume=True, device="cpu")
+    assert steps == [4, 5]
+    assert same(tmp_path / "whole" / "last", tmp_path / "cut" / "last")
+    assert same(tmp_path / "whole", tmp_path / "cut"), "the best as well"
+    records = [load_model(tmp_path / name / "last").record for name in ("whole", "cut")]
+    assert records[0].metrics == records[1].metrics
+    assert records[0].step == records[1].step == 6
+    assert (tmp_path / "cut" / "logs" / "csv" / "metrics.csv").is_file(), "the log before the interruption stays"
+    assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
+
+
+def test_a_finished_run_can_be_prolonged(small: Small, world: Path, tmp_path: Path) -> None:
+    config = configure(small, [world])
+    longer = configure(small, [world], training={"steps": 6})
+    train(longer, tmp_path / "whole", device="cpu")
+    train(config, tmp_path / "run", device="cpu")
+    train(longer, tmp_path / "run", resume=True, device="cpu")
+    assert same(tmp_path / "whole", tmp_path / "run")
+    assert load_experiment(tmp_path / "run" / "config.yaml").training.steps == 6
+
+
+def test_resuming_a_finished_run_changes_nothing(small: Small, world: Path, held_out: Path, tmp_path: Path) -> None:
+    """In particular the best weights are not replaced by the last, nor their metrics forgotten."""
+    config = configure(small, [world, held_out], training={"learning_rate": 3.0, "gradient_clip": 1.0})
+    output = train(config, tmp_path / "run", device="cpu")
+    shutil.copytree(output, tmp_path / "before")
+    train(config, output, resume=True, device="cpu")
+    assert same(tmp_path / "before", output)
+    assert load_model(output).record.metrics == load_model(tmp_path / "before").record.metrics != {}
+
+
+def test_the_best_stays_on_top(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quality = iter([0.3, 0.2, 0.5, float("nan")])
+    original = SelfSupervision.on_validation_epoch_end
+
+    def pretend(self: SelfSupervision) -> None:
+        original(self)
+        self.validation_metrics["abs_rel"] = next(quality)
+
+    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", pretend)
+    config = configure(small, [world, held_out], training={"steps": 4, "validate_every": 1})
+    output = train(config, tmp_path / "run", device="cpu")
+    assert load_model(output).record.step == 2
+    assert load_model(output).record.metrics["abs_rel"] == 0.2
+    assert load_model(output / "last").record.step == 4
+
+
+@pytest.mark.parametrize(
+    ("metrics", "measure"),
+    [
+        ({"abs_rel": 0.2, "photometric": 0.1}, 0.2),
+        ({"photometric": 0.1}, 0.1),
+        ({}, np.inf),
+        ({"abs_rel": np.nan, "photometric": 0.1}, np.inf),
+    ],
+)
+def test_decisive(metrics: dict[str, float], measure: float) -> None:
+    assert decisive(metrics) == measure
+
+
+def test_initial_weights_hand_on_their_leak_record(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = train(configure(small, [world], training={"steps": 1}), tmp_path / "first", device="cpu")
+    config = configure(small, [held_out], data={"validation": []}).model_copy(update={"initial_weights": str(first)})
+    gentle = config.training.model_copy(update={"learning_rate": 1e-12})
+    config = config.model_copy(update={"training": gentle})
+    interrupted(monkeypatch, config, tmp_path / "second", 3)
+    second = train(config, tmp_path / "second", resume=True, device="cpu")
+    record = load_model(second).record
+    assert record.trained_on == ["simulated/500", "kitti_odometry/00[0:10]"], "also after a resume"
+    assert record.licence.startswith("CC BY-NC-SA")
+    for trained, initial in zip(weights_of(second), weights_of(first), strict=True):
+        torch.testing.assert_close(trained, initial)
+
+
+def test_initial_weights_of_another_network(small: Small, world: Path, tmp_path: Path) -> None:
+    first = train(configure(small, [world], training={"steps": 1}), tmp_path / "first", device="cpu")
+    wider = configure(small, [world], network={"pose_width": 0.25})
+    with pytest.raises(ConfigError, match="of another network"):
+        train(wider.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
+
+
+def test_resume_with_other_data_keeps_the_leak_record(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(monkeypatch, configure(small, [world]), tmp_path / "run", 3)
+    other = configure(small, [held_out], data={"validation": []})
+    train(other, tmp_path / "run", resume=True, device="cpu")
+    assert load_model(tmp_path / "run").record.trained_on == ["simulated/500", "kitti_odometry/00[0:10]"]
+
+
+def test_a_loss_that_is_no_number_stops_the_run(
+    small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = SelfSupervision.training_step
+
+    def poisoned(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        if self.global_step == 3:
+            batch["target"][0, 0, 0, 0] = torch.nan
+        return original(self, batch, index)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", poisoned)
+    with pytest.raises(TrainingError, match="at step 3 is not finite") as caught:
+        train(configure(small, [world]), tmp_path / "run", device="cpu")
+    assert "\n" not in str(caught.value)
+    assert "photometric nan" in str(caught.value)
+    monkeypatch.undo()
+    train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
+
+
+def test_ctrl_c_is_one_line(small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SelfSupervision, "training_step", pressed)
+    with pytest.raises(TrainingError, match="interrupted at step 0"):
+        train(configure(small, [world]), tmp_path / "run", device="cpu")
+
+
+# refusals
+
+
+@pytest.fixture
+def cut(small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[ExperimentConfig, Path]:
+    """An interrupted run and its configuration."""
+    config = configure(small, [world])
+    interrupted(monkeypatch, config, tmp_path / "run", 3)
+    return config, tmp_path / "run"
+
+
+def test_a_run_is_not_overwritten(cut: tuple[ExperimentConfig, Path]) -> None:
+    config, output = cut
+    with pytest.raises(TrainingError, match="--resume or choose another --output"):
+        train(config, output, device="cpu")
+
+
+def test_weights_are_not_overwritten(small: Small, world: Path, tmp_path: Path) -> None:
+    """A short run leaves no checkpoint, but it leaves weights."""
+    config = configure(small, [world], training={"steps": 1})
+    train(config, tmp_path / "run", device="cpu")
+    assert not (tmp_path / "run" / "checkpoints").exists()
+    with pytest.raises(TrainingError, match="choose another --output"):
+        train(config, tmp_path / "run", device="cpu")
+
+
+def test_nothing_to_resume(small: Small, world: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="start without --resume"):
+        train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
+
+
+def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
+    config, output = cut
+    network = config.network.model_copy(update={"pose": "erf-posenet-dilated"})
+    with pytest.raises(ConfigError, match="networks"):
+        train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
+
+
+class Malice:
+    """An object that runs a command when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return os.system, (f"touch {self.mark}",)
+
+
+def refused_checkpoint(cut: tuple[ExperimentConfig, Path]) -> None:
+    config, output = cut
+    with pytest.raises(TrainingError, match="cannot be resumed") as caught:
+        train(config, output, resume=True, device="cpu")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["torch", "pickle"])
+def test_code_in_a_checkpoint_never_runs(cut: tuple[ExperimentConfig, Path], tmp_path: Path, kind: str) -> None:
+    path = cut[1] / "checkpoints" / "last.ckpt"
+    state = torch.load(path, weights_only=True) | {"extra": Malice(tmp_path / "executed")}
+    if kind == "torch":
+        torch.save(state, path)
+    else:
+        path.write_bytes(pickle.dumps(state))
+    refused_checkpoint(cut)
+    assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("keep", [0, 10, 0.5, -1])
+def test_a_half_written_checkpoint(cut: tuple[ExperimentConfig, Path], keep: float) -> None:
+    path = cut[1] / "checkpoints" / "last.ckpt"
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * keep) if isinstance(keep, float) else keep])
+    refused_checkpoint(cut)
+
+
+@pytest.mark.parametrize("content", [{}, {"global_step": 2}, [1, 2], torch.zeros(3)])
+def test_a_foreign_checkpoint(cut: tuple[ExperimentConfig, Path], content: Any) -> None:
+    torch.save(content, cut[1] / "checkpoints" / "last.ckpt")
+    refused_checkpoint(cut)
+
+
+def test_a_checkpoint_of_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
+    """Its own configuration file says so; without that the tensors do."""
+    config, output = cut
+    (output / "config.yaml").unlink()
+    network = config.network.model_copy(update={"pose_width": 0.25})
+    with pytest.raises(TrainingError, match="cannot be resumed"):
+        train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_broken_image_is_one_line(
+    small: Small, tmp_path: Path, write_root: Callable[..., Path], workers: int
+) -> None:
+    root = write_root(tmp_path / "root", frames=4)
+    for index in (1, 2):
+        (root / f"sequences/00/image_2/{index:06d}.png").write_bytes(b"broken")
+    with pytest.raises(DataError, match=r"00000[12]\.png is missing or not a readable image") as caught:
+        train(configure(small, [root], data={"workers": workers}), tmp_path / "run", device="cpu")
+    assert "\n" not in str(caught.value)
+
+
+def test_workers_change_nothing(small: Small, world: Path, tmp_path: Path) -> None:
+    for workers in (0, 1):
+        config = configure(small, [world], data={"workers": workers}, training={"steps": 2})
+        train(config, tmp_path / str(workers), device="cpu")
+    assert same(tmp_path / "0", tmp_path / "1")
+
+
+def test_lightning_keeps_quiet(
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    recwarn: pytest.WarningsRecorder,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = configure(small, [world, held_out])
+    interrupted(monkeypatch, config, tmp_path / "run", 3)
+    train(config, tmp_path / "run", resume=True, device="cpu")
+    out, err = capfd.readouterr()
+    assert (out, err) == ("", "")
+    assert [str(w.message) for w in recwarn if "ightning" in f"{w.filename} {w.message}"] == []
+
+
+@pytest.mark.parametrize(
+    ("seen", "licence"),
+    [
+        (["simulated/0-9"], "MIT"),
+        (["simulated/0-9", "kitti_odometry/00[0:250]"], "CC BY-NC-SA"),
+        (["folder/mine"], "unknown"),
+    ],
+)
+def test_licence_of(seen: list[str], licence: str) -> None:
+    assert licence_of(seen).startswith(licence)
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed"])
+def test_mixed_precision_trains(small: Small, world: Path, held_out: Path, tmp_path: Path, precision: str) -> None:
+    config = configure(small, [world, held_out], training={"precision": precision, "steps": 2})
+    output = train(config, tmp_path / "run", device="cpu")
+    assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+
+from slam import se3
+from slam.config import FrontendConfig
+from slam.errors import SlamError
+from slam.frames import SnippetPoses
+from slam.frontend.network_factors import chain_raw, network_factors
+
+CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_sigma_share=0.1, translation_floor_share=0.05)
+
+
+def drive(count: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    turns = np.stack([0.01 * rng.normal(size=count), 0.1 * rng.normal(size=count), 0 * np.arange(count)], axis=1)
+    steps = np.stack([0 * np.arange(count), 0 * np.arange(count), 1 + 0.2 * rng.normal(size=count)], axis=1)
+    return se3.chain(se3.from_rotation_vector(turns[1:], steps[1:]))
+
+
+def snippets_of(T, sources: int = 4, wrong: float = 0.0) -> list[SnippetPoses]:
+    """One per target; every pose but target -> next is shifted by ``wrong``."""
+    half, snippets = sources // 2, []
+    for target in range(half, len(T) - half):
+        indices = tuple(k for k in range(target - half, target + half + 1) if k != target)
+        poses = np.stack([se3.invert(T[k]) @ T[target] for k in indices])
+        for k, pose in zip(indices, poses, strict=True):
+            pose[0, 3] += wrong * (k != target + 1)
+        snippets.append(SnippetPoses(target, indices, poses))
+    return snippets
+
+
+@pytest.mark.parametrize(("count", "sources"), [(5, 4), (6, 4), (30, 4), (3, 2), (20, 2)])
+def test_exact_snippets_chain_to_the_truth(count, sources):
+    T = drive(count)
+    chained = chain_raw(snippets_of(T, sources), count)
+    np.testing.assert_allclose(chained, T, atol=1e-9)
+    np.testing.assert_array_equal(chained[0], np.eye(4))
+
+
+def test_chain_uses_target_to_next_and_nothing_else():
+    T = drive(12)
+    chained = chain_raw(snippets_of(T, wrong=0.5), 12)
+    inner = se3.invert(chained[2:-2]) @ chained[3:-1]
+    np.testing.assert_allclose(inner, se3.invert(T[2:-2]) @ T[3:-1], atol=1e-9)
+    # the ends come from the direct poses, which are wrong here
+    first, last = snippets_of(T, wrong=0.5)[0], snippets_of(T, wrong=0.5)[-1]
+    np.testing.assert_allclose(se3.invert(chained[0]) @ chained[2], first.T_source_target[0], atol=1e-9)
+    np.testing.assert_allclose(se3.invert(chained[1]) @ chained[2], first.T_source_target[1], atol=1e-9)
+    np.testing.assert_allclose(se3.invert(chained[11]) @ chained[9], last.T_source_target[3], atol=1e-9)
+    np.testing.assert_allclose(se3.invert(chained[10]) @ chained[9], last.T_source_target[2], atol=1e-9)
+
+
+def test_sequences_that_snippets_do_not_cover_are_refused():
+    snippets = snippets_of(drive(12))
+    with pytest.raises(SlamError, match="4 frames is shorter than one snippet"):
+        chain_raw([], 4)
+    with pytest.raises(SlamError, match="without gaps"):
+        chain_raw(snippets[:2] + snippets[3:], 12)
+    with pytest.raises(SlamError, match="frame 0"):
+        chain_raw(snippets[1:], 12)
+    for count in (11, 13):
+        with pytest.raises(SlamError, match=f"frame {count - 1}"):
+            chain_raw(snippets, count)
+
+
+def test_every_direct_pose_is_a_factor_in_its_own_direction():
+    T = drive(10)
+    factors = network_factors(snippets_of(T), CONFIG)
+    assert len(factors) == 4 * 6
+    for factor in factors:
+        expected = se3.invert(T[factor.from_index]) @ T[factor.to_index]
+        np.testing.assert_allclose(factor.T_from_to, expected, atol=1e-12)
+        assert 2 <= factor.to_index <= 7  # the target
+
+
+def test_noise_follows_distance_length_and_repetition():
+    T = np.tile(np.eye(4), (10, 1, 1))
+    T[:, 2, 3] = 2.0 * np.arange(10)
+    sigmas = {(f.from_index, f.to_index): f.sigmas for f in network_factors(snippets_of(T), CONFIG)}
+    once, twice = np.deg2rad(0.5), np.deg2rad(0.5) * np.sqrt(2)
+    # pair (0, 2) is measured once, pair (4, 5) by two snippets
+    np.testing.assert_allclose(sigmas[0, 2][:3], once * np.sqrt(2))
+    np.testing.assert_allclose(sigmas[4, 5][:3], twice)
+    np.testing.assert_allclose(sigmas[4, 5][3:], np.sqrt(2) * (0.1 * 2.0 + 0.05 * 2.0))
+    np.testing.assert_allclose(sigmas[4, 6][3:], np.sqrt(2) * (0.1 * 4.0 + 0.05 * 2.0))
+    np.testing.assert_array_equal(sigmas[5, 4], sigmas[4, 5])
+
+
+def test_standing_still_keeps_positive_sigmas():
+    for factor in network_factors(snippets_of(np.tile(np.eye(4), (8, 1, 1))), CONFIG):
+        assert (factor.sigmas > 0).all()

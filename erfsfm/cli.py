@@ -82,6 +82,8 @@ def predict(
     files = image_files(images) if images.is_dir() else (images,)
     if not files:
         raise DataError(f"{images} holds no png or jpg to predict from")
+    if output.resolve() in {file.parent.resolve() for file in files}:
+        raise DataError(f"{output} holds the images themselves: choose another --output, or they would be overwritten")
     predictor = DepthPosePredictor.from_weights(weights, device)
     output.mkdir(parents=True, exist_ok=True)
     for file in files:

@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
@@ -207,7 +207,8 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
 
     if format not in ("auto", "kitti", "tum"):
         raise SlamError(f"--format must be auto, kitti or tum; got '{format}'")
-    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
+    kind = cast(Literal["auto", "kitti", "tum"], format)
+    pair = associate(read_trajectory(estimate, kind), read_trajectory(reference, kind))
     metrics = trajectory_metrics(*pair)
     if as_json:
         typer.echo(json.dumps(metrics, indent=2))
@@ -272,7 +273,9 @@ class _progress_bar:  # noqa: N801 - reads as the function it stands for
 def main() -> None:
     """Run the command line: known errors become one line and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    terminal = logging.StreamHandler(sys.stderr)
+    terminal.setLevel(logging.WARNING)  # run.log has the rest
+    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
     try:
         app()
     except (SlamError, ErfsfmError) as error:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -13,6 +10,7 @@ import numpy as np
 
 from slam import se3
 from slam.errors import RunError
+from slam.files import write_atomically
 from slam.run_folder import RunFolder
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory, write_kitti, write_tum
@@ -68,7 +66,7 @@ def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: Rota
         if up != "y-down":
             raise RunError("a graph is exported as the run has it: leave --up out or give --up y-down")
         source = folder.require("graph.g2o")
-        _write(output, lambda path: shutil.copyfile(source, path))
+        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     return output
 
 
@@ -76,9 +74,9 @@ def _export_ply(source: Path, output: Path, up: str, rotate_ply: RotatePly) -> N
     if output.suffix.lower() != ".ply":
         raise RunError(f"meshes and clouds are written as PLY; got '{output.name}', give a name that ends in .ply")
     if up == "y-down":
-        _write(output, lambda path: shutil.copyfile(source, path))
+        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     else:
-        _write(output, lambda path: rotate_ply(source, path, R_UP_WORLD))
+        write_atomically(output, lambda path: rotate_ply(source, path, R_UP_WORLD), RunError)
 
 
 def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
@@ -90,18 +88,4 @@ def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
         T_up_world = se3.make(R_UP_WORLD, np.zeros(3))
         trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
     write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
-    _write(output, lambda path: write(path, trajectory))
-
-
-def _write(output: Path, fill: Callable[[Path], object]) -> None:
-    """Let ``fill`` write beside the target, then move into place; the suffix stays what it is."""
-    partial = output.with_name(f".{os.getpid()}.partial.{output.name}")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        fill(partial)
-        partial.replace(output)
-    except OSError as error:
-        raise RunError(f"{output}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+    write_atomically(output, lambda path: write(path, trajectory), RunError)

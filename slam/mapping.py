@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config import MappingConfig
 from slam.errors import SlamError
+from slam.files import write_atomically
 from slam.foreign import import_open3d
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.se3 import FloatArray, invert, rotation_angle
@@ -318,11 +319,27 @@ def _array(tensor: Any) -> FloatArray:
     return np.asarray(tensor.numpy(), dtype=np.float64)
 
 
+def rotate_ply(source: Path, target: Path, R_up_world: FloatArray) -> None:
+    """Write the mesh or cloud of one PLY file with vertices and normals turned by ``R_up_world`` ``(3, 3)``.
+
+    Raises:
+        SlamError: the source is no PLY, or the target cannot be written.
+    """
+    o3d = import_open3d()
+    kind = o3d.io.read_file_geometry_type(str(source))
+    is_mesh = bool(int(kind) & int(o3d.io.CONTAINS_TRIANGLES))
+    read = o3d.io.read_triangle_mesh if is_mesh else o3d.io.read_point_cloud
+    geometry = read(str(source))
+    if geometry.is_empty():
+        raise SlamError(f"{source} holds no points: it is damaged or not a PLY; run the sequence again")
+    geometry.rotate(R_up_world, center=np.zeros(3))
+    write = o3d.io.write_triangle_mesh if is_mesh else o3d.io.write_point_cloud
+    _write_ply(target, lambda name: write(name, geometry))
+
+
 def _write_ply(path: Path, write: Callable[[str], bool]) -> None:
-    temporary = path.with_name(f".{path.stem}.partial.ply")
-    try:
-        if not write(str(temporary)):
-            raise SlamError(f"{path} cannot be written")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    def fill(partial: Path) -> None:
+        if not write(str(partial)):
+            raise SlamError(f"{path} cannot be written: check the folder and the space on the disk")
+
+    write_atomically(path, fill)

@@ -6,9 +6,8 @@ apart in grey. Matplotlib is imported inside the functions, and no global state 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from slam.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.errors import RunError
+from slam.files import write_atomically
 from slam.frames import DepthMap, Image
 from slam.run_folder import TRAJECTORIES, RunFolder
 from slam.trajectory import Trajectory, associate
@@ -327,13 +327,6 @@ def _save(figure: Figure, output: Path) -> None:
     """Write beside the target and move into place; without a date, so that alike figures are alike files."""
     kind = output.suffix.lower().removeprefix(".")
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
-    partial = output.with_name(f".{output.stem}.{os.getpid()}.partial")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(partial, format=kind, dpi=200, metadata=undated)
-        partial.replace(output)
-    except OSError as error:
-        raise RunError(f"{output}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+    write_atomically(
+        output, lambda path: figure.savefig(path, format=kind, dpi=200, metadata=undated), RunError
+    )

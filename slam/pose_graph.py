@@ -8,8 +8,6 @@ start, so Cauchy is only offered as a polish of the Huber result.
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from scipy.stats import chi2
 
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
+from slam.files import write_atomically
 from slam.frames import RelativePose
 from slam.se3 import FloatArray, invert, is_se3
 
@@ -102,7 +101,8 @@ class PoseGraph:
             f"EDGE_SE3:QUAT {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.sigmas)}"
             for edge, pose in zip(self._relative_poses, edges, strict=True)
         ]
-        _write_text(path, "\n".join(lines) + "\n")
+        text = "\n".join(lines) + "\n"
+        write_atomically(path, lambda file: file.write_text(text, encoding="ascii"))
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:
@@ -238,14 +238,3 @@ def _g2o_information(sigmas: FloatArray) -> str:
 def _numbers(row: FloatArray) -> str:
     return " ".join(map(repr, row.tolist()))
 
-
-def _write_text(path: Path, text: str) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -109,11 +109,13 @@ def run_slam(
     folder.write_text("config.yaml", dump_yaml(settings))
     with _logging_to(folder.path / "run.log"):
         try:
-            return _run(folder, SlamPipeline(recording, _seeded(networks, seed), settings, progress), recording, provenance)
+            pipeline = SlamPipeline(recording, _seeded(networks, seed), settings, progress)
+            return _run(folder, pipeline, recording, provenance)
         except (SlamError, OSError, MemoryError, KeyboardInterrupt) as error:
             reason = str(error) or type(error).__name__
             logger.error("the run failed: %s", reason)
             folder.write_metrics(describe_failure(provenance, reason))
+            write_report(folder, [], None, None)
             raise
 
 

@@ -6,13 +6,13 @@ import json
 import logging
 import os
 import re
-import tempfile
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from slam.errors import RunError
+from slam.files import write_atomically
 from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 logger = logging.getLogger(__name__)
@@ -34,6 +34,8 @@ class RunFolder:
             RunError: ``output`` exists and holds something that is not a run.
         """
         if output is not None:
+            if output.exists() and not output.is_dir():
+                raise RunError(f"{output} is a file: give a folder as --output")
             if output.exists() and any(output.iterdir()) and not (output / "metrics.json").is_file():
                 raise RunError(f"{output} is not empty and holds no run: choose another --output")
             output.mkdir(parents=True, exist_ok=True)
@@ -70,17 +72,7 @@ class RunFolder:
 
     def write(self, name: str, fill: Callable[[Path], object]) -> None:
         """Let ``fill`` write a file beside its place, then put it there."""
-        target = self.path / name
-        handle, temporary = tempfile.mkstemp(dir=self.path, prefix=".", suffix=f".{name}")
-        os.close(handle)
-        try:
-            fill(Path(temporary))
-            umask = os.umask(0)
-            os.umask(umask)
-            Path(temporary).chmod(0o666 & ~umask)
-            Path(temporary).replace(target)
-        finally:
-            Path(temporary).unlink(missing_ok=True)
+        write_atomically(self.path / name, fill, RunError)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write ``metrics.json``; a number that is not finite is a mistake and is refused."""

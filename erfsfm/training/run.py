@@ -181,16 +181,17 @@ def commit() -> str:
 
 def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, resume: bool) -> int:
     """Make the folder ready; the number of steps already done."""
-    if resume and not checkpoint.is_file():
-        raise TrainingError(
-            f"nothing to resume in {output}: no {checkpoint.relative_to(output)}; start without --resume"
-        )
+    written = output / "config.yaml"
+    for needed in (checkpoint, written):
+        if resume and not needed.is_file():
+            raise TrainingError(
+                f"nothing to resume in {output}: no {needed.relative_to(output)}; start without --resume"
+            )
     if not resume and (checkpoint.is_file() or (output / "model.yaml").is_file()):
         raise TrainingError(f"{output} holds a run already: go on with --resume or choose another --output")
-    written = output / "config.yaml"
     done_steps = 0
     if resume:
-        if written.is_file() and load_experiment(written).network != config.network:
+        if load_experiment(written).network != config.network:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
         done_steps = _steps_of(checkpoint)
     output.mkdir(parents=True, exist_ok=True)

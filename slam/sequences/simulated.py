@@ -4,8 +4,13 @@ Surfaces are ray-cast with Open3D; everything else is NumPy (``slam/sequences/si
 """
 
 import functools
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast, get_args
 
 import cv2
 import numpy as np
@@ -14,19 +19,19 @@ from numpy.typing import NDArray
 from slam import se3
 from slam.errors import SequenceError
 from slam.foreign import import_open3d
+from slam.sequences.simulation import hazards as effects
 from slam.sequences.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.sequences.simulation.hazards import Hazard, Traffic
+from slam.sequences.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
 from slam.sequences.simulation.light import draw_weather, sky
 from slam.sequences.simulation.optics import kitti_intrinsics, pixel_rays
 from slam.sequences.simulation.painter import Hits, facing_normals, paint
-from slam.sequences.simulation.route import plan_drive
+from slam.sequences.simulation.route import Route, plan_drive
 from slam.sequences.simulation.town import build_town
 
-Route = Literal["loop", "grid", "straight"]
-Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
-
+VERSION = 1  # of the world: the same options give the same bytes as long as it stays
 FPS = 10.0
-STILL_FRAMES = 30
-FARTHEST = 200.0  # depth beyond this is called nothing, metres
+FARTHEST_M = 200.0  # what lies beyond counts as nothing
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,34 @@ class SimulationOptions:
     width: int = 416
     height: int = 128
     hazards: tuple[Hazard, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse options that mean nothing.
+
+        Raises:
+            SequenceError: naming the option.
+        """
+        if self.route not in get_args(Route):
+            raise SequenceError(f"route must be one of {', '.join(get_args(Route))}; got {self.route!r}")
+        for hazard in self.hazards:
+            if hazard not in get_args(Hazard):
+                raise SequenceError(f"hazards are {', '.join(get_args(Hazard))}; got {hazard!r}")
+        if self.seed < 0:
+            raise SequenceError(f"seed must be 0 or more; got {self.seed}")
+        if min(self.width, self.height) < 8:
+            raise SequenceError(f"images must be 8 x 8 or larger; got {self.width} x {self.height}")
+
+
+def parse_options(
+    route: str, frames: int, seed: int, width: int, height: int, hazards: str
+) -> SimulationOptions:
+    """Options from a command line; ``hazards`` is a comma list.
+
+    Raises:
+        SequenceError: if one of them means nothing.
+    """
+    names = tuple(name.strip() for name in hazards.split(",") if name.strip())
+    return SimulationOptions(cast(Route, route), frames, seed, width, height, cast(tuple[Hazard, ...], names))
 
 
 @dataclass(frozen=True)
@@ -60,22 +93,46 @@ class SimulatedFrame:
     T_world_camera: FloatArray
 
 
+@dataclass(frozen=True)
+class _Surface:
+    """A mesh and its ray casting scene."""
+
+    mesh: Mesh
+    scene: Any
+
+
 class SimulatedStreet:
-    """A street world and a drive through it; frames are rendered when asked for."""
+    """A street world and a drive through it; frames are rendered when asked for.
+
+    Attributes:
+        options: what is simulated.
+        K: camera matrix, ``(3, 3)``.
+        camera_height_m: of the camera above the road.
+        T_camera_lidar: ``(4, 4)``.
+        T_world_camera: every pose in the frame of the first camera, ``(N, 4, 4)``.
+    """
 
     def __init__(self, options: SimulationOptions) -> None:
-        _check(options)
+        """Plan the drive.
+
+        Raises:
+            SequenceError: if there are too few frames for the route.
+        """
         self.options = options
         self.K: FloatArray = kitti_intrinsics(options.width, options.height)
-        drive = plan_drive(
-            options.route, options.frames, options.seed, STILL_FRAMES if "stop" in options.hazards else 0
+        still = effects.STILL_FRAMES if "stop" in options.hazards else 0
+        self._drive = plan_drive(options.route, options.frames, options.seed, still)
+        self.camera_height_m = self._drive.camera_height_m
+        self.T_camera_lidar: FloatArray = T_CAMERA_LIDAR.copy()
+        self.T_world_camera: FloatArray = (
+            se3.invert(self._drive.T_street_camera[0]) @ self._drive.T_street_camera
         )
-        self.camera_height_m = drive.camera_height_m
-        self._drive = drive
-        self.T_world_camera: FloatArray = se3.invert(drive.T_street_camera[0]) @ drive.T_street_camera
         self.T_world_camera[0] = np.eye(4)
         self._weather = draw_weather(options.seed)
+        self._exposure = effects.exposure_curve(options.seed, options.frames)
+        self._traffic = Traffic(self._drive, options.seed) if "moving-cars" in options.hazards else None
         self._rays = pixel_rays(self.K, options.width, options.height)
+        self._stretch = np.linalg.norm(self._rays, axis=1)  # ray length per depth
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -83,78 +140,213 @@ class SimulatedStreet:
 
     def render(self, index: int) -> SimulatedFrame:
         """Image and depth of one frame; the same index gives the same bytes."""
+        self._require(index)
+        surfaces = self._surfaces(index)
+        if "blur" in self.options.hazards:
+            shutter = effects.shutter_poses(self._drive.T_street_camera, index)
+            rgb = np.mean([self._view(surfaces, T_street_camera)[0] for T_street_camera in shutter], axis=0)
+            _, depth = self._view(surfaces, self._drive.T_street_camera[index])
+        else:
+            rgb, depth = self._view(surfaces, self._drive.T_street_camera[index])
+        image = self._develop(rgb, index)
+        return SimulatedFrame(index, index / FPS, image, depth, self.T_world_camera[index].copy())
+
+    def scan(self, index: int) -> Float32Array:
+        """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
+        self._require(index)
+        rng = np.random.default_rng([self.options.seed, 40, index])
+        directions = beam_directions(rng)
+        T_street_lidar = self._drive.T_street_camera[index] @ self.T_camera_lidar
+        rays = _rays(T_street_lidar, directions)
+        ranges = np.full(len(rays), np.inf, dtype=np.float32)
+        reflectance = np.zeros(len(rays), dtype=np.float32)
+        for surface in self._surfaces(index):
+            answer = _cast(surface.scene, rays)
+            nearer = np.flatnonzero(answer["t_hit"] < ranges)
+            ranges[nearer] = answer["t_hit"][nearer]
+            instance = surface.mesh.instance[answer["primitive_ids"][nearer]]
+            reflectance[nearer] = surface.mesh.colours[instance, 0].mean(axis=1)
+        return measured(directions, ranges, reflectance, rng)
+
+    def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
+        """Distance in metres from points ``(M, 3)`` to the nearest still surface, ``(M,)``."""
+        points = se3.apply(self._drive.T_street_camera[0], np.asarray(points_world, dtype=np.float64))
+        tensor = import_open3d().core.Tensor(points.astype(np.float32))
+        return np.asarray(self._still.scene.compute_distance(tensor).numpy(), dtype=np.float64)
+
+    @functools.cached_property
+    def _still(self) -> _Surface:
+        return _surface(build_town(self._drive.plan, self._drive.bend, self.options.seed))
+
+    def _surfaces(self, index: int) -> list[_Surface]:
+        """What can be seen at a frame: the town, and the cars that drive."""
+        cars = self._traffic.placed(index) if self._traffic else None
+        return [self._still] if cars is None else [self._still, _surface(cars)]
+
+    def _view(
+        self, surfaces: list[_Surface], T_street_camera: FloatArray
+    ) -> tuple[Float32Array, Float32Array]:
+        """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose."""
+        rays = _rays(T_street_camera, self._rays)  # z = 1, so that t is z-depth
+        answers = [_cast(surface.scene, rays) for surface in surfaces]
+        depths = np.stack([answer["t_hit"] for answer in answers])
+        nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
+        depth[depth >= FARTHEST_M] = 0.0
+        rgb = np.empty((len(rays), 3), dtype=np.float32)
+        unseen = np.flatnonzero(depth == 0.0)
+        rgb[unseen] = sky(self._weather, rays[unseen, 3:] / self._stretch[unseen, None])
+        for number, (surface, answer) in enumerate(zip(surfaces, answers)):
+            seen = np.flatnonzero((nearest == number) & (depth > 0.0))
+            hits = Hits(
+                triangle=answer["primitive_ids"][seen].astype(np.int64),
+                barycentric=answer["primitive_uvs"][seen],
+                rays=rays[seen, 3:] / self._stretch[seen, None],
+                depth=depth[seen],
+                distance=depth[seen] * self._stretch[seen],
+            )
+            normals = facing_normals(surface.mesh, hits)
+            lit = self._sunlit(surfaces, rays[seen], hits, normals, seen)
+            rgb[seen] = paint(surface.mesh, hits, normals, lit, self._weather, float(self.K[0, 0]))
+        shape = self.options.height, self.options.width
+        return rgb.reshape(*shape, 3), depth.reshape(shape)
+
+    def _sunlit(
+        self,
+        surfaces: list[_Surface],
+        rays: Float32Array,
+        hits: Hits,
+        normals: Float32Array,
+        pixels: NDArray[np.int64],
+    ) -> Float32Array:
+        """How much of the sun reaches each hit, softened over the neighbouring pixels, ``(N,)``."""
+        to_sun = np.empty_like(rays)
+        to_sun[:, :3] = rays[:, :3] + rays[:, 3:] * hits.depth[:, None] + 0.03 * normals
+        to_sun[:, 3:] = self._weather.sun
+        tensor = import_open3d().core.Tensor(to_sun)
+        shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
+        lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
+        lit[pixels] = 1.0 - shadow
+        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
+        return np.asarray(soft.ravel()[pixels], dtype=np.float32)
+
+    def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
+        """Rain, the lens's slight softness, exposure, and 8 bits."""
+        rgb = rgb * np.float32(self._weather.exposure)
+        if "rain" in self.options.hazards:
+            rgb = effects.rained_on(rgb, self.options.seed, index)
+        rgb = cv2.GaussianBlur(rgb, (3, 3), 0.55)
+        if "exposure" in self.options.hazards:
+            rgb = effects.exposed(rgb, float(self._exposure[index, 0]), float(self._exposure[index, 1]))
+        return np.asarray(np.clip(rgb * np.float32(255.0) + np.float32(0.5), 0.0, 255.0)).astype(np.uint8)
+
+    def _require(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise IndexError(f"the simulated drive has frames 0 to {len(self) - 1}; asked for {index}")
-        rgb, depth = self._cast(self._drive.T_street_camera[index])
-        image = self._develop(rgb)
-        return SimulatedFrame(index, index / FPS, image, depth, self.T_world_camera[index])
-
-    @functools.cached_property
-    def _mesh(self) -> Mesh:
-        return build_town(self._drive.plan, self._drive.bend, self.options.seed)
-
-    @functools.cached_property
-    def _scene(self) -> Any:
-        open3d = import_open3d()
-        scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(
-            open3d.core.Tensor(self._mesh.vertices), open3d.core.Tensor(self._mesh.triangles)
-        )
-        return scene
-
-    def _cast(self, T_street_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Linear colour ``(H, W, 3)`` and z-depth ``(H, W)`` from a pose."""
-        height, width = self.options.height, self.options.width
-        directions = self._rays @ T_street_camera[:3, :3].T.astype(np.float32)
-        rays = np.empty((len(directions), 6), dtype=np.float32)
-        rays[:, :3], rays[:, 3:] = T_street_camera[:3, 3], directions
-        answer = self._scene.cast_rays(import_open3d().core.Tensor(rays))
-        depth = answer["t_hit"].numpy()  # rays have z = 1
-        seen = np.flatnonzero(depth < FARTHEST)
-        unseen = np.flatnonzero(~(depth < FARTHEST))
-        length = np.linalg.norm(self._rays, axis=1)
-        unit = directions / length[:, None]
-        hits = Hits(
-            triangle=answer["primitive_ids"].numpy()[seen].astype(np.int64),
-            barycentric=answer["primitive_uvs"].numpy()[seen],
-            rays=unit[seen],
-            depth=depth[seen],
-            distance=depth[seen] * length[seen],
-        )
-        normals = facing_normals(self._mesh, hits)
-        points = rays[seen, :3] + directions[seen] * hits.depth[:, None]
-        lit = self._sunlit(points, normals, seen)
-        rgb = np.empty((len(directions), 3), dtype=np.float32)
-        rgb[seen] = paint(self._mesh, hits, normals, lit, self._weather, float(self.K[0, 0]))
-        rgb[unseen] = sky(self._weather, unit[unseen])
-        depth[unseen] = 0.0
-        return rgb.reshape(height, width, 3), depth.reshape(height, width)
-
-    def _sunlit(self, points: Float32Array, normals: Float32Array, seen: NDArray[np.int64]) -> Float32Array:
-        """Whether the sun reaches each point, softened over the neighbouring pixels, ``(N,)``."""
-        rays = np.empty((len(points), 6), dtype=np.float32)
-        rays[:, :3] = points + 0.03 * normals
-        rays[:, 3:] = self._weather.sun
-        shadow = self._scene.test_occlusions(import_open3d().core.Tensor(rays)).numpy()
-        lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
-        lit[seen] = 1.0 - shadow
-        soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
-        return np.asarray(soft.ravel()[seen], dtype=np.float32)
-
-    def _develop(self, rgb: Float32Array) -> NDArray[np.uint8]:
-        """Exposure, the lens's slight softness, and 8 bits."""
-        soft = cv2.GaussianBlur(rgb * np.float32(255.0 * self._weather.exposure), (3, 3), 0.55)
-        return np.asarray(np.clip(soft + 0.5, 0.0, 255.0)).astype(np.uint8)
 
 
-def _check(options: SimulationOptions) -> None:
-    """Refuse options that mean nothing."""
-    if options.route not in get_args(Route):
-        raise SequenceError(f"route must be one of {', '.join(get_args(Route))}; got {options.route!r}")
-    for hazard in options.hazards:
-        if hazard not in get_args(Hazard):
-            raise SequenceError(f"hazards are {', '.join(get_args(Hazard))}; got {hazard!r}")
-    if options.seed < 0:
-        raise SequenceError(f"seed must be 0 or more; got {options.seed}")
-    if min(options.width, options.height) < 8:
-        raise SequenceError(f"images must be at least 8 x 8; got {options.width} x {options.height}")
+def write_kitti_root(
+    street: SimulatedStreet,
+    output: Path,
+    depth: bool = False,
+    lidar: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Write a drive as the KITTI odometry root ``output`` with the one sequence ``sim``.
+
+    Args:
+        street: the drive.
+        output: a folder that does not exist yet or is empty.
+        depth: whether to write depth maps (16 bit, metres x 256, 0 where nothing was hit).
+        lidar: whether to write scans.
+        progress: told the number of frames written so far.
+
+    Raises:
+        SequenceError: if ``output`` holds something already, or cannot be written.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise SequenceError(f"{output} exists and is not empty; remove it or choose another output")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
+        partial.chmod(0o755)
+        try:
+            _write_frames(street, partial / "sequences" / "sim", depth, lidar, progress)
+            _write_records(street, partial)
+            partial.replace(output)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise SequenceError(f"cannot write the simulated sequence to {output}: {error}") from error
+
+
+def _write_frames(
+    street: SimulatedStreet,
+    folder: Path,
+    depth: bool,
+    lidar: bool,
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Images, and depth maps and scans if wanted."""
+    wanted = {"image_2": True, "depth_2": depth, "velodyne": lidar}
+    for name in (name for name, is_wanted in wanted.items() if is_wanted):
+        (folder / name).mkdir(parents=True)
+    for index in range(len(street)):
+        frame = street.render(index)
+        _write_png(folder / "image_2" / f"{index:06d}.png", frame.image[..., ::-1])
+        if depth:
+            encoded = np.clip(np.rint(frame.depth * 256.0), 0.0, 65535.0).astype(np.uint16)
+            _write_png(folder / "depth_2" / f"{index:06d}.png", encoded)
+        if lidar:
+            street.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
+        if progress:
+            progress(index + 1)
+
+
+def _write_png(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(f"cannot write {path}")
+
+
+def _write_records(street: SimulatedStreet, root: Path) -> None:
+    """Calibration, times, poses, the camera and what was simulated."""
+    sequence, K, options = root / "sequences" / "sim", street.K, street.options
+    projection = _row(np.column_stack([K, np.zeros(3)]))
+    rows = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_row(street.T_camera_lidar[:3])}"]
+    _write_lines(sequence / "calib.txt", rows)
+    _write_lines(sequence / "times.txt", [f"{index / FPS:.6e}" for index in range(len(street))])
+    (root / "poses").mkdir()
+    _write_lines(root / "poses" / "sim.txt", [_row(T_world_camera[:3]) for T_world_camera in street.T_world_camera])
+    camera = {"width": options.width, "height": options.height, "fx": K[0, 0], "fy": K[1, 1]}
+    camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": FPS, "camera_height_m": street.camera_height_m}
+    _write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
+    record = json.dumps({**asdict(options), "version": VERSION}, indent=2)
+    _write_lines(root / "simulation.json", [record])
+
+
+def _row(matrix: FloatArray) -> str:
+    return " ".join(f"{value:.9e}" for value in matrix.ravel())
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _surface(mesh: Mesh) -> _Surface:
+    open3d = import_open3d()
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(open3d.core.Tensor(mesh.vertices), open3d.core.Tensor(mesh.triangles))
+    return _Surface(mesh, scene)
+
+
+def _rays(T_street_sensor: FloatArray, directions: Float32Array) -> Float32Array:
+    """Origin and direction in the street frame of directions ``(N, 3)`` in a sensor's, ``(N, 6)``."""
+    rays = np.empty((len(directions), 6), dtype=np.float32)
+    rays[:, :3] = T_street_sensor[:3, 3]
+    rays[:, 3:] = directions @ T_street_sensor[:3, :3].T.astype(np.float32)
+    return rays
+
+
+def _cast(scene: Any, rays: Float32Array) -> dict[str, NDArray[Any]]:
+    """Where rays ``(N, 6)`` meet a scene: ``t_hit`` (infinite if nowhere), triangle and barycentric weights."""
+    answer = scene.cast_rays(import_open3d().core.Tensor(rays))
+    return {name: answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}

@@ -86,6 +86,11 @@ class Soup:
         self._parameters: list[FloatArray] = []
         self._count = 0
 
+    @property
+    def instances(self) -> int:
+        """How many things are registered."""
+        return len(self._materials)
+
     def instance(
         self,
         material: Material,
@@ -197,7 +202,7 @@ def town_bend(rng: np.random.Generator) -> Bend:
 
 
 def road_bend(rng: np.random.Generator, start: float, end: float) -> Bend:
-    """A road whose heading wanders within about 35 degrees, radius of curvature at least about 100 m."""
+    """A road whose heading wanders within about 35 degrees, radius of curvature at least about 80 m."""
     town = town_bend(rng)
     s = np.arange(np.floor(start), np.ceil(end) + 2.0)
     heading = np.zeros_like(s)

@@ -47,7 +47,7 @@ class FixedPose(nn.Module):
         return self.vectors.expand(len(target), -1, -1)
 
     def forward_with_masks(self, target: Tensor, sources: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        height, width = (math.ceil((n - self.shrink)) for n in target.shape[-2:])
+        height, width = (math.ceil(n - self.shrink) for n in target.shape[-2:])
         masks = [
             target.new_full((len(target), len(sources), math.ceil(height / 2**s), math.ceil(width / 2**s)), self.mask)
             for s in range(4)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from slam.sequences.simulated import SimulationOptions
 
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.simulated import SimulationOptions
 from slam.sequences.simulated_sequence import SimulatedSequence
 
 

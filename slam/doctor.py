@@ -1,0 +1,83 @@
+"""What is installed, what is found, what is missing and what to do about it."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from erfsfm.errors import ErfsfmError
+from erfsfm.inference import DepthPosePredictor
+from slam.errors import SlamError
+from slam.foreign import import_open3d
+from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_names
+
+PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
+DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
+WEIGHTS = ("default", "sim")
+
+
+def examine(dataset: Path | None) -> list[str]:
+    """One line a finding, each beginning with ``ok`` or ``missing``.
+
+    Args:
+        dataset: a data set to look at; else ``$KITTI_ODOMETRY`` where it is set.
+    """
+    lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
+    lines += [_package(name) for name in PACKAGES]
+    lines.append(_open3d())
+    lines += [_weights(name) for name in WEIGHTS]
+    root = dataset or (Path(os.environ[KITTI_VARIABLE]) if KITTI_VARIABLE in os.environ else None)
+    if root is None:
+        lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset; the simulated street needs none")
+    else:
+        lines += _dataset(root)
+    return lines
+
+
+def _package(name: str) -> str:
+    distribution = DISTRIBUTIONS.get(name, name)
+    try:
+        importlib.import_module(name)
+        return f"ok       {distribution} {version(distribution)}"
+    except (ImportError, OSError, PackageNotFoundError) as error:
+        return f"missing  {distribution}: {error}; run make setup, or pip install {distribution}"
+
+
+def _open3d() -> str:
+    try:
+        return f"ok       open3d {import_open3d().__version__}"
+    except SlamError as error:
+        return f"missing  {error}"
+
+
+def _weights(name: str) -> str:
+    try:
+        record = DepthPosePredictor.from_weights(name).record
+        return f"ok       weights {name}: {record.network.depth} and {record.network.pose}, {record.licence}"
+    except ErfsfmError as error:
+        return f"missing  weights {name}: {error}"
+
+
+def _dataset(root: Path) -> list[str]:
+    try:
+        names = sequence_names(root)
+    except SlamError as error:
+        return [f"missing  {error}"]
+    if not names:
+        return [f"missing  {root} is of no kind that 'erfsfm-slam run --help' names"]
+    return [_sequence(root, name) for name in names]
+
+
+def _sequence(root: Path, name: str) -> str:
+    try:
+        sequence = open_sequence(root, name)
+    except SlamError as error:
+        return f"missing  sequence {name}: {error}"
+    truth = "true poses" if sequence.reference is not None else "no true poses"
+    height = f"camera {sequence.camera_height_m} m high" if sequence.camera_height_m else "camera height unknown"
+    scans = sum(sequence.scan_path(k) is not None for k in range(len(sequence)))
+    size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
+    return f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans"

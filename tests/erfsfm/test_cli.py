@@ -1,0 +1,250 @@
+"""The command line: help without weight, errors in one line, results on stdout."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+from erfsfm.cli import main
+from erfsfm.config import NetworkConfig
+from erfsfm.networks.presets import PRESETS
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Exit code, stdout and stderr of ``erfsfm ARGUMENTS``, in this process."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+        monkeypatch.setattr(sys, "argv", ["erfsfm", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        out, err = capsys.readouterr()
+        return int(stopped.value.code or 0), out, err
+
+    return call
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64)
+    record = ModelRecord(network=config, trained_on=["simulated/17"])
+    save_model(tmp_path / "weights", Model(record, *build_networks(config)))
+    return tmp_path / "weights"
+
+
+HELP = """
+import sys, typer
+from typer.testing import CliRunner
+from erfsfm.cli import app
+
+def walk(command, path):
+    result = CliRunner().invoke(app, [*path, "--help"])
+    assert result.exit_code == 0, (path, result.output)
+    children = getattr(command, "commands", {})
+    assert children or "Example:" in result.output, path
+    print(" ".join(path))
+    for name, child in children.items():
+        walk(child, [*path, name])
+
+walk(typer.main.get_command(app), [])
+heavy = {"torch", "lightning", "cv2", "gtsam", "open3d", "matplotlib"} & set(sys.modules)
+assert not heavy, heavy
+"""
+
+
+def test_help_of_every_verb_is_light() -> None:
+    finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert {"train", "predict", "networks", "evaluate depth", "evaluate pose"} <= set(finished.stdout.splitlines())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fly"],
+        ["train"],
+        ["train", "--config", "tiny", "--stepz", "3"],
+        ["train", "--config", "tiny", "--seed", "x"],
+        ["train", "--config", "tiny", "--device", "tpu"],
+        ["predict"],
+        ["networks", "--fidelity", "exact"],
+        ["evaluate", "depth"],
+        ["evaluate", "speed"],
+    ],
+)
+def test_usage(run: Run, arguments: list[str]) -> None:
+    code, out, err = run(*arguments)
+    assert code == 2
+    assert out == ""
+    assert err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train", "--config", "nothing"], "no configuration 'nothing'"),
+        (["train", "--config", "tiny"], "--dataset"),
+        (["train", "--config", "tiny", "--dataset", "nowhere"], "does not exist"),
+        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'steps'"),
+        (["train", "--config", "tiny", "--seed", "-1"], "training.seed"),
+        (["predict", "nowhere.png"], "no weights 'default'"),
+        (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),
+        (["predict", "{empty}", "--weights", "{weights}"], "no png or jpg"),
+        (["networks", "--width", "0"], "width"),
+        (["networks", "--sources", "0"], "sources"),
+        (["evaluate", "depth", "--dataset", "nowhere", "--weights", "{weights}"], "does not exist"),
+        (["evaluate", "pose", "--dataset", "{root}", "--sequence", "44", "--weights", "{weights}"], "found 00"),
+        (["evaluate", "pose", "--dataset", "{root}", "--sequence", "00", "--weights", "bad"], "no weights 'bad'"),
+        (["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}"], "no true depth"),
+    ],
+)
+def test_errors_are_one_line(
+    run: Run,
+    tmp_path: Path,
+    weights: Path,
+    write_root: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    words: str,
+) -> None:
+    import erfsfm.checkpoint
+
+    monkeypatch.setattr(erfsfm.checkpoint, "SHIPPED", tmp_path / "none")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    write_root(tmp_path / "root", frames=5)
+    places = {"weights": weights, "empty": tmp_path / "empty", "root": tmp_path / "root"}
+    code, out, err = run(*(argument.format(**places) for argument in arguments))
+    assert code == 1
+    assert out == ""
+    assert err.startswith("erfsfm: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+def test_an_unwritable_output_is_one_line(run: Run, tmp_path: Path, weights: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((20, 30, 3), np.uint8))
+    (tmp_path / "file").write_text("")
+    code, _, err = run("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "file")
+    assert code == 1
+    assert err.count("\n") == 1
+
+
+def test_networks_json(run: Run) -> None:
+    code, out, err = run("networks", "--json", "--fidelity", "paper")
+    assert (code, err) == (0, "")
+    rows: list[dict[str, Any]] = json.loads(out)
+    assert [row["name"] for row in rows] == list(PRESETS)
+    assert all({"name", "kind", "parameters", "multiply_adds", "receptive_field"} <= row.keys() for row in rows)
+    by_name = {row["name"]: row for row in rows}
+    assert by_name["depthnet"]["parameters"] == 31_596_900
+    assert by_name["erf-posenet-dfc"]["parameters"] == 1_776_479
+    assert by_name["depthnet"]["multiply_adds"] == pytest.approx(3.67e9, rel=0.01)
+    assert (by_name["posenet"]["receptive_field"], by_name["depthnet"]["receptive_field"]) == (263, 787)
+    impossible = [row["name"] for row in rows if row["multiply_adds"] is None]
+    assert impossible == ["erf-depthnet-dilated"]
+    reasons = [value for key, value in by_name["erf-depthnet-dilated"].items() if "reason" in key]
+    assert len(reasons) == 1
+    assert "paper fidelity" in reasons[0]
+
+
+def test_networks_table(run: Run) -> None:
+    code, out, _ = run("networks", "--width", "0.25", "--sources", "2")
+    assert code == 0
+    assert all(name in out for name in PRESETS)
+    assert "263 px" in out
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_predict(run: Run, tmp_path: Path, weights: Path, folder: bool) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("a.png", "b.jpg"):
+        cv2.imwrite(str(images / name), np.full((20, 30, 3), 99, np.uint8))
+    given = images if folder else images / "a.png"
+    code, out, _ = run("predict", given, "--weights", weights, "--output", tmp_path / "depth")
+    assert code == 0
+    assert f"depth of {2 if folder else 1} images" in out
+    wanted = ["a.npy", "a.png", "b.npy", "b.png"] if folder else ["a.npy", "a.png"]
+    assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == wanted
+    assert np.load(tmp_path / "depth" / "a.npy").shape == (20, 30)
+
+
+def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 30, 3), 99, np.uint8))
+    before = (tmp_path / "a.png").read_bytes()
+    code, _, err = run("predict", tmp_path, "--weights", weights, "--output", tmp_path)
+    assert code == 1
+    assert "overwritten" in err
+    assert (tmp_path / "a.png").read_bytes() == before
+
+
+def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+    root = write_root(tmp_path / "root", frames=6, depth=True, seed=600)
+    code, out, err = run("evaluate", "depth", "--weights", weights, "--dataset", root, "--json")
+    assert (code, err) == (0, "")
+    networks, median = json.loads(out)
+    assert (networks["method"], median["method"]) == ("networks", "median depth map")
+    assert networks["images"] == 2
+    assert networks["leak"] is False
+    assert median["abs_rel"] < 0.02
+    code, out, _ = run("evaluate", "depth", "--weights", weights, "--dataset", root)
+    assert code == 0
+    assert out.count("abs_rel") == 2
+
+
+def test_evaluate_refuses_a_leak(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+    root = write_root(tmp_path / "root", frames=6, depth=True, seed=17)
+    for verb in (("depth",), ("pose", "--sequence", "00")):
+        arguments = ("evaluate", *verb, "--weights", weights, "--dataset", root, "--json")
+        code, out, err = run(*arguments)
+        assert (code, out) == (1, "")
+        assert "simulated/17[0:6]" in err
+        assert "--allow-leak" in err
+        code, out, _ = run(*arguments, "--allow-leak")
+        assert code == 0
+        assert all(row["leak"] is True for row in json.loads(out))
+
+
+def test_evaluate_pose(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+    root = write_root(tmp_path / "root", frames=7, step=(0.0, 0.0, 0.1))
+    code, out, _ = run("evaluate", "pose", "--weights", weights, "--dataset", root, "--sequence", "00", "--json")
+    assert code == 0
+    networks, straight = json.loads(out)
+    assert networks["snippets"] == straight["snippets"] == 3
+    assert straight["ate_mean"] == pytest.approx(0, abs=1e-9), "this drive is straight and steady"
+    assert straight["re_mean"] == pytest.approx(0, abs=1e-9)
+    assert networks["re_mean"] >= 0
+
+
+def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    root = write_root(tmp_path / "root", frames=6, seed=3)
+    small = ["network.depth_width=0.0625", "network.pose_width=0.125", "network.height=32", "network.width=64"]
+    steps = ["training.steps=2", "training.batch=2", "training.checkpoint_every=1", "data.workers=0"]
+    arguments = ["train", "--config", "tiny", "--dataset", root, "--output", tmp_path / "run", "--device", "cpu"]
+    for change in (*small, *steps):
+        arguments += ["--set", change]
+    code, out, err = run(*arguments, "--seed", "5")
+    assert (code, err) == (0, "")
+    assert f"--weights {tmp_path / 'run'}" in out
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "--resume" in err
+    code, _, _ = run(*arguments, "--set", "training.steps=3", "--resume")
+    assert code == 0
+    record = (tmp_path / "run" / "model.yaml").read_text()
+    assert "step: 3" in record
+    assert "command: erfsfm train --config tiny" in record.replace("\n  ", " ")

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -106,7 +107,7 @@ def networks(
     """
     from erfsfm.networks.presets import describe
 
-    summaries: list[dict[str, Any]] = [s.as_dict() for s in describe(fidelity, width, sources)]
+    summaries = [asdict(summary) for summary in describe(fidelity, width, sources)]
     if as_json:
         typer.echo(json.dumps(summaries, indent=2))
         return

@@ -5,6 +5,7 @@ Conventions: ``docs/conventions.md``. This is the only file where quaternions ap
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 from collections.abc import Iterable, Iterator
@@ -95,8 +96,9 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
         if backwards.size:
             raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: time stamps must increase")
     R = T_world_camera[:, :3, :3]
-    deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-    wrong = np.flatnonzero((deviation >= _ROTATION_TOLERANCE) | (np.linalg.det(R) <= 0))
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers end as NaN, which fits nothing
+        deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero(~((deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)))
     if wrong.size:
         raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the 3x3 part is not a rotation matrix")
     T_world_camera[:, :3, :3] = se3.nearest_rotation(R)
@@ -269,4 +271,5 @@ def _write_atomically(path: Path, rows: Iterable[str]) -> None:
     except OSError as error:
         raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -32,7 +32,8 @@ class Recording:
     """Frames of one drive: ``images`` are files, or one video file whose frames are decoded together.
 
     ``camera`` belongs to the images as stored. ``depth`` and ``poses_file`` are truth, where it is known: poses
-    of camera 0, in whose frame this camera's origin is seen through ``t_camera_cam0``.
+    of camera 0, which this camera sees at ``t_camera_cam0``. ``sequence`` is the name of its folder in an odometry
+    root.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Recording:
     poses_file: Path | None = None
     t_camera_cam0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: int = 0
+    sequence: str = ""
 
     def __len__(self) -> int:
         return self.video_frames or len(self.images)
@@ -181,6 +183,7 @@ def _odometry(base: Path, sequence: Path) -> list[Recording]:
                 depth=depth if len(depth) == len(images) else None,
                 poses_file=poses if poses.is_file() else None,
                 t_camera_cam0=t_camera_cam0,
+                sequence=sequence.name,
             )
         )
     return recordings

@@ -17,6 +17,8 @@ Fidelity = Literal["default", "paper"]
 
 # The reference code sizes its error array by images instead of snippets: length - 1 rows stay zero.
 _PAPER_ZERO_ROWS = 4
+# Predicted motion below this share of the true one is rounding: fitting a scale to it would reward noise.
+_STILL_SHARE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,8 @@ def _position_errors(predicted: FloatArray, truth: FloatArray) -> FloatArray:
     """ATE ``(S,)`` of positions ``(S, K, 3)``."""
     energy = (predicted**2).sum(axis=(1, 2))
     agreement = (truth * predicted).sum(axis=(1, 2))
-    scale = np.divide(agreement, energy, out=np.zeros_like(energy), where=energy > 0)
+    moves = energy > _STILL_SHARE**2 * (truth**2).sum(axis=(1, 2))
+    scale = np.divide(agreement, energy, out=np.zeros_like(energy), where=moves)
     residual = truth - scale[:, None, None] * predicted
     ate: FloatArray = np.sqrt((residual**2).sum(axis=(1, 2))) / predicted.shape[1]
     return ate

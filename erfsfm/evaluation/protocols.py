@@ -81,12 +81,13 @@ def pose_protocol(
         DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
             not allowed.
     """
-    found = {r.name.split("/")[-1]: r for r in reversed(discover(root))}
+    recordings = [r for r in reversed(discover(root)) if r.sequence]
+    found = {r.name: r for r in recordings} | {r.sequence: r for r in recordings}
     rows = []
     for name in sequences:
         recording = found.get(name)
         if recording is None:
-            raise DataError(f"no sequence {name} in {root}: found {', '.join(sorted(found))}")
+            raise DataError(f"no sequence {name} in {root}: found {', '.join(sorted(found)) or 'none'}")
         T_world_camera = recording.true_poses(fidelity)
         if T_world_camera is None:
             raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")

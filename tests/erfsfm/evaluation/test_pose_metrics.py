@@ -79,6 +79,8 @@ def test_paper_fidelity_averages_over_four_zero_rows() -> None:
 def test_no_predicted_motion_is_scored_as_standing_still() -> None:
     errors = snippet_errors(straight([0] * 5)[None], straight([0, 3, 0, 4, 0])[None])
     assert errors == SnippetErrors(1.0, 0.0, 0.0, 0.0, 1)
+    rounding = snippet_errors(straight([0, 3e-16, 0, 4e-16, 0])[None], straight([0, 3, 0, 4, 0])[None])
+    assert rounding == errors
 
 
 @pytest.mark.parametrize("shapes", [((0, 5, 4, 4), (0, 5, 4, 4)), ((2, 5, 4, 4), (3, 5, 4, 4)), ((5, 4, 4),) * 2])

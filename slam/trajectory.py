@@ -5,9 +5,7 @@ Conventions: ``docs/conventions.md``. This is the only file where quaternions ap
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from slam import se3
 from slam.errors import TrajectoryError
+from slam.files import write_atomically
 from slam.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -112,7 +111,7 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
         TrajectoryError: if the file cannot be written.
     """
     rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
-    _write_atomically(Path(path), (_row(row) for row in rows))
+    _write(Path(path), (_row(row) for row in rows))
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -125,7 +124,7 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
     stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
     rows = (f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses))
-    _write_atomically(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
+    _write(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
 
 
 def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
@@ -261,15 +260,6 @@ def _row(values: Iterable[float]) -> str:
     return " ".join(f"{value:.9e}" for value in values)
 
 
-def _write_atomically(path: Path, rows: Iterable[str]) -> None:
-    """Write beside the target and move into place, so that no reader ever meets half a file."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text("".join(f"{row}\n" for row in rows), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise TrajectoryError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+def _write(path: Path, rows: Iterable[str]) -> None:
+    text = "".join(f"{row}\n" for row in rows)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), TrajectoryError)

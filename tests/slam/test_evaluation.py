@@ -27,7 +27,7 @@ SHAPE = {
 
 
 def trajectory(T_world_camera: FloatArray) -> Trajectory:
-    return Trajectory(0.1 * np.arange(len(T_world_camera)), T_world_camera)
+    return Trajectory(0.1 * np.arange(len(T_world_camera), dtype=np.float64), T_world_camera)
 
 
 def drive(frames: int = 400, step_m: float = 1.0) -> FloatArray:
@@ -160,7 +160,7 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
     errors = ate(metrics)
     assert errors["scale"] is None
     assert errors["7dof"] is None
-    assert errors["first"] > 1.0
+    assert (errors["first"] or 0.0) > 1.0
     assert metrics["align"]["first"]["rpe_trans_m"] == pytest.approx(1.0)
 
 

@@ -18,7 +18,7 @@ def metrics(frames: int, reference: bool = True) -> dict[str, Any]:
     T_world_camera[:, 0, 3] = 5 * np.sin(0.1 * np.arange(frames))
     truth = T_world_camera.copy()
     truth[:, 1, 3] = 0.25 * (-1.0) ** np.arange(frames)
-    stamps = np.arange(float(frames))
+    stamps = np.arange(frames, dtype=np.float64)
     return trajectory_metrics(Trajectory(stamps, T_world_camera), Trajectory(stamps, truth) if reference else None)
 
 

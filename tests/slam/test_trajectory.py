@@ -25,7 +25,7 @@ TUM = "0.1 1.5 2.5 3.5 0 0 0 1"
 def wander(count: int, period: float = 0.1, seed: int = 0) -> Trajectory:
     rng = np.random.default_rng(seed)
     T_world_camera = se3.make(Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=100, size=(count, 3)))
-    return Trajectory(period * np.arange(count), T_world_camera)
+    return Trajectory(period * np.arange(count, dtype=np.float64), T_world_camera)
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -37,7 +37,7 @@ def written(tmp_path: Path, text: str) -> Path:
 def test_length_and_rebasing() -> None:
     places = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 4.0], [1.0, 5.0, 4.0]])
     turn = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]).as_matrix()
-    trajectory = Trajectory(np.arange(3.0), se3.make(np.tile(turn, (3, 1, 1)), places))
+    trajectory = Trajectory(np.array([0.0, 1.0, 2.0]), se3.make(np.tile(turn, (3, 1, 1)), places))
     assert trajectory.length_m == pytest.approx(7.0)
     rebased = trajectory.rebased()
     np.testing.assert_allclose(rebased.T_world_camera[0], np.eye(4), atol=1e-15)
@@ -65,7 +65,7 @@ def test_kitti_round_trip(tmp_path: Path, format: str) -> None:
 @pytest.mark.parametrize("format", ["auto", "tum"])
 def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str) -> None:
     trajectory = wander(7)
-    stamps = 1311868164.3631 + 0.1037 * np.arange(7)
+    stamps = 1311868164.3631 + 0.1037 * np.arange(7, dtype=np.float64)
     write_tum(tmp_path / "poses.txt", Trajectory(stamps, trajectory.T_world_camera))
     back = read_trajectory(tmp_path / "poses.txt", format)
     np.testing.assert_allclose(back.T_world_camera, trajectory.T_world_camera, rtol=1e-8, atol=1e-8)
@@ -159,7 +159,7 @@ def test_writing_is_atomic_and_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_untimed_trajectories_match_row_by_row() -> None:
     timed = wander(4)
-    untimed = Trajectory(np.arange(4.0), timed.T_world_camera, timed=False)
+    untimed = Trajectory(10 * timed.stamps, timed.T_world_camera, timed=False)
     assert associate(untimed, timed) == (untimed, timed)
     with pytest.raises(TrajectoryError, match=r"4 poses and the reference 5.*TUM files") as error:
         associate(untimed, wander(5))

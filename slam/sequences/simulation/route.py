@@ -119,7 +119,7 @@ def _layout(route: Route, moving: int, seed: int, stops: bool) -> tuple[StreetPl
 
 def _lane_offset(plan: StreetPlan, seed: int) -> float:
     """How far right of the middle of the street the car drives, metres."""
-    return float(np.random.default_rng([seed, 4]).uniform(0.36, 0.42)) * plan.half_width
+    return float(np.random.default_rng([seed, 4]).uniform(0.33, 0.38)) * plan.half_width
 
 
 def _loop_lane(plan: StreetPlan, seed: int) -> FloatArray:
@@ -155,7 +155,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
     drift *= 0.13 / max(float(drift.std()), 1e-9)
-    path += np.clip(drift, -0.35, 0.35)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     return _resample(path)
 
 

@@ -109,7 +109,7 @@ def town_plan(rng: np.random.Generator, drive: list[Node], spacing: float, side_
     """
     span = np.max(drive, axis=0)
     lines = [_lines(rng, int(count), spacing) for count in span]
-    half_width = float(rng.uniform(4.2, 5.0))
+    half_width = float(rng.uniform(4.6, 5.2))
     shifted = [(i + 1, j + 1) for i, j in drive]
     along_x = rng.random((len(lines[0]) - 1, len(lines[1]))) < side_streets
     along_y = rng.random((len(lines[0]), len(lines[1]) - 1)) < side_streets
@@ -132,7 +132,7 @@ def road_plan(rng: np.random.Generator, length: float) -> StreetPlan:
     along_y = rng.random((len(xs), 2)) < 0.45
     along_y[[0, -1], :] = False
     drive = tuple((i, 1) for i in range(len(xs)))
-    return StreetPlan(xs, ys, along_x, along_y, float(rng.uniform(4.2, 5.0)), drive)
+    return StreetPlan(xs, ys, along_x, along_y, float(rng.uniform(4.6, 5.2)), drive)
 
 
 def _lines(rng: np.random.Generator, count: int, spacing: float) -> FloatArray:

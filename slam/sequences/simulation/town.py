@@ -170,7 +170,7 @@ class _Town:
         along = 6.5
         while along < length - 6.5:
             if rng.random() < self.parking:
-                spot = start + along * ahead - float(rng.uniform(0.9, 1.0)) * inward
+                spot = start + along * ahead - 0.95 * inward
                 objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
             along += float(rng.uniform(5.4, 7.5))
 

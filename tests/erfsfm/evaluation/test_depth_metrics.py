@@ -1,0 +1,70 @@
+"""Depth errors by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from erfsfm.evaluation.depth_metrics import depth_errors, mean_errors, valid_pixels
+
+
+def test_perfect_up_to_scale() -> None:
+    truth = np.random.default_rng(0).uniform(1, 70, (6, 8)).astype(np.float32)
+    errors = depth_errors(truth / 7, truth)
+    assert errors is not None
+    assert errors.scale == pytest.approx(7, rel=1e-6)
+    assert errors.abs_rel == pytest.approx(0, abs=1e-6)
+    assert errors.rmse == pytest.approx(0, abs=1e-4)
+    assert errors.a1 == errors.a2 == errors.a3 == 1
+
+
+def test_by_hand_without_scaling() -> None:
+    truth = np.array([[10.0, 20.0, 0.0]], np.float32)
+    guess = np.array([[12.0, 10.0, 5.0]], np.float32)
+    errors = depth_errors(guess, truth, scaling="none")
+    assert errors is not None
+    assert errors.scale == 1
+    assert errors.abs_rel == pytest.approx((0.2 + 0.5) / 2)
+    assert errors.sq_rel == pytest.approx((4 / 10 + 100 / 20) / 2)
+    assert errors.rmse == pytest.approx(math.sqrt((4 + 100) / 2))
+    assert errors.rmse_log == pytest.approx(math.sqrt((math.log(1.2) ** 2 + math.log(2) ** 2) / 2))
+    assert (errors.a1, errors.a2, errors.a3) == (0.5, 0.5, 0.5)
+
+
+def test_scaled_predictions_are_clipped_afterwards() -> None:
+    truth = np.array([[10.0, 10.0, 79.0]], np.float32)
+    guess = np.array([[1.0, 1.0, 1000.0]], np.float32)
+    errors = depth_errors(guess, truth)
+    assert errors is not None
+    assert errors.scale == 10
+    assert errors.rmse == pytest.approx(math.sqrt(1 / 3)), "80 against 79, not 10000"
+
+
+def test_what_counts() -> None:
+    truth = np.full((100, 200), 5.0, np.float32)
+    truth[50, 50:53] = [0, 80, 90]
+    assert (~valid_pixels(truth, 80, "none")).sum() == 3
+    rows, columns = np.nonzero(valid_pixels(np.full((375, 1242), 5.0, np.float32), 80, "garg"))
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (153, 370, 44, 1196)
+
+
+def test_no_truth() -> None:
+    assert depth_errors(np.ones((2, 2), np.float32), np.zeros((2, 2), np.float32)) is None
+
+
+def test_sizes_must_agree() -> None:
+    with pytest.raises(ValueError, match=r"must have the truth's shape \(2, 2\); got \(2, 3\)"):
+        depth_errors(np.ones((2, 3), np.float32), np.ones((2, 2), np.float32))
+
+
+def test_every_image_counts_once() -> None:
+    truth = np.full((1, 4), 10, np.float32)
+    first = depth_errors(truth, truth, scaling="none")
+    second = depth_errors(truth * 1.5, truth, scaling="none")
+    assert first is not None
+    assert second is not None
+    assert mean_errors([first, second]).abs_rel == pytest.approx(0.25)
+    with pytest.raises(ValueError, match="no image"):
+        mean_errors([])

@@ -1,0 +1,106 @@
+"""Whole evaluations with networks that know the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from erfsfm.data.recordings import discover
+from erfsfm.data.splits import overlapping
+from erfsfm.errors import DataError
+from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
+
+
+class Oracle:
+    """Right up to scale about the drive of ``write_root``, which it recognises by nothing but the calls."""
+
+    def __init__(self, step: tuple[float, float, float], sources: int = 4, seen: Sequence[str] = ()) -> None:
+        self.step = np.array(step)
+        self.sources = sources
+        self.seen = seen
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return np.full(image.shape[:2], 3.0, np.float32)
+
+    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+        assert len(images) == self.sources + 1
+        T_source_target = np.tile(np.eye(4), (self.sources, 1, 1))
+        offsets = [k for k in range(-self.sources // 2, self.sources // 2 + 1) if k]
+        T_source_target[:, :3, 3] = [-k * self.step / 3 for k in offsets]  # another scale
+        return T_source_target
+
+    def leaks(self, names: Sequence[str]) -> list[str]:
+        return overlapping(names, self.seen)
+
+
+STEP = (0.05, 0.0, 0.1)
+
+
+def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=11, depth=True, seed=600, step=STEP)
+    networks, median = depth_protocol(Oracle(STEP), tmp_path, allow_leak=False)
+    assert networks["images"] == 3, "every fifth frame"
+    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
+    assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
+    assert networks["scale_spread"] == pytest.approx(np.std([6.0, 5.5, 5.0]) / 5.5, abs=1e-3)
+    assert median["method"] == "median depth map"
+
+
+@pytest.mark.parametrize("name", ["00", "kitti_odometry/00"])
+def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> None:
+    write_root(tmp_path, frames=9, step=STEP, cameras=("image_2", "image_3"))
+    networks, straight = pose_protocol(Oracle(STEP), tmp_path, [name], "default", allow_leak=False)
+    assert networks["snippets"] == 5
+    assert networks["ate_mean"] == pytest.approx(0, abs=1e-9)
+    assert straight["ate_mean"] > 0.01, "the drive slides sideways"
+    assert networks["leak"] is False
+
+
+def test_sequences_of_a_simulated_root_go_by_their_folder(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=5, seed=600, step=STEP)
+    for name in ("00", "simulated/600"):
+        networks, _ = pose_protocol(Oracle(STEP), tmp_path, [name], "default", allow_leak=False)
+        assert networks["recording"] == "simulated/600"
+
+
+def test_paper_fidelity_counts_four_empty_snippets(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=9, step=STEP)
+    default = pose_protocol(Oracle(STEP), tmp_path, ["00"], "default", allow_leak=False)[1]
+    paper = pose_protocol(Oracle(STEP), tmp_path, ["00"], "paper", allow_leak=False)[1]
+    assert paper["ate_mean"] == pytest.approx(default["ate_mean"] * 5 / 9)
+
+
+def test_leaks_are_refused_by_frames(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=6, step=STEP)
+    later, same = Oracle(STEP, seen=["kitti_odometry/00[6:]"]), Oracle(STEP, seen=["kitti_odometry/00[5:]"])
+    assert pose_protocol(later, tmp_path, ["00"], "default", allow_leak=False)[0]["leak"] is False
+    with pytest.raises(DataError, match=r"kitti_odometry/00\[0:6\]"):
+        pose_protocol(same, tmp_path, ["00"], "default", allow_leak=False)
+    assert pose_protocol(same, tmp_path, ["00"], "default", allow_leak=True)[0]["leak"] is True
+
+
+def test_refusals(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path / "short", frames=4, step=STEP)
+    with pytest.raises(DataError, match="a snippet needs 5"):
+        pose_protocol(Oracle(STEP), tmp_path / "short", ["00"], "default", allow_leak=False)
+    with pytest.raises(DataError, match="4 sources"):
+        pose_protocol(Oracle(STEP, sources=2), tmp_path / "short", ["00"], "default", allow_leak=False)
+    with pytest.raises(DataError, match="no sequence 07"):
+        pose_protocol(Oracle(STEP), tmp_path / "short", ["07"], "default", allow_leak=False)
+    with pytest.raises(DataError, match="no true depth"):
+        depth_protocol(Oracle(STEP), tmp_path / "short", allow_leak=False)
+    (tmp_path / "short/poses/00.txt").unlink()
+    with pytest.raises(DataError, match="no true poses"):
+        pose_protocol(Oracle(STEP), tmp_path / "short", ["00"], "default", allow_leak=False)
+
+
+def test_depth_of_several_sizes_is_refused(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path / "a", frames=1, seed=600, depth=True)
+    write_root(tmp_path / "b", frames=1, seed=601, depth=True, size=(32, 48))
+    assert len(discover(tmp_path)) == 2
+    with pytest.raises(DataError, match="different sizes"):
+        depth_protocol(Oracle(STEP), tmp_path, allow_leak=False)

@@ -1,0 +1,86 @@
+"""Turn a training output into shipped weights: half precision, with a model card.
+
+Example: python tools/ship_weights.py runs/sim sim --data "60 simulated worlds, seeds 0-59"
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from erfsfm.checkpoint import FILES, SHIPPED, Model, load_model, save_model
+
+LARGEST_MB = 20
+
+CARD = """# Weights `{name}`
+
+| | |
+|---|---|
+| networks | `{depth}` at width {depth_width}, `{pose}` at width {pose_width}, normalisation {normalisation} |
+| input | {width}x{height}, snippets of {frames} frames |
+| data | {data} |
+| seen | {seen} |
+| held out | {held_out} |
+| steps | {steps} |
+| command | `{command}` |
+| commit | {commit} |
+| licence | {licence} |
+
+Trained without labels, from the photometric error between frames. Depth and poses share one unknown scale.
+
+Measured (`{evaluation}`):
+
+{metrics}
+"""
+
+
+def main() -> None:
+    """Write ``erfsfm/weights/NAME``."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="output folder of erfsfm train")
+    parser.add_argument("name", help="name of the shipped weights")
+    parser.add_argument("--data", required=True, help="one line: what it was trained on")
+    parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
+    parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
+    parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
+    arguments = parser.parse_args()
+
+    model = load_model(arguments.run)
+    folder = SHIPPED / arguments.name
+    save_model(folder, Model(model.record, model.depth_net, model.pose_net), half=True)
+    for file in FILES:
+        size = (folder / file).stat().st_size / 1e6
+        if size > LARGEST_MB:
+            raise SystemExit(f"{file} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower")
+    record, network = model.record, model.record.network
+    card = CARD.format(
+        name=arguments.name,
+        **network.model_dump(),
+        frames=network.sources + 1,
+        data=arguments.data,
+        seen=", ".join(record.trained_on),
+        held_out=arguments.held_out,
+        steps=record.step,
+        command=record.command,
+        commit=record.commit,
+        licence=record.licence,
+        evaluation=arguments.evaluation,
+        metrics=_table(arguments.metrics, record.metrics),
+    )
+    (folder / "README.md").write_text(card)
+    print(f"{folder}: read {folder / 'README.md'}")
+
+
+def _table(path: Path | None, fallback: dict[str, float]) -> str:
+    rows = json.loads(path.read_text()) if path else [fallback]
+    keys = list(rows[0])
+    lines = ["| " + " | ".join(keys) + " |", "|" + "---|" * len(keys)]
+    for row in rows:
+        cells = (f"{row[k]:.4f}" if isinstance(row[k], float) else str(row[k]) for k in keys)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -34,7 +34,7 @@ lint: setup
 	$(BIN)/lint-imports
 
 benchmark: setup
-	$(BIN)/python -m pytest -q -s tests/benchmarks --override-ini testpaths=tests/benchmarks -m slow
+	$(BIN)/python -m pytest -q -s tests/benchmarks
 
 clean:
 	rm -rf $(VENV) results runs dist build

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -25,8 +26,10 @@ app = typer.Typer(
     help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
 )
 
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda")]
-Seed = Annotated[int, typer.Option(help="seed of everything random")]
+_INTERRUPTED = 130  # what typer makes of ctrl-C
+
+Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of everything random")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 
 
@@ -65,7 +68,7 @@ def run(
             seed,
             device,
             progress,
-            command="erfsfm-slam " + " ".join(sys.argv[1:]),
+            command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
         )
     metrics = folder.metrics()
     if as_json:
@@ -77,7 +80,7 @@ def run(
 @app.command()
 def evaluate(
     paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or one or more run folders")],
-    format: Annotated[str, typer.Option(help="auto, kitti or tum")] = "auto",
+    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the two files")] = "auto",
     fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 where it is larger; repeat")] = None,
     as_json: Json = False,
     seed: Seed = 0,
@@ -88,11 +91,14 @@ def evaluate(
     Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
     """
     if all(path.is_dir() for path in paths):
+        if fail_over:
+            raise typer.BadParameter("limits are for two trajectory files, not for run folders", param_hint="--fail-over")
         _evaluate_runs(paths, as_json)
     elif len(paths) == 2:
         _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)
     else:
-        raise SlamError(f"evaluate wants two trajectory files or run folders; got {', '.join(map(str, paths))}")
+        what = ", ".join(map(str, paths))
+        raise typer.BadParameter(f"two trajectory files or run folders that exist are wanted; got {what}")
 
 
 @app.command()
@@ -205,10 +211,7 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
     from slam.tables import metrics_table
     from slam.trajectory import associate, read_trajectory
 
-    if format not in ("auto", "kitti", "tum"):
-        raise SlamError(f"--format must be auto, kitti or tum; got '{format}'")
-    kind = cast(Literal["auto", "kitti", "tum"], format)
-    pair = associate(read_trajectory(estimate, kind), read_trajectory(reference, kind))
+    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
     metrics = trajectory_metrics(*pair)
     if as_json:
         typer.echo(json.dumps(metrics, indent=2))
@@ -224,17 +227,21 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
 def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     from rich.console import Console
 
+    from slam.comparison import unit_notes
     from slam.tables import metrics_table
 
     provenance, scale, timing = metrics["provenance"], metrics["scale"], metrics["timing"]
     known = {k: v for k, v in metrics["trajectories"].items() if isinstance(v, dict)}
     Console(width=_table_width()).print(metrics_table(known, f"{metrics['sequence']['name']}, scale {scale['mode']}"))
+    for note in unit_notes(metrics):
+        typer.echo(note)
     typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
     typer.echo(
         f"{metrics['sequence']['frames']} frames in {timing['seconds_total']:.1f} s "
-        f"({timing['frames_per_second']:.1f} a second); everything in {path}, read {path}/report.html"
+        f"({timing['frames_per_second']:.1f} a second); everything in {path}"
+        + (f", read {path / 'report.html'}" if (path / "report.html").is_file() else "")
     )
 
 
@@ -278,9 +285,10 @@ def main() -> None:
     logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
     try:
         app()
-    except (SlamError, ErfsfmError) as error:
+    except (SlamError, ErfsfmError, OSError) as error:
         typer.echo(f"erfsfm-slam: {error}", err=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
-        sys.exit(1)
+    except SystemExit as end:
+        if end.code == _INTERRUPTED:
+            typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
+        raise

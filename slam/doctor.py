@@ -29,7 +29,8 @@ def examine(dataset: Path | None) -> list[str]:
     lines += [_package(name) for name in PACKAGES]
     lines.append(_open3d())
     lines += [_weights(name) for name in WEIGHTS]
-    root = dataset or (Path(os.environ[KITTI_VARIABLE]) if KITTI_VARIABLE in os.environ else None)
+    told = os.environ.get(KITTI_VARIABLE)
+    root = dataset or (Path(told) if told else None)
     if root is None:
         lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset; the simulated street needs none")
     else:

@@ -7,10 +7,25 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slam.se3 import FloatArray
+from slam.se3 import FloatArray, Similarity, nearest_rotation
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
+
+
+def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray) -> Similarity:
+    """The similarity that takes a trajectory and its map to the truth, poses ``(N, 4, 4)`` both.
+
+    The rotation is the chordal mean over all orientations, scale and shift are the best for the positions
+    under it: positions alone leave the roll about a straight road open, and a map hangs on it.
+    """
+    R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
+    R = nearest_rotation((R_true @ np.swapaxes(R_estimate, 1, 2)).sum(axis=0))
+    true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3] @ R.T
+    centred_true, centred = true - true.mean(axis=0), estimate - estimate.mean(axis=0)
+    agreement, energy = float((centred_true * centred).sum()), float((centred**2).sum())
+    scale = agreement / energy if agreement > 0 else 1.0
+    return Similarity(scale, R, true.mean(axis=0) - scale * estimate.mean(axis=0))
 
 
 def accuracy_median_m(points_true: FloatArray, distance_to_surface: Callable[[FloatArray], FloatArray]) -> float | None:

@@ -101,11 +101,13 @@ class SlamPipeline:
         """Run the whole system.
 
         Raises:
-            SlamError: the sequence is too short, unreadable, or leaves the graph without a solution.
+            SlamError: the sequence is too short, unreadable, lacks what the scale mode wants, or leaves the graph
+                without a solution.
         """
+        mode = self._require_possible()
         observations = self._observe()
         T_network = chain_raw(observations.snippets, len(self._sequence))
-        scale = self._find_scale(observations, T_network)
+        scale = self._find_scale(mode, observations, T_network)
         factors = self._measure(observations, scale)
         T_odometry = self._dead_reckon(factors, T_network, scale)
         graph = PoseGraph(self._config.pose_graph)
@@ -125,6 +127,28 @@ class SlamPipeline:
             map=tsdf_map,
             stopwatch=self._watch,
         )
+
+    def _require_possible(self) -> ScaleMode:
+        """The scale mode of this run; refuses before any work what could only fail after all of it."""
+        sequence, shortest = self._sequence, self._predictor.sources + 1
+        if len(sequence) < shortest:
+            raise SlamError(
+                f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
+                "choose a longer range"
+            )
+        mode = resolve_mode(self._config.scale, sequence.camera_height_m)
+        if mode == "lidar":
+            raise SlamError("scale mode lidar is not built yet: choose camera-height, reference or none")
+        if mode == "reference" and sequence.reference is None:
+            raise SlamError(
+                f"scale mode reference wants true poses; {sequence.name} has none: choose camera-height or none"
+            )
+        if mode == "camera-height" and sequence.camera_height_m is None:
+            raise SlamError(
+                f"scale mode camera-height wants a known height; {sequence.name} has none: add camera_height_m "
+                "to camera.yaml or choose scale.mode=none"
+            )
+        return mode
 
     def _observe(self) -> Observations:
         """One pass over the frames: depth, road, snippet poses and image geometry, as frames arrive."""
@@ -187,24 +211,12 @@ class SlamPipeline:
         image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
         seen.keyframes.append(Keyframe(frame.index, image, small))
 
-    def _find_scale(self, seen: Observations, T_network: FloatArray) -> Scale:
+    def _find_scale(self, mode: ScaleMode, seen: Observations, T_network: FloatArray) -> Scale:
         """The unit of length, as the named mode wants it."""
         config, sequence = self._config.scale, self._sequence
-        mode = resolve_mode(config, sequence.camera_height_m)
         with self._watch.stage("scale"):
-            estimate: ScaleEstimate | Refusal
-            if mode == "reference":
-                if sequence.reference is None:
-                    raise SlamError(f"scale mode reference wants true poses; {sequence.name} has none")
-                estimate = scale_from_reference(T_network, sequence.reference, config)
-                return self._steady(mode, estimate)
-            if mode == "lidar":
-                raise SlamError("scale mode lidar is not built yet: choose camera-height, reference or none")
-            if mode == "camera-height" and sequence.camera_height_m is None:
-                raise SlamError(
-                    f"scale mode camera-height wants a known height; {sequence.name} has none: add camera_height_m "
-                    "to camera.yaml or choose scale.mode=none"
-                )
+            if mode == "reference" and sequence.reference is not None:
+                return self._steady(mode, scale_from_reference(T_network, sequence.reference, config))
             height = sequence.camera_height_m if mode == "camera-height" else None
             estimate = scale_from_road(seen.roads, height, config)
             if isinstance(estimate, Refusal):

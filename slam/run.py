@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm import __version__
+from erfsfm.errors import ErfsfmError
 from erfsfm.evaluation.pose_metrics import (
     SnippetErrors,
     snippet_errors,
@@ -28,7 +30,7 @@ from slam.evaluation import trajectory_metrics
 from slam.frames import Predictor
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.refusal import Refusal
-from slam.map_metrics import accuracy_median_m, completeness, visible_surface
+from slam.map_metrics import accuracy_median_m, completeness, pose_similarity, visible_surface
 from slam.networks import NetworkPredictor
 from slam.pipeline import Progress, SlamPipeline, SlamResult
 from slam.pose_graph import coverage
@@ -88,7 +90,7 @@ def run_slam(
         The run folder.
 
     Raises:
-        SlamError, ErfsfmError: one line; a folder already made then holds what there is and says why.
+        SlamError, ErfsfmError: one line; whatever ends a run, a folder already made holds what there is and says why.
     """
     settings = load_config(config, overrides)
     recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
@@ -110,13 +112,22 @@ def run_slam(
     with _logging_to(folder.path / "run.log"):
         try:
             pipeline = SlamPipeline(recording, _seeded(networks, seed), settings, progress)
-            return _run(folder, pipeline, recording, provenance)
-        except (SlamError, OSError, MemoryError, KeyboardInterrupt) as error:
-            reason = str(error) or type(error).__name__
-            logger.error("the run failed: %s", reason)
-            folder.write_metrics(describe_failure(provenance, reason))
-            write_report(folder, [], None, None)
+            _run(folder, pipeline, recording, provenance, settings.output.report)
+            return folder
+        except BaseException as error:
+            _leave_failure(folder, provenance, settings.output.report, error)
             raise
+
+
+def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, error: BaseException) -> None:
+    """Say in the folder why the run ended; where even that fails, the first error is the one to hear about."""
+    known = isinstance(error, SlamError | ErfsfmError)
+    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    logger.error("the run failed: %s", reason)
+    with suppress(SlamError):
+        folder.write_metrics(describe_failure(provenance, reason))
+        if report:
+            write_report(folder, [], None, None)
 
 
 def _seeded(networks: DepthPosePredictor, seed: int) -> Predictor:
@@ -125,7 +136,9 @@ def _seeded(networks: DepthPosePredictor, seed: int) -> Predictor:
     return NetworkPredictor(networks)
 
 
-def _run(folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance) -> RunFolder:
+def _run(
+    folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, report: bool
+) -> None:
     result = pipeline.run()
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
@@ -135,9 +148,9 @@ def _run(folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, pro
     folder.write_text("loops.json", as_json({"reason": NOT_BUILT, "accepted": [], "rejected": []}))
     surface = _write_map(folder, result, sequence)
     folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
-    examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
-    write_report(folder, examples, surface.points, surface.colours)
-    return folder
+    if report:
+        examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
+        write_report(folder, examples, surface.points, surface.colours)
 
 
 def _metrics(
@@ -194,8 +207,10 @@ def _graph(result: SlamResult) -> dict[str, Any]:
     """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
     summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.factors)}
     if result.reference is None:
-        return summary | {"coverage": None, "coverage_reason": "the sequence has no true poses"}
+        return summary | null("coverage", "the sequence has no true poses")
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+    if not aligned.scale > 0:
+        return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
     return summary | {"coverage": coverage(result.factors, result.reference.T_world_camera, aligned.scale)}
 
 
@@ -228,13 +243,13 @@ def _no_map(reason: str) -> dict[str, Any]:
 
 
 def _map_quality(points: NDArray[np.float64], result: SlamResult, sequence: FrameSequence) -> dict[str, Any]:
-    """Distance to the true street and share of it found, the map moved by the trajectory's 7-dof alignment."""
+    """Distance to the true street and share of it found, the map moved with its trajectory to the truth."""
     base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
     street = getattr(base, "street", None)
     if result.reference is None or street is None:
         reason = "the true surface is known for the embedded simulated sequence only"
         return null("accuracy_median_m", reason) | null("completeness", reason)
-    to_truth = umeyama(result.reference.positions, result.optimised.positions, with_scale=True)
+    to_truth = pose_similarity(result.reference.T_world_camera, result.optimised.T_world_camera)
     T_street_first = street.T_world_camera[first]
     points_true = apply(T_street_first, to_truth.scale * points @ to_truth.R_a_b.T + to_truth.t_a_b)
     seen = [
@@ -269,7 +284,7 @@ def _logging_to(path: Path) -> Iterator[None]:
 def _commit() -> str:
     """The revision of the source tree this runs from, or an empty string outside one."""
     root = Path(__file__).resolve().parents[1]
-    if not (root / ".git").exists():
+    if not (root / ".git").exists() or shutil.which("git") is None:
         return ""
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

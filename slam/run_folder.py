@@ -18,6 +18,17 @@ from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 logger = logging.getLogger(__name__)
 
 TRAJECTORIES = ("network", "odometry", "optimised", "lidar")
+_STEMS = ("reference", *(f"trajectory_{name}" for name in TRAJECTORIES))
+_OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "tum")) | {
+    "config.yaml",
+    "metrics.json",
+    "graph.g2o",
+    "loops.json",
+    "map_mesh.ply",
+    "map_cloud.ply",
+    "report.html",
+    "run.log",
+}
 
 
 class RunFolder:
@@ -31,28 +42,13 @@ class RunFolder:
         """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` to it.
 
         Raises:
-            RunError: ``output`` exists and holds something that is not a run.
+            RunError: ``output`` exists and holds something that is not a run, or no folder can be made there.
         """
-        if output is not None:
-            if output.exists() and not output.is_dir():
-                raise RunError(f"{output} is a file: give a folder as --output")
-            if output.exists() and any(output.iterdir()) and not (output / "metrics.json").is_file():
-                raise RunError(f"{output} is not empty and holds no run: choose another --output")
-            output.mkdir(parents=True, exist_ok=True)
-            for stale in output.iterdir():
-                if stale.is_file():
-                    stale.unlink()
-            return cls(output)
-        safe = re.sub(r"[^\w.-]+", "-", sequence)
-        stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-        path = results / f"{stamp}_{safe}"
-        number = 1
-        while path.exists():
-            number += 1
-            path = results / f"{stamp}-{number}_{safe}"
-        path.mkdir(parents=True)
-        _link(results / "latest", path)
-        return cls(path)
+        try:
+            return cls(_cleared(output) if output is not None else _stamped(results, sequence))
+        except OSError as error:
+            where = output if output is not None else results
+            raise RunError(f"no run folder can be made in {where}: {error.strerror or error}") from error
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -112,6 +108,33 @@ class RunFolder:
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
             raise RunError(f"{self.path} has no {name}: it holds {present}")
         return path
+
+
+def _cleared(output: Path) -> Path:
+    """``output`` as an empty run folder: an earlier run in it goes, files of other kinds beside it stay."""
+    if output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: give a folder as --output")
+    output.mkdir(parents=True, exist_ok=True)
+    present = {path.name for path in output.iterdir()}
+    if present - _OWN and "metrics.json" not in present:
+        raise RunError(f"{output} is not empty and holds no run: choose another --output")
+    for name in present & _OWN:
+        (output / name).unlink()
+    return output
+
+
+def _stamped(results: Path, sequence: str) -> Path:
+    """A new ``<stamp>_<sequence>`` in ``results``, with ``latest`` pointing to it."""
+    safe = re.sub(r"[^\w.-]+", "-", sequence)
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = results / f"{stamp}_{safe}"
+    number = 1
+    while path.exists():
+        number += 1
+        path = results / f"{stamp}-{number}_{safe}"
+    path.mkdir(parents=True)
+    _link(results / "latest", path)
+    return path
 
 
 def _link(link: Path, target: Path) -> None:

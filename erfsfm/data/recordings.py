@@ -139,7 +139,8 @@ def discover(root: Path) -> list[Recording]:
         raise DataError(f"no data set at {root}: the path does not exist")
     found = _recordings_at(root)
     if not found and root.is_dir():
-        children = sorted(p for p in root.iterdir() if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
+        visible = (p for p in root.iterdir() if not p.name.startswith("."))
+        children = sorted(p for p in visible if p.is_dir() or p.suffix.lower() in VIDEO_SUFFIXES)
         found = [r for child in children for r in _recordings_at(child)]
     if not found:
         entries = sorted(p.name for p in root.iterdir())[:8] if root.is_dir() else [root.name]

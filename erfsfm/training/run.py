@@ -7,6 +7,8 @@ import math
 import pickle
 import subprocess
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -89,7 +91,7 @@ def _fit(
 ) -> None:
     """Run the loop; what stops it becomes one line."""
     try:
-        with warnings.catch_warnings():
+        with _opencv_without_threads(), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
@@ -259,7 +261,17 @@ def _trainer(
     )
 
 
-def _calm_worker(_: int) -> None:
-    """A worker decodes with one thread: the cores belong to the training step."""
+@contextmanager
+def _opencv_without_threads() -> Iterator[None]:
+    """End OpenCV's threads while workers are forked: a child waits forever for threads it did not inherit."""
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _calm_worker(_: int) -> None:
+    """A worker computes with one thread: the cores belong to the training step."""
     torch.set_num_threads(1)

@@ -22,6 +22,13 @@ from slam.foreign import import_open3d
 from slam.sequences.simulation import hazards as effects
 from slam.sequences.simulation.geometry import Float32Array, FloatArray, Mesh
 from slam.sequences.simulation.hazards import Hazard, Traffic
+from slam.sequences.simulation.kitti_layout import (
+    write_calibration,
+    write_depth,
+    write_image,
+    write_lines,
+    write_poses,
+)
 from slam.sequences.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
 from slam.sequences.simulation.light import draw_weather, sky
 from slam.sequences.simulation.optics import kitti_intrinsics, pixel_rays
@@ -62,9 +69,7 @@ class SimulationOptions:
             raise SequenceError(f"images must be 8 x 8 or larger; got {self.width} x {self.height}")
 
 
-def parse_options(
-    route: str, frames: int, seed: int, width: int, height: int, hazards: str
-) -> SimulationOptions:
+def parse_options(route: str, frames: int, seed: int, width: int, height: int, hazards: str) -> SimulationOptions:
     """Options from a command line; ``hazards`` is a comma list.
 
     Raises:
@@ -124,15 +129,13 @@ class SimulatedStreet:
         self._drive = plan_drive(options.route, options.frames, options.seed, still)
         self.camera_height_m = self._drive.camera_height_m
         self.T_camera_lidar: FloatArray = T_CAMERA_LIDAR.copy()
-        self.T_world_camera: FloatArray = (
-            se3.invert(self._drive.T_street_camera[0]) @ self._drive.T_street_camera
-        )
+        self.T_world_camera: FloatArray = se3.invert(self._drive.T_street_camera[0]) @ self._drive.T_street_camera
         self.T_world_camera[0] = np.eye(4)
         self._weather = draw_weather(options.seed)
         self._exposure = effects.exposure_curve(options.seed, options.frames)
         self._traffic = Traffic(self._drive, options.seed) if "moving-cars" in options.hazards else None
         self._rays = pixel_rays(self.K, options.width, options.height)
-        self._stretch = np.linalg.norm(self._rays, axis=1)  # ray length per depth
+        self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)  # ray length per depth
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -165,7 +168,7 @@ class SimulatedStreet:
             nearer = np.flatnonzero(answer["t_hit"] < ranges)
             ranges[nearer] = answer["t_hit"][nearer]
             instance = surface.mesh.instance[answer["primitive_ids"][nearer]]
-            reflectance[nearer] = surface.mesh.colours[instance, 0].mean(axis=1)
+            reflectance[nearer] = surface.mesh.colours[0][:, instance].mean(axis=0)
         return measured(directions, ranges, reflectance, rng)
 
     def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
@@ -183,51 +186,49 @@ class SimulatedStreet:
         cars = self._traffic.placed(index) if self._traffic else None
         return [self._still] if cars is None else [self._still, _surface(cars)]
 
-    def _view(
-        self, surfaces: list[_Surface], T_street_camera: FloatArray
-    ) -> tuple[Float32Array, Float32Array]:
+    def _view(self, surfaces: list[_Surface], T_street_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose."""
         rays = _rays(T_street_camera, self._rays)  # z = 1, so that t is z-depth
+        unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
         answers = [_cast(surface.scene, rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
         depth[depth >= FARTHEST_M] = 0.0
         rgb = np.empty((len(rays), 3), dtype=np.float32)
         unseen = np.flatnonzero(depth == 0.0)
-        rgb[unseen] = sky(self._weather, rays[unseen, 3:] / self._stretch[unseen, None])
+        rgb[unseen] = sky(self._weather, unit[:, unseen]).T
         for number, (surface, answer) in enumerate(zip(surfaces, answers)):
             seen = np.flatnonzero((nearest == number) & (depth > 0.0))
+            triangle = answer["primitive_ids"][seen].astype(np.int64)
+            order = np.argsort(np.take(surface.mesh.material, triangle), kind="stable")
+            seen, triangle = seen[order], triangle[order]
             hits = Hits(
-                triangle=answer["primitive_ids"][seen].astype(np.int64),
-                barycentric=answer["primitive_uvs"][seen],
-                rays=rays[seen, 3:] / self._stretch[seen, None],
+                triangle=triangle,
+                barycentric=np.take(answer["primitive_uvs"], seen, axis=0).T,
+                rays=np.take(unit, seen, axis=1),
+                normals=facing_normals(surface.mesh, triangle, np.take(unit, seen, axis=1)),
                 depth=depth[seen],
                 distance=depth[seen] * self._stretch[seen],
             )
-            normals = facing_normals(surface.mesh, hits)
-            lit = self._sunlit(surfaces, rays[seen], hits, normals, seen)
-            rgb[seen] = paint(surface.mesh, hits, normals, lit, self._weather, float(self.K[0, 0]))
+            lit = self._sunlit(surfaces, np.take(rays, seen, axis=0), hits, seen)
+            rgb[seen] = paint(surface.mesh, hits, lit, self._weather, float(self.K[0, 0])).T
         shape = self.options.height, self.options.width
         return rgb.reshape(*shape, 3), depth.reshape(shape)
 
     def _sunlit(
-        self,
-        surfaces: list[_Surface],
-        rays: Float32Array,
-        hits: Hits,
-        normals: Float32Array,
-        pixels: NDArray[np.int64],
+        self, surfaces: list[_Surface], rays: Float32Array, hits: Hits, pixels: NDArray[np.int64]
     ) -> Float32Array:
         """How much of the sun reaches each hit, softened over the neighbouring pixels, ``(N,)``."""
-        to_sun = np.empty_like(rays)
-        to_sun[:, :3] = rays[:, :3] + rays[:, 3:] * hits.depth[:, None] + 0.03 * normals
+        towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
+        to_sun = np.take(rays, towards, axis=0)
+        to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
         to_sun[:, 3:] = self._weather.sun
         tensor = import_open3d().core.Tensor(to_sun)
         shadow = np.any([surface.scene.test_occlusions(tensor).numpy() for surface in surfaces], axis=0)
         lit = np.ones(self.options.height * self.options.width, dtype=np.float32)
-        lit[pixels] = 1.0 - shadow
+        lit[pixels[towards]] = 1.0 - shadow
         soft = cv2.blur(lit.reshape(self.options.height, self.options.width), (3, 3))
-        return np.asarray(soft.ravel()[pixels], dtype=np.float32)
+        return np.asarray(np.take(soft, pixels), dtype=np.float32)
 
     def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
         """Rain, the lens's slight softness, exposure, and 8 bits."""
@@ -292,43 +293,26 @@ def _write_frames(
         (folder / name).mkdir(parents=True)
     for index in range(len(street)):
         frame = street.render(index)
-        _write_png(folder / "image_2" / f"{index:06d}.png", frame.image[..., ::-1])
+        write_image(folder / "image_2" / f"{index:06d}.png", frame.image)
         if depth:
-            encoded = np.clip(np.rint(frame.depth * 256.0), 0.0, 65535.0).astype(np.uint16)
-            _write_png(folder / "depth_2" / f"{index:06d}.png", encoded)
+            write_depth(folder / "depth_2" / f"{index:06d}.png", frame.depth)
         if lidar:
             street.scan(index).astype("<f4").tofile(folder / "velodyne" / f"{index:06d}.bin")
         if progress:
             progress(index + 1)
 
 
-def _write_png(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"cannot write {path}")
-
-
 def _write_records(street: SimulatedStreet, root: Path) -> None:
     """Calibration, times, poses, the camera and what was simulated."""
     sequence, K, options = root / "sequences" / "sim", street.K, street.options
-    projection = _row(np.column_stack([K, np.zeros(3)]))
-    rows = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_row(street.T_camera_lidar[:3])}"]
-    _write_lines(sequence / "calib.txt", rows)
-    _write_lines(sequence / "times.txt", [f"{index / FPS:.6e}" for index in range(len(street))])
+    write_calibration(sequence / "calib.txt", K, street.T_camera_lidar)
+    write_lines(sequence / "times.txt", [f"{index / FPS:.6e}" for index in range(len(street))])
     (root / "poses").mkdir()
-    _write_lines(root / "poses" / "sim.txt", [_row(T_world_camera[:3]) for T_world_camera in street.T_world_camera])
+    write_poses(root / "poses" / "sim.txt", street.T_world_camera)
     camera = {"width": options.width, "height": options.height, "fx": K[0, 0], "fy": K[1, 1]}
     camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": FPS, "camera_height_m": street.camera_height_m}
-    _write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
-    record = json.dumps({**asdict(options), "version": VERSION}, indent=2)
-    _write_lines(root / "simulation.json", [record])
-
-
-def _row(matrix: FloatArray) -> str:
-    return " ".join(f"{value:.9e}" for value in matrix.ravel())
-
-
-def _write_lines(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
+    write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
 
 
 def _surface(mesh: Mesh) -> _Surface:

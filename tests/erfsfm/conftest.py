@@ -49,6 +49,7 @@ class Plane:
 @pytest.fixture(autouse=True)
 def _same_chance() -> None:
     torch.manual_seed(0)
+    cv2.setNumThreads(1)  # forked workers do not inherit OpenCV's threads
 
 
 @pytest.fixture

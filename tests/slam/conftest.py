@@ -1,7 +1,9 @@
-"""A run folder as ``erfsfm-slam run`` leaves it, made of a drive around a block."""
+"""What several tests of the system stand on: a run folder of a drive around a block, as ``erfsfm-slam run`` leaves
+it, a few frames of the simulated street on disk, and networks that have learned nothing."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 
 from slam.run_folder import RunFolder
 from slam.se3 import FloatArray, chain, from_rotation_vector
+from slam.sequences.simulated import SimulatedStreet, SimulationOptions, write_kitti_root
 from slam.trajectory import Trajectory
 
 MakeRun = Callable[..., RunFolder]
@@ -144,3 +147,43 @@ def make_run(tmp_path: Path) -> MakeRun:
 def make_metrics() -> Callable[..., dict[str, Any]]:
     """``metrics_of``: a realistic ``metrics.json``."""
     return metrics_of
+
+
+@pytest.fixture(scope="session")
+def kitti_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A KITTI odometry root with the one sequence ``sim``: 14 frames of simulated world 1001. Not to be changed."""
+    root = tmp_path_factory.mktemp("kitti") / "root"
+    options = SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64)
+    write_kitti_root(SimulatedStreet(options), root)
+    return root
+
+
+@pytest.fixture
+def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
+    """Copies ``kitti_root`` to a place where a test may damage it."""
+    return lambda: shutil.copytree(kitti_root, tmp_path / "damaged")
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small networks with their first random weights, as a training run would have written them."""
+    return write_weights(tmp_path_factory.mktemp("weights"), ["simulated/17"])
+
+
+@pytest.fixture
+def leaky_weights(tmp_path: Path) -> Path:
+    """The same, said to be trained on the world of ``kitti_root``."""
+    return write_weights(tmp_path / "leaky", ["simulated/1000-1100"])
+
+
+def write_weights(folder: Path, trained_on: list[str]) -> Path:
+    import torch
+
+    from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+    from erfsfm.config import NetworkConfig
+
+    torch.manual_seed(0)
+    network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208)
+    record = ModelRecord(network=network, trained_on=trained_on, licence="none, untrained")
+    save_model(folder, Model(record, *build_networks(network)))
+    return folder

@@ -51,7 +51,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path: Path) -> N
         path.write_text("half")
         raise OSError("disk full")
 
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(RunError, match="disk full"):
         folder.write("run.log", fail)
     assert [path.name for path in tmp_path.iterdir()] == ["run.log"]
     assert (tmp_path / "run.log").read_text() == "old"

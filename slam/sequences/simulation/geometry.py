@@ -39,17 +39,20 @@ class Material(IntEnum):
 class Mesh:
     """A finished soup; coordinates in the street frame (x east, y north, z up, metres).
 
+    What pixels look up is stored with the triangles or instances last: gathering and arithmetic are
+    several times faster so.
+
     Attributes:
         vertices: ``(V, 3)``.
         triangles: vertex indices, ``(T, 3)``.
-        uv: texture coordinates of the three corners, metres, ``(T, 3, 2)``.
-        normals: unit normals, ``(T, 3)``.
-        tangents: unit direction in which u grows, ``(T, 3)``.
+        uv: texture coordinates of the three corners, metres, ``(3, 2, T)``.
+        normals: unit normals, ``(3, T)``.
+        tangents: unit direction in which u grows, ``(3, T)``.
         instance: index into the tables below, ``(T,)``.
-        material: per instance, ``(I,)``.
-        colours: two base colours per instance, RGB in [0, 1], ``(I, 2, 3)``.
-        parameters: what the texture of the material wants to know, ``(I, PARAMETERS)``.
-        offsets: where in the noise an instance lies, ``(I, 2)``.
+        material: of each triangle, ``(T,)``.
+        colours: two base colours per instance, RGB in [0, 1], ``(2, 3, I)``.
+        parameters: what the texture of the material wants to know, ``(PARAMETERS, I)``.
+        offsets: where in the noise an instance lies, ``(2, I)``.
     """
 
     vertices: Float32Array
@@ -58,7 +61,7 @@ class Mesh:
     normals: Float32Array
     tangents: Float32Array
     instance: NDArray[np.int32]
-    material: NDArray[np.int32]
+    material: NDArray[np.int8]
     colours: Float32Array
     parameters: Float32Array
     offsets: Float32Array
@@ -146,15 +149,20 @@ class Soup:
         return Mesh(
             vertices=vertices.astype(np.float32),
             triangles=triangles[keep].astype(np.uint32),
-            uv=uv[keep].astype(np.float32),
-            normals=normals[keep].astype(np.float32),
-            tangents=tangents[keep].astype(np.float32),
+            uv=_last(uv[keep]),
+            normals=_last(normals[keep]),
+            tangents=_last(tangents[keep]),
             instance=instance[keep].astype(np.int32),
-            material=np.array(self._materials, dtype=np.int32),
-            colours=np.stack(self._colours).astype(np.float32),
-            parameters=np.stack(self._parameters).astype(np.float32),
-            offsets=self._rng.uniform(0.0, 200.0, (count, 2)).astype(np.float32),
+            material=np.array(self._materials, dtype=np.int8)[instance[keep]],
+            colours=_last(np.stack(self._colours)),
+            parameters=_last(np.stack(self._parameters)),
+            offsets=_last(self._rng.uniform(0.0, 200.0, (count, 2))),
         )
+
+
+def _last(table: FloatArray) -> Float32Array:
+    """A table with its first axis moved to the end, contiguous."""
+    return np.ascontiguousarray(np.moveaxis(table, 0, -1), dtype=np.float32)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,8 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
         return np.repeat(here[None], BLUR_SAMPLES, axis=0)
     share = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
     share *= SHUTTER / (high - low)
-    return here @ se3.from_rotation_vector(share[:, None] * turn, share[:, None] * T_low_high[:3, 3])
+    T_here_shutter = se3.from_rotation_vector(share[:, None] * turn, share[:, None] * T_low_high[:3, 3])
+    return np.asarray(here @ T_here_shutter)
 
 
 class Traffic:
@@ -106,23 +107,25 @@ class Traffic:
             self._mesh,
             vertices=corners,
             triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
-            uv=np.concatenate([part.uv for part in parts]),
-            normals=np.concatenate([part.normals for part in parts]),
-            tangents=np.concatenate([part.tangents for part in parts]),
+            uv=np.concatenate([part.uv for part in parts], axis=-1),
+            normals=np.concatenate([part.normals for part in parts], axis=-1),
+            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
             instance=np.concatenate([part.instance for part in parts]),
+            material=np.concatenate([part.material for part in parts]),
         )
 
     def _part(self, number: int, T_street_car: FloatArray) -> Mesh:
         """One car's triangles, three vertices each, moved into the street."""
         mine = self._car_of_triangle == number
-        R, t = T_street_car[:3, :3].T.astype(np.float32), T_street_car[:3, 3].astype(np.float32)
+        R, t = T_street_car[:3, :3].astype(np.float32), T_street_car[:3, 3].astype(np.float32)
         return dataclasses.replace(
             self._mesh,
-            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R + t,
-            uv=self._mesh.uv[mine],
-            normals=self._mesh.normals[mine] @ R,
-            tangents=self._mesh.tangents[mine] @ R,
+            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
+            uv=self._mesh.uv[..., mine],
+            normals=R @ self._mesh.normals[:, mine],
+            tangents=R @ self._mesh.tangents[:, mine],
             instance=self._mesh.instance[mine],
+            material=self._mesh.material[mine],
         )
 
     def _leader(self, index: int) -> FloatArray | None:
@@ -145,4 +148,3 @@ class Traffic:
         left /= np.linalg.norm(left)
         position = lane[k] + (sample - k) * (lane[k + 1] - lane[k]) + sense * left_m * left
         return se3.make(np.stack([ahead, left, np.cross(ahead, left)], axis=1), position)
-

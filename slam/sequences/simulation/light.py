@@ -52,31 +52,29 @@ def draw_weather(seed: int) -> Weather:
 
 
 def sky(weather: Weather, directions: Float32Array) -> Float32Array:
-    """Colour of the sky along unit ``directions`` in the street frame, ``(N, 3)`` both."""
-    up = np.clip(directions[:, 2], 0.0, 1.0)
-    rgb = weather.horizon + np.sqrt(up)[:, None] * (weather.zenith - weather.horizon)
-    plane = directions[:, :2] / (up + 0.12)[:, None]
+    """Colour of the sky along unit ``directions`` in the street frame, ``(3, N)`` both."""
+    up = np.clip(directions[2], 0.0, 1.0)
+    rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
+    plane = directions[:2] / (up + 0.12)
     still = np.zeros_like(up)
     size = 0.006 / (up + 0.12)
-    texels = Texels(plane[:, 0], plane[:, 1], size, size, still, still)
+    texels = Texels(plane[0], plane[1], size, size, still, still)
     cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
-    share = np.clip(1.6 * cover, 0.0, 0.85)[:, None]
-    white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)[:, None]
+    share = np.clip(1.6 * cover, 0.0, 0.85)
+    white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
     return np.asarray(rgb + share * (white - rgb), dtype=np.float32)
 
 
-def light(
-    weather: Weather, normals: Float32Array, lit: Float32Array
-) -> Float32Array:
-    """Irradiance on surfaces that face the viewer, ``(N, 3)``.
+def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
+    """Irradiance on surfaces that face the viewer, ``(3, N)``.
 
     Args:
         weather: of the world.
-        normals: unit, towards the viewer, ``(N, 3)``.
+        normals: unit, towards the viewer, ``(3, N)``.
         lit: 1 where the sun is seen, ``(N,)``.
     """
-    direct = weather.sunshine * np.clip(normals @ weather.sun, 0.0, 1.0) * lit
-    around = weather.ambient * (0.78 + 0.22 * normals[:, 2])
-    warm = np.array([1.05, 1.0, 0.92], dtype=np.float32)
-    cool = np.array([0.96, 1.0, 1.06], dtype=np.float32)
-    return np.asarray(direct[:, None] * warm + around[:, None] * cool, dtype=np.float32)
+    direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
+    around = weather.ambient * (0.78 + 0.22 * normals[2])
+    warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
+    cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
+    return np.asarray(direct * warm + around * cool, dtype=np.float32)

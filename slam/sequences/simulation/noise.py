@@ -2,10 +2,14 @@
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.sequences.simulation.geometry import Float32Array
+
+Lengths = NDArray[np.floating[Any]]
 
 _SIZE = 256  # lattice cells before the noise repeats
 
@@ -47,10 +51,10 @@ def value_noise(u: Float32Array, v: Float32Array) -> Float32Array:
     i, j = whole_u.astype(np.int32), whole_v.astype(np.int32)
     left, right = (i & 255) << 8, ((i + 1) & 255) << 8
     low, high = j & 255, (j + 1) & 255
-    bottom = table[left | low]
-    bottom += a * (table[right | low] - bottom)
-    top = table[left | high]
-    top += a * (table[right | high] - top)
+    bottom = np.take(table, left | low)
+    bottom += a * (np.take(table, right | low) - bottom)
+    top = np.take(table, left | high)
+    top += a * (np.take(table, right | high) - top)
     top -= bottom
     top *= b
     top += bottom
@@ -61,7 +65,7 @@ def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
     """A random number in [0, 1] for each integer cell, ``(N,)``."""
     i = (np.floor(u).astype(np.int32) + 37 * salt) & 255
     j = (np.floor(v).astype(np.int32) + 101 * salt) & 255
-    return np.asarray(0.5 + 0.5 * _lattice()[(i << 8) | j])
+    return np.asarray(0.5 + 0.5 * np.take(_lattice(), (i << 8) | j))
 
 
 def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
@@ -90,22 +94,18 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
     return total
 
 
-def stripes(
-    x: Float32Array, size: Float32Array, period: Float32Array | float, width: Float32Array | float
-) -> Float32Array:
+def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float) -> Float32Array:
     """Share of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
     half = 0.5 * np.maximum(size, 1e-4)
 
-    def integral(at: Float32Array) -> Float32Array:
+    def integral(at: Lengths) -> Lengths:
         whole = np.floor(at / period)
         return np.asarray(whole * width + np.minimum(at - whole * period, width))
 
     return np.asarray((integral(x + half) - integral(x - half)) / (2.0 * half))
 
 
-def band(
-    x: Float32Array, size: Float32Array, low: Float32Array | float, high: Float32Array | float
-) -> Float32Array:
+def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float) -> Float32Array:
     """Share of each pixel covered by the one stripe [low, high]."""
     inverse = 1.0 / np.maximum(size, 1e-4)
     return np.asarray(np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1))

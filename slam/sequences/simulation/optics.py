@@ -34,12 +34,12 @@ def footprint(
 
     Args:
         pixel: size of the pixel at the surface's distance, metres, ``(N,)``.
-        rays: unit, ``(N, 3)``.
-        normals: unit, ``(N, 3)``.
-        tangents: unit direction of u, ``(N, 3)``.
+        rays: unit, ``(3, N)``.
+        normals: unit, ``(3, N)``.
+        tangents: unit direction of u, ``(3, N)``.
     """
-    cosine = np.abs(np.einsum("ij,ij->i", rays, normals))
-    along_u = np.einsum("ij,ij->i", rays, tangents)
+    cosine = np.abs((rays * normals).sum(axis=0))
+    along_u = (rays * tangents).sum(axis=0)
     cosine2 = np.maximum(cosine * cosine, 1e-4)
     u2 = along_u * along_u
     v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)

@@ -159,9 +159,7 @@ def _lane(plan: StreetPlan, seed: int) -> FloatArray:
     return _resample(path)
 
 
-def _corner(
-    rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray
-) -> list[FloatArray]:
+def _corner(rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray) -> list[FloatArray]:
     """An arc of 8.5 to 11 m radius, less where the edges are short; nothing but the corner if straight on."""
     a, b = before - corner, after - corner
     shorter = min(float(np.linalg.norm(a)), float(np.linalg.norm(b)))
@@ -231,4 +229,5 @@ def _shake(rng: np.random.Generator, frames: int) -> FloatArray:
     white = rng.standard_normal((frames + 60, 4))
     slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]
-    return np.clip(mixed, -2.2, 2.2) * [np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012]
+    sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
+    return np.asarray(np.clip(mixed, -2.2, 2.2) * sizes)

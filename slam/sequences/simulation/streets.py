@@ -1,6 +1,7 @@
 """The street plan: which edges of an irregular grid are streets, and which way the camera drives over them."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +90,7 @@ def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> li
             walk.append(steps[rng.integers(len(steps))])
         driven: set[tuple[Node, Node]] = set()
         same = opposite = 0
-        for step in zip(walk[:edges], walk[1 : edges + 1]):
+        for step in pairwise(walk[: edges + 1]):
             same += step in driven
             opposite += step[::-1] in driven
             driven.add(step)
@@ -115,7 +116,7 @@ def town_plan(rng: np.random.Generator, drive: list[Node], spacing: float, side_
     along_y = rng.random((len(lines[0]), len(lines[1]) - 1)) < side_streets
     along_x[:, [0, -1]] = False
     along_y[[0, -1], :] = False
-    for a, b in zip(shifted[:-1], shifted[1:]):
+    for a, b in pairwise(shifted):
         low = min(a, b)
         (along_x if a[1] == b[1] else along_y)[low] = True
     return StreetPlan(lines[0], lines[1], along_x, along_y, half_width, tuple(shifted))

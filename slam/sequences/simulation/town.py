@@ -36,7 +36,8 @@ class _Town:
         stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
         turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
-        lines = (plan.half_width, float(rng.uniform(3.0, 6.0)), float(rng.uniform(0.35, 0.6)), float(rng.random() < 0.7))
+        dash, share, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
+        lines = (plan.half_width, float(dash), float(share), float(edged))
         soup = self.soup
         self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
         self.junction = soup.instance(Material.JUNCTION, grey, paint)
@@ -60,16 +61,16 @@ class _Town:
                 neighbours = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
                 crossed = any(self.plan.is_street((i, j), other) for other in neighbours)
                 rectangle = (x - half, y - half, x + half, y + half)
-                # twice the road's half width beyond, under the rounded kerbs
                 self._slab(rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass)
-        self._corner_fill()
+                if crossed:
+                    self._corner_fill(x, y)
 
-    def _corner_fill(self) -> None:
-        """Asphalt under the rounded corners of the blocks, just below the road so that nothing flickers."""
-        reach = self.plan.half_width + ROUNDING
-        for i, x in enumerate(self.plan.xs):
-            for j, y in enumerate(self.plan.ys):
-                self._slab((x - reach, y - reach, x + reach, y + reach), -0.012, self.junction)
+    def _corner_fill(self, x: float, y: float) -> None:
+        """Asphalt outside the rounded kerbs at a junction, and a hair lower where it runs below the blocks."""
+        near, reach = self.plan.half_width, self.plan.half_width + ROUNDING
+        for x0, x1 in ((x - reach, x - near), (x + near, x + reach)):
+            for y0, y1 in ((y - reach, y - near), (y + near, y + reach)):
+                self._slab((x0, y0, x1, y1), -0.005, self.junction)
 
     def _corridor(self, rectangle: Rectangle, a: tuple[int, int], b: tuple[int, int]) -> None:
         """A stretch of road between two junctions, or the grass that lies there instead."""
@@ -82,9 +83,8 @@ class _Town:
         else:
             points, length = self._grid((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
         rows, columns = points.shape[:2]
-        v, u = np.meshgrid(
-            np.linspace(-self.plan.half_width, self.plan.half_width, rows), np.linspace(0, length, columns), indexing="ij"
-        )
+        half = self.plan.half_width
+        v, u = np.meshgrid(np.linspace(-half, half, rows), np.linspace(0.0, length, columns), indexing="ij")
         self.soup.patch(points, np.stack([u, v], axis=2), self.asphalt)
 
     def _grid(self, rectangle: Rectangle, z: float, step: float) -> FloatArray:
@@ -132,8 +132,8 @@ class _Town:
             ahead, back = (after - here) / np.linalg.norm(after - here), (before - here) / np.linalg.norm(before - here)
             for angle in np.linspace(0.0, np.pi / 2.0, 6):
                 rim.append(here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead))
-            length = float(np.linalg.norm(after - here))
-            for along in np.arange(ROUNDING + 2.0, length - ROUNDING - 1.0, 2.5):
+            reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
+            for along in np.arange(ROUNDING + 2.0, reach, 2.5):
                 rim.append(here + along * ahead)
         edge = np.stack([*rim, rim[0]])
         inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
@@ -147,7 +147,8 @@ class _Town:
         lip[..., 2] += 0.004
         towards = inside - edge
         lip[1, :, :2] += 0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
-        self.soup.patch(lip, np.stack([np.stack([length] * 2), np.stack([0 * length, 0 * length + 0.16])], 2), self.kerb)
+        across = np.stack([np.zeros_like(length), np.full_like(length, 0.16)])
+        self.soup.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
 
     def _furnish(self, start: FloatArray, end: FloatArray) -> None:
         """Trees, lamps and signs along one kerb, which has its block on the left, and cars in front of it."""

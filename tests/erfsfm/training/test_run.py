@@ -6,10 +6,12 @@ import csv
 import os
 import pickle
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -388,6 +390,26 @@ def test_workers_change_nothing(small: Small, world: Path, tmp_path: Path) -> No
         config = configure(small, [world], data={"workers": workers}, training={"steps": 2})
         train(config, tmp_path / str(workers), device="cpu")
     assert same(tmp_path / "0", tmp_path / "1")
+
+
+def test_workers_start_where_opencv_has_threads(small: Small, world: Path, tmp_path: Path) -> None:
+    """A forked worker would wait forever for the threads of OpenCV's pool, which it does not inherit."""
+
+    def too_late(*_: object) -> None:
+        raise TimeoutError("the worker hangs")
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(4)
+    cv2.resize(np.zeros((2000, 2000, 3), np.uint8), (1500, 1500), interpolation=cv2.INTER_AREA)  # starts the pool
+    previous = signal.signal(signal.SIGALRM, too_late)
+    signal.alarm(60)
+    try:
+        train(configure(small, [world], data={"workers": 1}, training={"steps": 1}), tmp_path / "run", device="cpu")
+        assert cv2.getNumThreads() == 4, "as it was"
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
+        cv2.setNumThreads(threads)
 
 
 def test_lightning_keeps_quiet(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -59,7 +60,7 @@ def train(
     if dataset:
         roots = [*experiment.data.roots, *dataset]
         experiment = experiment.model_copy(update={"data": experiment.data.model_copy(update={"roots": roots})})
-    command = "erfsfm " + " ".join(sys.argv[1:])
+    command = shlex.join(["erfsfm", *sys.argv[1:]])
     folder = run_training(experiment, output, resume, device, command, quiet=not sys.stderr.isatty())
     typer.echo(f"weights in {folder}: use them with --weights {folder}")
 

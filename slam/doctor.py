@@ -78,7 +78,7 @@ def _sequence(root: Path, name: str) -> str:
     except SlamError as error:
         return f"missing  sequence {name}: {error}"
     truth = "true poses" if sequence.reference is not None else "no true poses"
-    height = f"camera {sequence.camera_height_m} m high" if sequence.camera_height_m else "camera height unknown"
+    height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
     scans = sum(sequence.scan_path(k) is not None for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
     return f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans"

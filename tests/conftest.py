@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import sys
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 # Read when NumPy and torch are first imported, so before any test module: one thread, and none that spins.
 os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -42,3 +45,86 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real recordings in {root}; set ERFSFM_DATA to their folder")
     return root
+
+
+_A = dict.fromkeys(("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"), float)
+_T = {
+    "snippet5": {**dict.fromkeys(("ate_mean", "ate_std", "re_mean", "re_std"), float), "count": int},
+    "align": dict.fromkeys(("none", "first", "scale", "6dof", "7dof"), _A),
+    "evo": dict.fromkeys(("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference"), float),
+}
+_WORDS = ("version", "commit", "command", "device", "weights", "weights_sha256", "weights_licence")
+_PROVENANCE = {**dict.fromkeys(_WORDS, str), "seed": int, "trained_on": list, "leak": bool}
+# metrics.json of a run that ended well: design, section 7
+_METRICS = {
+    "schema": int,
+    "status": str,
+    "provenance": _PROVENANCE,
+    "sequence": {"name": str, "frames": int, "length_m": float, "fps": float},
+    "timing": {
+        **dict.fromkeys(("seconds_total", "frames_per_second", "cpu_seconds", "peak_rss_mb"), float),
+        "stages": dict,
+    },
+    "scale": {"mode": str, "value": float},
+    "trajectories": dict.fromkeys(("network", "odometry", "optimised", "lidar"), _T),
+    "graph": {"nodes": int, "factors": int, "coverage": dict.fromkeys(("50", "90", "95"), float)},
+    "loops": {**dict.fromkeys(("candidates", "verified", "accepted"), int), "rejected": list},
+    "map": {
+        **dict.fromkeys(("triangles", "points", "blocks"), int),
+        **dict.fromkeys(("accuracy_median_m", "completeness"), float),
+    },
+}
+# may be null only where they are null for a reason; these never are
+_ALWAYS = {"schema", "status", "provenance", "frames", "name", "timing", "mode", "nodes", "factors", *_PROVENANCE}
+_STEMS = ("trajectory_network", "trajectory_odometry", "trajectory_optimised")
+_FILES = ("config.yaml", "metrics.json", "graph.g2o", "loops.json", "report.html", "run.log")
+_MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
+
+
+def _mistakes(node: Any, wanted: Any, where: str) -> list[str]:
+    """What of a part of ``metrics.json`` is not as the design has it."""
+    if not isinstance(wanted, Mapping):
+        right = isinstance(node, (int, float) if wanted is float else wanted) and (wanted is bool or node is not True)
+        return [] if right else [f"{where} is {node!r}, not {wanted.__name__}"]
+    if not isinstance(node, dict):
+        return [f"{where} is {node!r}, not an object"]
+    found = []
+    for key, kind in wanted.items():
+        place = f"{where}.{key}"
+        if key not in node:
+            found.append(f"{place} is missing")
+        elif node[key] is not None:
+            found += _mistakes(node[key], kind, place)
+        elif key in _ALWAYS:
+            found.append(f"{place} is null")
+        elif not isinstance(node.get(f"{key}_reason"), str) or not node[f"{key}_reason"]:
+            found.append(f"{place} is null without a reason")
+    return found
+
+
+@pytest.fixture(scope="session")
+def check_run() -> Callable[[Path], dict[str, Any]]:
+    """Checks that a folder holds every file of a run that ended well, and gives its metrics (design, 6 and 7)."""
+
+    def check(path: Path) -> dict[str, Any]:
+        def refuse(word: str) -> None:
+            raise AssertionError(f"metrics.json holds {word}")
+
+        metrics: dict[str, Any] = json.loads((path / "metrics.json").read_text(), parse_constant=refuse)
+        assert _mistakes(metrics, _METRICS, "metrics") == []
+        assert (metrics["schema"], metrics["status"]) == (1, "ok")
+        maps = _MAP_FILES if metrics["map"]["triangles"] else ()
+        stems = (*_STEMS, "reference") if metrics["sequence"]["length_m"] is not None else _STEMS
+        wanted = {*_FILES, *maps, *(f"{stem}.{kind}.txt" for stem in stems for kind in ("kitti", "tum"))}
+        assert {file.name for file in path.iterdir()} == wanted
+        for stem in stems:
+            rows = np.loadtxt(path / f"{stem}.kitti.txt", ndmin=2)
+            assert rows.shape == (metrics["sequence"]["frames"], 12) and np.isfinite(rows).all()
+            np.testing.assert_allclose(rows[0], np.eye(4)[:3].ravel(), atol=1e-9)
+            timed = np.loadtxt(path / f"{stem}.tum.txt", ndmin=2)
+            np.testing.assert_allclose(timed[:, 1:4], rows[:, 3::4], atol=1e-8)
+            assert (np.diff(timed[:, 0]) > 0).all()
+        assert metrics["graph"]["nodes"] == metrics["sequence"]["frames"]
+        return metrics
+
+    return check

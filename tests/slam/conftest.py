@@ -165,25 +165,31 @@ def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
 
 
 @pytest.fixture(scope="session")
-def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small networks with their first random weights, as a training run would have written them."""
-    return write_weights(tmp_path_factory.mktemp("weights"), ["simulated/17"])
+def write_weights() -> Callable[..., Path]:
+    """Writes small networks with their first random weights, as a training run would have."""
+
+    def write(folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4) -> Path:
+        import torch
+
+        from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+        from erfsfm.config import NetworkConfig
+
+        torch.manual_seed(0)
+        network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources)
+        record = ModelRecord(network=network, trained_on=list(trained_on), licence="none, untrained")
+        save_model(folder, Model(record, *build_networks(network)))
+        return folder
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]) -> Path:
+    """Small networks that have learned nothing."""
+    return write_weights(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture
-def leaky_weights(tmp_path: Path) -> Path:
+def leaky_weights(tmp_path: Path, write_weights: Callable[..., Path]) -> Path:
     """The same, said to be trained on the world of ``kitti_root``."""
-    return write_weights(tmp_path / "leaky", ["simulated/1000-1100"])
-
-
-def write_weights(folder: Path, trained_on: list[str]) -> Path:
-    import torch
-
-    from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
-    from erfsfm.config import NetworkConfig
-
-    torch.manual_seed(0)
-    network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208)
-    record = ModelRecord(network=network, trained_on=trained_on, licence="none, untrained")
-    save_model(folder, Model(record, *build_networks(network)))
-    return folder
+    return write_weights(tmp_path / "leaky", ("simulated/1000-1100",))

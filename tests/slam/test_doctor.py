@@ -50,7 +50,7 @@ def test_a_data_set_sequence_by_sequence(
     if by_variable:
         monkeypatch.setenv("KITTI_ODOMETRY", str(kitti_root))
     line = finding(examine(None if by_variable else kitti_root), "sequence sim")
-    assert line.startswith("ok") and "14 frames of 208x64, true poses, camera 1.6" in line
+    assert line.startswith("ok") and "14 frames of 208x64, true poses, camera 1.54 m high" in line
 
 
 def test_an_empty_variable_is_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -347,7 +347,7 @@ def test_code_in_a_checkpoint_never_runs(cut: tuple[ExperimentConfig, Path], tmp
     if kind == "torch":
         torch.save(state, path)
     else:
-        path.write_bytes(pickle.dumps(state))
+        path.write_bytes(pickle.dumps(state, protocol=2))
     refused_checkpoint(cut)
     assert not (tmp_path / "executed").exists()
 

@@ -1,0 +1,222 @@
+"""From a data set and weights to a run folder, the way a user goes; the networks have learned nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+import slam.run
+from slam import run_slam
+from slam.config import load_config
+from slam.errors import RunError, SlamError
+from slam.pipeline import SlamPipeline
+from slam.run_folder import RunFolder
+
+CheckRun = Callable[[Path], dict[str, Any]]
+CopyRoot = Callable[[], Path]
+
+NO_REPORT = "output.report=false"
+
+
+@pytest.fixture(scope="module")
+def run(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """One whole run with everything on. Not to be changed."""
+    output = tmp_path_factory.mktemp("runs") / "run"
+    return run_slam(kitti_root, "sim", weights=tiny_weights, output=output, seed=3, command="erfsfm-slam run ...")
+
+
+@pytest.fixture
+def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any]:
+    """Arguments of a run of a second: networks and graph alone."""
+    overrides = ["mapping.enabled=false", "geometry.enabled=false", f"output.root={tmp_path / 'results'}", NO_REPORT]
+    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:6"}
+
+
+@pytest.fixture
+def reported(quick: dict[str, Any]) -> dict[str, Any]:
+    """The same with the report."""
+    return quick | {"overrides": quick["overrides"][:-1]}
+
+
+def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> None:
+    metrics = check_run(run.path)
+    provenance = metrics["provenance"]
+    assert (provenance["seed"], provenance["device"]) == (3, "cpu")
+    assert provenance["command"] == "erfsfm-slam run ..." and provenance["weights_licence"] == "none, untrained"
+    assert re.fullmatch("[0-9a-f]{64}", provenance["weights_sha256"])
+    assert provenance["trained_on"] == ["simulated/17"] and provenance["leak"] is False
+    sequence = metrics["sequence"]
+    assert (sequence["name"], sequence["frames"], sequence["fps"]) == ("sim", 14, pytest.approx(10.0))
+    assert 9 < sequence["length_m"] < 18
+    assert sum(metrics["timing"]["stages"].values()) <= metrics["timing"]["seconds_total"]
+    assert metrics["trajectories"]["lidar"] is None
+    for name in ("network", "odometry", "optimised"):
+        assert metrics["trajectories"][name]["snippet5"]["count"] == 10
+        assert metrics["trajectories"][name]["evo"]["difference"] < 1e-6
+        assert "100 m" in metrics["trajectories"][name]["align"]["7dof"]["t_rel_percent_reason"]
+
+
+def test_the_configuration_reads_back(run: RunFolder) -> None:
+    assert load_config(run.path / "config.yaml") == load_config()
+
+
+def test_the_report_and_the_log_tell_of_it(run: RunFolder) -> None:
+    report = (run.path / "report.html").read_text()
+    assert "none, untrained" in report and ">FAILED<" not in report and ">LEAK<" not in report
+    assert not re.search(r"(src|href)=['\"]https?:", report)
+    assert "slam.pose_graph: pose graph" in (run.path / "run.log").read_text()
+    assert all(not isinstance(handler, logging.FileHandler) for handler in logging.getLogger("slam").handlers)
+
+
+def test_the_snippets_of_the_network_are_its_own_answers(run: RunFolder) -> None:
+    """Cut from the chain they would be other numbers: an untrained net's answers do not fit each other."""
+    numbers = run.metrics()["trajectories"]
+    assert numbers["network"]["snippet5"]["ate_mean"] != numbers["odometry"]["snippet5"]["ate_mean"]
+    assert numbers["network"]["snippet5"]["ate_mean"] > 0
+
+
+def test_weights_that_saw_the_sequence_are_stamped(reported: dict[str, Any], leaky_weights: Path) -> None:
+    folder = run_slam(**reported | {"weights": leaky_weights})
+    assert folder.metrics()["provenance"]["leak"] is True
+    assert ">LEAK<" in (folder.path / "report.html").read_text()
+
+
+def test_runs_get_a_stamp_a_name_and_a_link(quick: dict[str, Any], tmp_path: Path) -> None:
+    first, second = run_slam(**quick), run_slam(**quick)
+    assert re.fullmatch(r"\d{8}-\d{6}(-\d+)?_sim", first.path.name) and first.path != second.path
+    assert (tmp_path / "results" / "latest").resolve() == second.path.resolve()
+
+
+def test_two_runs_with_one_seed_give_one_trajectory(quick: dict[str, Any]) -> None:
+    first, second = (run_slam(**quick | {"overrides": quick["overrides"][:1] + quick["overrides"][2:]}) for _ in "ab")
+    for name in ("trajectory_network.tum.txt", "trajectory_optimised.kitti.txt", "graph.g2o"):
+        assert (first.path / name).read_bytes() == (second.path / name).read_bytes()
+
+
+def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
+    output = tmp_path / "mine"
+    run_slam(**quick, output=output)
+    (output / "map_mesh.ply").write_text("of an older run")
+    (output / "notes.txt").write_text("what I saw")
+    run_slam(**quick | {"frames": "0:7"}, output=output)
+    assert RunFolder.open(output).metrics()["sequence"]["frames"] == 7
+    assert not (output / "map_mesh.ply").exists()
+    assert (output / "notes.txt").read_text() == "what I saw"
+    assert not (tmp_path / "results").exists()
+
+
+def test_output_of_a_run_that_was_killed_is_used_again(quick: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "killed").mkdir()
+    (tmp_path / "killed" / "run.log").write_text("...")
+    assert run_slam(**quick, output=tmp_path / "killed").metrics()["status"] == "ok"
+
+
+def test_without_map_and_truth_the_reasons_stand_there(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    (root / "poses" / "sim.txt").unlink()
+    metrics = check_run(run_slam(**reported | {"dataset": root}).path)
+    assert "mapping.enabled" in metrics["map"]["triangles_reason"]
+    assert "no true poses" in metrics["sequence"]["length_m_reason"]
+    assert metrics["graph"]["coverage"] is None
+    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m_reason"]
+
+
+def test_the_report_can_be_left_out(quick: dict[str, Any]) -> None:
+    assert NO_REPORT in quick["overrides"]
+    folder = run_slam(**quick)
+    assert not (folder.path / "report.html").exists() and folder.metrics()["status"] == "ok"
+
+
+def test_a_run_that_fails_says_why_and_keeps_what_it_has(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
+) -> None:
+    root = copy_of_kitti_root()
+    image = root / "sequences" / "sim" / "image_2" / "000007.png"
+    image.write_bytes(image.read_bytes()[:200])
+    output = tmp_path / "failed"
+    with pytest.raises(SlamError, match=r"000007\.png is truncated"):
+        run_slam(**reported | {"dataset": root, "frames": None}, output=output)
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["status"] == "failed" and "000007.png is truncated" in metrics["reason"]
+    assert metrics["provenance"]["weights_licence"] == "none, untrained"
+    report = (output / "report.html").read_text()
+    assert ">FAILED<" in report and "000007.png is truncated" in report
+    assert "the run failed" in (output / "run.log").read_text()
+    assert yaml.safe_load((output / "config.yaml").read_text())["mapping"]["enabled"] is False
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")])
+def test_whatever_ends_a_run_its_folder_says_so(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def stop(self: SlamPipeline) -> None:
+        raise error
+
+    monkeypatch.setattr(SlamPipeline, "run", stop)
+    with pytest.raises(type(error)):
+        run_slam(**quick, output=tmp_path / "ended")
+    metrics = RunFolder.open(tmp_path / "ended").metrics()
+    wanted = {"ValueError": "ValueError: a bug", "RunError": "x"}.get(type(error).__name__, type(error).__name__)
+    assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
+
+
+def test_trajectories_stay_where_the_map_cannot_be_written(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(slam.run, "_write_map", full)
+    with pytest.raises(OSError, match="No space left"):
+        run_slam(**quick, output=tmp_path / "full")
+    folder = RunFolder.open(tmp_path / "full")
+    assert "No space left" in folder.metrics()["reason"]
+    optimised = folder.trajectory("optimised")
+    assert optimised is not None and len(optimised) == 6
+
+
+def test_an_untrained_pose_network_with_two_sources_runs(
+    reported: dict[str, Any], tmp_path: Path, write_weights: Callable[..., Path], check_run: CheckRun
+) -> None:
+    metrics = check_run(run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path)
+    assert metrics["trajectories"]["network"]["snippet5"]["count"] == 2
+
+
+def test_wishes_that_cannot_be_met_make_no_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+    for wish in ({"sequence": "09"}, {"frames": "0:99"}, {"overrides": ["map.enabled=false"]}):
+        with pytest.raises(SlamError):
+            run_slam(**quick | wish, output=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_progress_is_told(quick: dict[str, Any]) -> None:
+    told: list[tuple[str, int, int]] = []
+    run_slam(**quick, progress=lambda *words: told.append(words))
+    assert told == [("frames", k, 6) for k in range(1, 7)]
+
+
+def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert slam.run._commit() == ""
+
+
+def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: RunFolder) -> None:
+    class Result:
+        optimised = run.trajectory("network")
+        reference = run.trajectory("reference")
+        factors = ()
+
+    assert Result.optimised is not None
+    Result.optimised.T_world_camera[:] = np.eye(4)
+    graph = slam.run._graph(Result)  # type: ignore[arg-type]
+    assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]

@@ -70,6 +70,12 @@ class LossConfig(Section):
         default="mean", description="over sources: 'minimum' forgives occlusion (Godard et al. 2019)"
     )
     auto_mask: bool = Field(default=False, description="ignore pixels that a still camera explains better")
+    warm_up_steps: int = Field(
+        default=0,
+        ge=0,
+        description="first steps under the plain mean without auto-mask: a minimum over sources teaches the "
+        "pose network only the source that fits best already",
+    )
     scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
     smoothness: Literal["depth-second-order", "disparity-second-order", "disparity-edge-aware"] = Field(
         default="depth-second-order", description="what is kept smooth, and how"

@@ -27,6 +27,8 @@ class SelfSupervision(lightning.LightningModule):
     def __init__(self, config: ExperimentConfig) -> None:
         super().__init__()
         self.config = config
+        plain = config.loss.model_copy(update={"reduction": "mean", "auto_mask": False})
+        self._warm_up = config.model_copy(update={"loss": plain})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
@@ -34,7 +36,8 @@ class SelfSupervision(lightning.LightningModule):
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The objective of one batch; stops the run where it is not a number."""
         snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"])
-        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self.config)
+        warm = self.global_step < self.config.loss.warm_up_steps
+        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._warm_up if warm else self.config)
         if not torch.isfinite(outcome.total):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
             raise TrainingError(

@@ -1,0 +1,149 @@
+"""The whole system on the simulated street, where every truth is known: first an oracle, then the shipped networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam import run_slam, se3
+from slam.config import load_config
+from slam.evaluation import trajectory_metrics
+from slam.frames import Frame
+from slam.frontend.geometric_factors import ESSENTIAL_SOURCE
+from slam.frontend.refusal import Refusal
+from slam.map_metrics import pose_similarity
+from slam.oracle import OracleNoise, OraclePredictor
+from slam.pipeline import SlamPipeline, SlamResult
+from slam.se3 import FloatArray
+from slam.sequences.excerpt import Excerpt
+from slam.sequences.simulated import SimulatedFrame, SimulationOptions
+from slam.sequences.simulated_sequence import SimulatedSequence
+from slam.trajectory import Trajectory
+
+FACTOR = 0.2  # unscaled lengths per metre
+NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_sigma_share": 0.05, "depth_sigma_share": 0.03}
+
+
+class Rendered(SimulatedSequence):
+    """The street with every frame rendered once, its depth beside it."""
+
+    def __init__(self, options: SimulationOptions) -> None:
+        super().__init__(options)
+        self._frames: list[SimulatedFrame] = [self.street.render(k) for k in range(options.frames)]
+
+    def frame(self, index: int) -> Frame:
+        """A rendered frame."""
+        return Frame(index, float(self.stamps[index]), self._frames[index].image)
+
+    def depth(self, index: int) -> FloatArray:
+        """True z-depth, the sky at 200 m."""
+        depth = self._frames[index].depth.astype(np.float64)
+        return np.where(depth > 0, depth, 200.0)
+
+
+@pytest.fixture(scope="module")
+def street() -> Rendered:
+    return Rendered(SimulationOptions("loop", frames=250, seed=1000, width=416, height=128))
+
+
+def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> SlamResult:
+    base, start = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+    assert isinstance(base, Rendered) and sequence.reference is not None
+    oracle = OraclePredictor(
+        sequence.reference, lambda k: base.depth(start + k), OracleNoise(**NOISE, seed=seed), FACTOR
+    )
+    return SlamPipeline(sequence, oracle, load_config(None, overrides)).run()
+
+
+def ate(estimate: Trajectory, result: SlamResult) -> float:
+    return float(trajectory_metrics(estimate, result.reference)["align"]["7dof"]["ate_rmse_m"])
+
+
+@pytest.fixture(scope="module")
+def round_trip(street: Rendered) -> SlamResult:
+    """Once around the block with everything on."""
+    return drive(street, 0)
+
+
+def test_images_and_graph_cut_the_noise_of_the_network(round_trip: SlamResult) -> None:
+    assert len(round_trip.optimised) == 250
+    sources = [factor.source for factor in round_trip.observations.geometric]
+    assert sources.count(ESSENTIAL_SOURCE) > 200
+    assert ate(round_trip.optimised, round_trip) < 0.6 * ate(round_trip.network, round_trip)
+    assert ate(round_trip.optimised, round_trip) < 0.01 * 250
+
+
+def test_the_camera_height_gives_metres(street: Rendered, round_trip: SlamResult) -> None:
+    estimate = round_trip.scale.estimate
+    assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, Refusal)
+    assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
+    assert estimate.frames_used > 200
+    assert round_trip.optimised.length_m == pytest.approx(round_trip.reference.length_m, rel=0.03)
+
+
+def test_the_map_lies_on_the_street(street: Rendered, round_trip: SlamResult) -> None:
+    assert round_trip.map is not None and round_trip.reference is not None
+    points = round_trip.map.cloud().points_world[::7]
+    assert len(points) > 10_000
+    fit = pose_similarity(round_trip.reference.T_world_camera, round_trip.optimised.T_world_camera)
+    points = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
+    distance = street.street.distance_to_surface(points)
+    assert np.median(distance) < 0.2  # a voxel
+    assert np.percentile(distance, 90) < 1.0
+
+
+def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
+    part = Excerpt(street, 40, 70)
+    oracle = OraclePredictor(part.reference, lambda k: street.depth(40 + k))
+    result = SlamPipeline(part, oracle, load_config(None, ["geometry.enabled=false"])).run()
+    assert result.map is not None
+    points = se3.apply(street.street.T_world_camera[40], result.map.cloud().points_world)
+    assert np.median(street.street.distance_to_surface(points)) < 0.03
+
+
+def test_the_graph_alone_cuts_the_noise(street: Rendered) -> None:
+    part = Excerpt(street, 0, 100)
+    options = ("geometry.enabled=false", "mapping.enabled=false")
+    runs = [drive(part, seed, *options) for seed in range(4)]
+    before, after = (np.mean([ate(getattr(run, name), run) for run in runs]) for name in ("network", "optimised"))
+    assert after < 0.7 * before
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The embedded street through the networks trained on other streets."""
+    output = tmp_path_factory.mktemp("learned") / "run"
+    run_slam(weights="/tmp/review_w", frames="0:120", output=output, device="cpu")
+    return output
+
+
+def yaw_steps(T_world_camera: FloatArray) -> FloatArray:
+    """Turn to the right from each frame to the next ``(N - 1,)``, radians."""
+    T_step = se3.invert(T_world_camera[:-1]) @ T_world_camera[1:]
+    return np.arctan2(T_step[:, 0, 2], T_step[:, 2, 2])
+
+
+def test_shipped_networks_turn_where_the_road_turns(
+    learned: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
+    metrics = check_run(learned)
+    assert metrics["provenance"]["leak"] is False
+    rows = {name: np.loadtxt(learned / f"{name}.kitti.txt") for name in ("trajectory_network", "reference")}
+    network, truth = (np.insert(r.reshape(-1, 3, 4), 3, [0, 0, 0, 1], axis=1) for r in rows.values())
+    assert np.corrcoef(yaw_steps(network), yaw_steps(truth))[0, 1] > 0.8
+    assert (network[1:, 2, 3] - network[:-1, 2, 3])[:20].min() > 0  # forward
+
+
+def test_the_system_is_not_worse_than_its_networks(
+    learned: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
+    metrics = check_run(learned)
+    errors = {name: metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] for name in ("network", "optimised")}
+    assert errors["optimised"] <= errors["network"]
+    assert errors["optimised"] < 0.05 * metrics["sequence"]["length_m"]
+    assert metrics["scale"]["mode"] == "camera-height"
+    assert metrics["map"]["triangles"] > 1000 and metrics["map"]["accuracy_median_m"] < 1.0

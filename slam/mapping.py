@@ -26,6 +26,7 @@ from slam.se3 import FloatArray, invert, rotation_angle
 
 _BLOCK_SIDE = 16
 _FIRST_BLOCKS = 1000
+_SEED_STRIDE = 4  # Open3D looks for blocks at these pixels alone, and raises where none of them has depth
 _ATTRIBUTES = ("tsdf", "weight", "color")
 
 logger = logging.getLogger(__name__)
@@ -201,9 +202,10 @@ class TsdfMap:
 
     def _fuse(self, view: _View, agrees: NDArray[np.bool_]) -> None:
         config = self._config
-        near = (view.depth >= config.depth_min_m) & (view.depth <= config.depth_max_m)
+        near = (view.depth >= config.depth_min_m) & (view.depth < config.depth_max_m)
         kept = near & agrees & ~_at_edges(view.depth, config.max_depth_step)
-        if not kept.any():
+        rows, columns = (side // _SEED_STRIDE * _SEED_STRIDE for side in kept.shape)
+        if not kept[:rows:_SEED_STRIDE, :columns:_SEED_STRIDE].any():
             return
         if self._grid.hashmap().size() >= config.max_blocks:
             if self._left_out == 0:

@@ -185,3 +185,15 @@ def test_a_full_map_stops_growing_and_counts_what_it_left_out(caplog):
 def test_wrong_sizes_are_refused():
     with pytest.raises(ValueError, match=r"\(64, 208\)"):
         TsdfMap(MappingConfig(), CAMERA).integrate(np.ones((3, 4), np.float32), GREY, np.eye(4))
+
+
+@pytest.mark.parametrize(("first", "size", "fused"), [(4, 5, 0), (4, 6, 1), (59, 6, 0)])
+def test_a_frame_with_hardly_any_depth_left_is_skipped(first: int, size: int, fused: int):
+    """Open3D raises where no pixel of its coarse grid has depth; the border of a patch counts as an edge."""
+    depth = np.zeros((CAMERA.height - 1, CAMERA.width), np.float32)
+    depth[first : first + size, 4:20] = 8.0
+    camera = Intrinsics(CAMERA.width, CAMERA.height - 1, 120.0, 120.0, 103.5, 31.5)
+    tsdf_map = TsdfMap(MappingConfig(), camera)
+    tsdf_map.integrate(depth, GREY[:-1], pose(0.0, 0.0, 0.0))
+    tsdf_map.statistics()
+    assert tsdf_map.statistics().frames_fused == fused

@@ -73,8 +73,8 @@ class LossConfig(Section):
     warm_up_steps: int = Field(
         default=0,
         ge=0,
-        description="first steps under the plain mean without auto-mask: a minimum over sources teaches the "
-        "pose network only the source that fits best already",
+        description="first steps under the paper's plain L1 mean: structure finds no large rotation, and a minimum "
+        "teaches the pose network only the source that fits best already",
     )
     scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
     smoothness: Literal["depth-second-order", "disparity-second-order", "disparity-edge-aware"] = Field(

@@ -92,7 +92,9 @@ def evaluate(
     """
     if all(path.is_dir() for path in paths):
         if fail_over:
-            raise typer.BadParameter("limits are for two trajectory files, not for run folders", param_hint="--fail-over")
+            raise typer.BadParameter(
+                "limits are for two trajectory files, not for run folders", param_hint="--fail-over"
+            )
         _evaluate_runs(paths, as_json)
     elif len(paths) == 2:
         _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)

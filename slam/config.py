@@ -34,6 +34,9 @@ class FrontendConfig(Section):
     translation_floor_share: float = Field(
         default=0.05, gt=0, le=10, description="floor, as a share of the median one-frame step"
     )
+    noise_steps: int = Field(
+        default=20, ge=1, description="steps that image geometry must share before the noise is measured on them"
+    )
 
 
 class GeometryConfig(Section):
@@ -91,6 +94,41 @@ class ScaleConfig(Section):
         return self
 
 
+class LoopsConfig(Section):
+    """Loop closure, see ``loops/closure.py``; metres, or camera heights under scale mode none."""
+
+    enabled: bool = Field(default=True, description="look for places seen before")
+    frame_stride: int = Field(default=2, ge=1, description="look at every n-th frame")
+    max_features: int = Field(default=500, ge=50, le=5000, description="corners remembered of a frame")
+    corner_contrast: int = Field(default=10, ge=1, le=100, description="least grey-level contrast of a corner")
+    max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
+    words: int = Field(default=1000, ge=10, le=20000, description="binary words learned on the run")
+    min_gap_frames: int = Field(default=30, ge=1, description="a loop links frames at least this far apart")
+    min_path_m: float = Field(default=15.0, ge=0, description="and after driving at least this far")
+    candidates_per_frame: int = Field(default=2, ge=1, le=20, description="places to verify for a frame")
+    peak_frames: int = Field(default=10, ge=0, description="places are at least this many frames apart")
+    min_score: float = Field(default=0.2, ge=0, description="likeness, as a share of that of neighbouring frames")
+    ratio: float = Field(default=0.85, gt=0, le=1, description="nearest over second nearest descriptor distance")
+    max_hamming: int = Field(default=64, ge=1, le=256, description="largest distance of matching descriptors, bits")
+    ransac_iterations: int = Field(default=200, ge=10, description="samples of perspective-n-point")
+    reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier")
+    min_inliers: int = Field(default=20, ge=6, description="fewer refuse the loop")
+    min_inlier_share: float = Field(default=0.4, gt=0, le=1, description="share of the matches with depth that agree")
+    min_spread_share: float = Field(default=0.1, ge=0, lt=1, description="standard deviation of the inliers' columns")
+    agreement_deg: float = Field(default=2.0, gt=0, description="largest difference of both directions' rotations")
+    agreement_share: float = Field(default=0.1, gt=0, description="of their positions, as a share of the depth")
+    rotation_floor_deg: float = Field(default=0.15, gt=0, description="least rotation sigma")
+    translation_floor_share: float = Field(default=0.01, gt=0, description="least translation sigma, share of depth")
+    length_sigma_share: float = Field(default=0.1, gt=0, description="translation sigma, share of the translation")
+    max_drift_share: float = Field(default=0.3, gt=0, description="largest correction, as a share of the way between")
+    support_frames: int = Field(default=20, ge=1, description="loops with ends this near must agree")
+    min_support: int = Field(default=2, ge=0, description="images whose loops must agree with a loop")
+    alone_inliers: int = Field(default=120, ge=6, description="a loop with this many inliers may stand alone")
+    support_sigmas: float = Field(default=3.0, gt=0, description="sigmas that agreeing loops may differ by")
+    support_drift_share: float = Field(default=0.1, ge=0, description="drift of the odometry between their ends")
+    support_drift_deg: float = Field(default=0.1, ge=0, description="likewise, a frame")
+
+
 class PoseGraphConfig(Section):
     """The pose graph, see ``pose_graph.py``."""
 
@@ -102,6 +140,7 @@ class PoseGraphConfig(Section):
     max_iterations: int = Field(default=100, ge=1, description="Levenberg-Marquardt iterations per stage")
     relative_tolerance: float = Field(default=1e-6, gt=0, lt=1, description="stop below this relative decrease")
     max_dropped_loops: int = Field(default=10, ge=0, description="loop edges to give up where the system is singular")
+    max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual where a loop is given up")
 
 
 class MappingConfig(Section):
@@ -142,6 +181,7 @@ class SlamConfig(Section):
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
     scale: ScaleConfig = ScaleConfig()
+    loops: LoopsConfig = LoopsConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
     mapping: MappingConfig = MappingConfig()
     output: OutputConfig = OutputConfig()

@@ -18,6 +18,7 @@ from slam.se3 import FloatArray
 
 Image = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
+LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may give these up
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, Image, Predictor, RelativePose, SnippetPoses
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.geometric_factors import GeometricOdometry
-from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, network_factors
+from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors
 from slam.frontend.refusal import Refusal
 from slam.frontend.scale import (
     RoadPlane,
@@ -27,6 +27,8 @@ from slam.frontend.scale import (
     scale_from_road,
     scale_track,
 )
+from slam.loops.closure import LoopClosures, close_loops
+from slam.loops.descriptors import FeatureExtractor, View
 from slam.mapping import TsdfMap
 from slam.pose_graph import PoseGraph
 from slam.se3 import FloatArray, chain, invert
@@ -56,6 +58,7 @@ class Observations:
     geometric: list[RelativePose] = field(default_factory=list)
     refusals: list[tuple[int, int, str]] = field(default_factory=list)
     roads: list[RoadPlane | Refusal] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
     examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
 
@@ -80,6 +83,7 @@ class SlamResult:
     observations: Observations
     scale: Scale
     factors: list[RelativePose]
+    loops: LoopClosures
     graph: PoseGraph
     map: TsdfMap | None
     stopwatch: Stopwatch
@@ -110,10 +114,8 @@ class SlamPipeline:
         scale = self._find_scale(mode, observations, T_network)
         factors = self._measure(observations, scale)
         T_odometry = self._dead_reckon(factors, T_network, scale)
-        graph = PoseGraph(self._config.pose_graph)
-        graph.add_relative(*factors)
-        with self._watch.stage("graph"):
-            T_optimised = graph.optimise(T_odometry)
+        loops = self._close_loops(observations.views, scale, T_odometry)
+        graph, T_optimised = self._optimise(factors, loops, T_odometry)
         tsdf_map = self._fuse(observations.keyframes, scale, T_optimised)
         return SlamResult(
             network=self._trajectory(T_network),
@@ -123,6 +125,7 @@ class SlamPipeline:
             observations=observations,
             scale=scale,
             factors=factors,
+            loops=loops.without(graph.dropped),
             graph=graph,
             map=tsdf_map,
             stopwatch=self._watch,
@@ -154,6 +157,7 @@ class SlamPipeline:
         """One pass over the frames: depth, road, snippet poses and image geometry, as frames arrive."""
         seen = Observations()
         geometry = GeometricOdometry(self._config.geometry, self._sequence.intrinsics)
+        features = FeatureExtractor(self._config.loops, self._sequence.intrinsics)
         steps = self._config.geometry.steps if self._config.geometry.enabled else ()
         window: deque[Frame] = deque(maxlen=self._predictor.sources + 1)
         recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(steps, default=0) + 1)
@@ -171,9 +175,13 @@ class SlamPipeline:
             if len(window) == window.maxlen:
                 with self._watch.stage("pose network"):
                     seen.snippets.append(self._predictor.snippet(list(window)))
-            recent.append((frame, depth, road.height_unscaled if isinstance(road, RoadPlane) else None))
+            height = road.height_unscaled if isinstance(road, RoadPlane) else None
+            recent.append((frame, depth, height))
             with self._watch.stage("geometry"):
                 self._measure_geometry(geometry, recent, steps, seen)
+            if self._config.loops.enabled and index % self._config.loops.frame_stride == 0:
+                with self._watch.stage("loops"):
+                    seen.views.append(features.view(frame, depth, height))
             self._keep(frame, depth, index in wanted, seen)
             self._progress("frames", index + 1, total)
         return seen
@@ -231,7 +239,8 @@ class SlamPipeline:
 
     def _measure(self, seen: Observations, scale: Scale) -> list[RelativePose]:
         """All relative poses with their noise, in the mode's unit."""
-        factors = network_factors(seen.snippets, self._config.frontend) + seen.geometric
+        noise = measured_noise(seen.snippets, seen.geometric, self._config.frontend)
+        factors = network_factors(seen.snippets, noise) + seen.geometric
         return [rescaled(f, float(scale.per_frame[min(f.from_index, f.to_index)])) for f in factors]
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
@@ -242,6 +251,24 @@ class SlamPipeline:
             if factor.source != NETWORK_SOURCE and factor.to_index - factor.from_index == 1:
                 increments[factor.from_index] = factor.T_from_to
         return chain(increments)
+
+    def _close_loops(self, views: Sequence[View], scale: Scale, T_odometry: FloatArray) -> LoopClosures:
+        """Places seen before, looked for among all views after the last frame."""
+        with self._watch.stage("loops"):
+            scaled = [view.scaled(float(scale.per_frame[view.index])) for view in views]
+            return close_loops(scaled, T_odometry, self._sequence.intrinsics, self._config.loops)
+
+    def _optimise(
+        self, factors: Sequence[RelativePose], loops: LoopClosures, T_odometry: FloatArray
+    ) -> tuple[PoseGraph, FloatArray]:
+        """The trajectory that explains all measurements best, without the loops that contradict it."""
+        graph = PoseGraph(self._config.pose_graph)
+        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
+        with self._watch.stage("graph"):
+            T_optimised = graph.optimise(T_odometry)
+            while graph.drop_contradicted_loops():
+                T_optimised = graph.optimise(T_odometry)
+        return graph, T_optimised
 
     def _fuse(self, keyframes: Sequence[Keyframe], scale: Scale, T_world_camera: FloatArray) -> TsdfMap | None:
         """Learned depth at the optimised poses, fused into one surface."""

@@ -22,11 +22,11 @@ from scipy.stats import chi2
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
 from slam.files import write_atomically
-from slam.frames import RelativePose
+from slam.frames import LOOP_SOURCE, RelativePose
 from slam.se3 import FloatArray, invert, is_se3
 
-LOOP_SOURCE = "loop"
 _ANCHOR_SIGMA = 1e-6
+_OUTLYING = 3.0
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class PoseGraph:
 
     @property
     def dropped(self) -> tuple[RelativePose, ...]:
-        """Loop edges given up because the system could not be solved with them."""
+        """Loop edges given up: the system could not be solved with them, or they contradict the rest."""
         return tuple(self._dropped)
 
     @property
@@ -90,6 +90,27 @@ class PoseGraph:
                 self._drop_newest_loop(reason)
                 self._check_connected(len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
+
+    def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
+        """Give up the loops that the optimised trajectory could not meet while it met most others.
+
+        Where all loops pull together against an overconfident odometry none is to blame: a loop must also lie
+        far outside what the middle one shows.
+
+        Returns:
+            The loops given up; where there are any, optimise again.
+        """
+        squared = self.errors
+        is_loop = np.array([edge.source == LOOP_SOURCE for edge in self._relative_poses], dtype=bool)
+        if not is_loop.any():
+            return ()
+        typical = float(np.median(np.sqrt(squared[is_loop])))
+        limit = max(self._config.max_loop_residual, _OUTLYING * typical)
+        beyond = is_loop & (squared > limit**2)
+        gone = tuple(edge for edge, out in zip(self._relative_poses, beyond, strict=True) if out)
+        self._relative_poses = [edge for edge, out in zip(self._relative_poses, beyond, strict=True) if not out]
+        self._dropped += gone
+        return gone
 
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""

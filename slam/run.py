@@ -145,7 +145,7 @@ def _run(
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
     folder.write("graph.g2o", result.graph.write_g2o)
-    folder.write_text("loops.json", as_json({"reason": NOT_BUILT, "accepted": [], "rejected": []}))
+    folder.write_text("loops.json", as_json(result.loops.details()))
     surface = _write_map(folder, result, sequence)
     folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
     if report:
@@ -164,7 +164,6 @@ def _metrics(
         "optimised": trajectory_metrics(result.optimised, reference),
         **null("lidar", lidar),
     }
-    loops = {**null("candidates", NOT_BUILT), **null("verified", NOT_BUILT), **null("accepted", NOT_BUILT)}
     metrics: dict[str, Any] = finite(
         {
             "schema": SCHEMA,
@@ -175,7 +174,7 @@ def _metrics(
             "scale": _scale(result),
             "trajectories": trajectories,
             "graph": _graph(result),
-            "loops": {**loops, "rejected": []},
+            "loops": result.loops.summary(),
             "map": map_summary,
         }
     )
@@ -205,13 +204,13 @@ def _scale(result: SlamResult) -> dict[str, Any]:
 
 def _graph(result: SlamResult) -> dict[str, Any]:
     """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
-    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.factors)}
+    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
     if result.reference is None:
         return summary | null("coverage", "the sequence has no true poses")
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    return summary | {"coverage": coverage(result.factors, result.reference.T_world_camera, aligned.scale)}
+    return summary | {"coverage": coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)}
 
 
 @dataclass(frozen=True)

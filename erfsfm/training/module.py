@@ -27,7 +27,7 @@ class SelfSupervision(lightning.LightningModule):
     def __init__(self, config: ExperimentConfig) -> None:
         super().__init__()
         self.config = config
-        plain = config.loss.model_copy(update={"reduction": "mean", "auto_mask": False})
+        plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
         self._warm_up = config.model_copy(update={"loss": plain})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.validation_metrics: dict[str, float] = {}

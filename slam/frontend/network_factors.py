@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slam.config import FrontendConfig
 from slam.errors import SlamError
@@ -20,6 +21,7 @@ from slam.frames import RelativePose, SnippetPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
+_MAD_TO_SIGMA = 1.4826
 
 
 def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
@@ -36,6 +38,36 @@ def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) ->
             sigmas = repeated * np.repeat([rotation, translation], 3)
             factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
     return factors
+
+
+def measured_noise(
+    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], config: FrontendConfig
+) -> FrontendConfig:
+    """The noise of this network on this drive, where image geometry measured the same steps.
+
+    Sigmas are 1.48 times the median absolute disagreement of one-frame steps, never below the configured ones;
+    with fewer than ``noise_steps`` common steps the configured ones stand.
+    """
+    by_pair = {(g.from_index, g.to_index): g.T_from_to for g in geometric}
+    turns, shifts = [], []
+    for snippet in snippets:
+        for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
+            T_geometric = by_pair.get((source, snippet.target))
+            length = 0.0 if T_geometric is None else float(np.linalg.norm(T_geometric[:3, 3]))
+            if T_geometric is None or abs(snippet.target - source) != 1 or length == 0:
+                continue
+            error = invert(T_geometric) @ T_source_target
+            turns.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
+            shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
+    if len(turns) < config.noise_steps:
+        return config
+    rotation, shift = (_MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(e)))) for e in (turns, shifts))
+    return config.model_copy(
+        update={
+            "rotation_sigma_deg": max(config.rotation_sigma_deg, float(np.rad2deg(rotation))),
+            "translation_sigma_share": max(config.translation_sigma_share, shift),
+        }
+    )
 
 
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:

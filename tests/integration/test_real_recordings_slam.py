@@ -12,13 +12,11 @@ from slam import run_slam
 
 
 @pytest.mark.data
-def test_forty_frames_of_kitti(
-    data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
-) -> None:
+def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     run = run_slam(data_root / "kitti_odometry", "00", frames="0:40", output=tmp_path / "run", device="cpu")
     metrics = check_run(run.path)
     assert (metrics["sequence"]["name"], metrics["sequence"]["frames"]) == ("00", 40)
     assert metrics["scale"]["mode"] == "camera-height"
     for name in ("network", "odometry", "optimised"):
         assert metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] < 0.1 * metrics["sequence"]["length_m"]
-    assert metrics["map"]["accuracy_median_m"] is None and metrics["map"]["triangles"] > 0
+    assert metrics["map"]["accuracy_median_m"] is None and (metrics["map"]["triangles"] or 0) > 0

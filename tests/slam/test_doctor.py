@@ -44,9 +44,7 @@ def test_a_package_that_is_gone_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("by_variable", [False, True])
-def test_a_data_set_sequence_by_sequence(
-    kitti_root: Path, by_variable: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_data_set_sequence_by_sequence(kitti_root: Path, by_variable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if by_variable:
         monkeypatch.setenv("KITTI_ODOMETRY", str(kitti_root))
     line = finding(examine(None if by_variable else kitti_root), "sequence sim")

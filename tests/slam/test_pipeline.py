@@ -27,6 +27,7 @@ from slam.trajectory import Trajectory, write_kitti, write_tum
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5
 FACTOR = 0.2  # unscaled lengths per metre
+NO_NOISE = OracleNoise()
 NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false")
 
 
@@ -73,7 +74,7 @@ def road(index: int) -> FloatArray:
     return np.repeat(depth[:, None], 104, axis=1)
 
 
-def run(drive: Drive, *overrides: str, noise: OracleNoise = OracleNoise(), depth_of=road) -> SlamResult:
+def run(drive: Drive, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
     assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()

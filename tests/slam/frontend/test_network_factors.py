@@ -4,8 +4,8 @@ import pytest
 from slam import se3
 from slam.config import FrontendConfig
 from slam.errors import SlamError
-from slam.frames import SnippetPoses
-from slam.frontend.network_factors import chain_raw, network_factors
+from slam.frames import RelativePose, SnippetPoses
+from slam.frontend.network_factors import chain_raw, measured_noise, network_factors
 
 CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_sigma_share=0.1, translation_floor_share=0.05)
 
@@ -89,3 +89,27 @@ def test_noise_follows_distance_length_and_repetition():
 def test_standing_still_keeps_positive_sigmas():
     for factor in network_factors(snippets_of(np.tile(np.eye(4), (8, 1, 1))), CONFIG):
         assert (factor.sigmas > 0).all()
+
+
+def geometry_of(T) -> list[RelativePose]:
+    steps = zip(range(len(T) - 1), se3.invert(T[:-1]) @ T[1:])
+    return [RelativePose(k, k + 1, T_k_next, np.full(6, 1e-3), "essential") for k, T_k_next in steps]
+
+
+def test_noise_is_measured_where_geometry_saw_the_same_steps():
+    T, sigma_deg = drive(300), 2.0
+    rng = np.random.default_rng(1)
+    snippets = snippets_of(T)
+    for snippet in snippets:
+        for pose in snippet.T_source_target:
+            turn = np.deg2rad(sigma_deg) * rng.normal(size=3)
+            pose[:] = pose @ se3.from_rotation_vector(turn, np.zeros(3))
+    measured = measured_noise(snippets, geometry_of(T), CONFIG)
+    assert measured.rotation_sigma_deg == pytest.approx(sigma_deg, rel=0.15)
+    assert measured.translation_sigma_share == CONFIG.translation_sigma_share
+
+
+def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_saw_little():
+    T = drive(60)
+    assert measured_noise(snippets_of(T), geometry_of(T), CONFIG) == CONFIG
+    assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3], CONFIG) == CONFIG

@@ -1,0 +1,104 @@
+"""One sweep over the whole run: candidates, measurements, and the loops that agree with each other."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from slam.config import LoopsConfig
+from slam.frames import Intrinsics, RelativePose
+from slam.loops.consistency import agreeing
+from slam.loops.descriptors import View
+from slam.loops.retrieval import find_candidates
+from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+MOST_REJECTED = 200
+
+
+@dataclass(frozen=True)
+class LoopClosures:
+    """What became of all candidates; ``verified`` were measured, of these ``accepted`` support each other."""
+
+    candidates: int = 0
+    verified: int = 0
+    accepted: tuple[Loop, ...] = ()
+    rejected: tuple[RejectedLoop, ...] = ()
+
+    def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
+        """The same after the pose graph gave up some accepted loops."""
+        ends = {(edge.from_index, edge.to_index) for edge in dropped}
+        gone = tuple(loop.refused("the trajectory cannot meet it") for loop in self.accepted if loop.ends in ends)
+        kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
+        return replace(self, accepted=kept, rejected=gone + self.rejected)
+
+    def summary(self) -> dict[str, Any]:
+        """For ``metrics.json``: how many, and why the most telling others were refused."""
+        return {
+            "candidates": self.candidates,
+            "verified": self.verified,
+            "accepted": len(self.accepted),
+            "rejected": [
+                {"from": loop.from_index, "to": loop.to_index, "reason": loop.reason}
+                for loop in self.rejected[:MOST_REJECTED]
+            ],
+        }
+
+    def details(self) -> dict[str, Any]:
+        """For ``loops.json``: every accepted loop and the most telling rejected ones, with what was measured."""
+        return {
+            "accepted": [
+                {
+                    **_entry(*loop.ends, loop.inliers, loop.score),
+                    "reason": f"{loop.inliers} corners agree in both directions",
+                    "T_from_to": loop.measured.T_from_to.tolist(),
+                    "sigmas": loop.measured.sigmas.tolist(),
+                }
+                for loop in self.accepted
+            ],
+            "rejected": [
+                {
+                    **_entry(loop.from_index, loop.to_index, loop.inliers, loop.score),
+                    "reason": loop.reason,
+                    "T_from_to": None if loop.T_from_to is None else loop.T_from_to.tolist(),
+                }
+                for loop in self.rejected[:MOST_REJECTED]
+            ],
+            "rejected_left_out": max(len(self.rejected) - MOST_REJECTED, 0),
+        }
+
+
+def _entry(from_index: int, to_index: int, inliers: int, score: float) -> dict[str, Any]:
+    return {"from": from_index, "to": to_index, "inliers": inliers, "score": round(score, 4)}
+
+
+def close_loops(
+    views: Sequence[View], T_world_camera: FloatArray, intrinsics: Intrinsics, config: LoopsConfig
+) -> LoopClosures:
+    """Find where the drive came back.
+
+    The sweep comes after the last frame: some drives close only in their last metres.
+
+    Args:
+        views: in time order, their points in the unit of the trajectory.
+        T_world_camera: odometry ``(N, 4, 4)``.
+        intrinsics: of the images that the views were taken from.
+        config: gates and bounds.
+    """
+    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    path = np.concatenate([[0.0], np.cumsum(steps)])
+    candidates = find_candidates(views, path[[view.index for view in views]], config)
+    verifier = LoopVerifier(config, intrinsics)
+    verdicts = [verifier.verify(views[c.earlier], views[c.later], c.score) for c in candidates]
+    verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
+    refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
+    accepted, lonely = agreeing(verified, T_world_camera, config)
+    logger.info("loops: %d candidates, %d verified, %d accepted", len(candidates), len(verified), len(accepted))
+    refused.sort(key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
+    return LoopClosures(len(candidates), len(verified), tuple(accepted), tuple(lonely + refused))

@@ -1,0 +1,71 @@
+"""Loops judged together: against the trajectory so far, and against other loops of the same place.
+
+A pairwise test as in Mangelson et al. 2018 (PCM), kept to neighbours: two loops that leave and arrive near each
+other must close a ring with the two short pieces of odometry between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from slam.config import LoopsConfig
+from slam.loops.verification import Loop, RejectedLoop
+from slam.se3 import FloatArray, invert, rotation_angle
+
+
+def agreeing(
+    loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfig
+) -> tuple[list[Loop], list[RejectedLoop]]:
+    """Split verified loops into those that support each other and those that stand alone or are contradicted.
+
+    Args:
+        loops: verified, in the unit of the trajectory.
+        T_world_camera: odometry ``(N, 4, 4)``.
+        config: how far neighbours reach and how much they may differ.
+    """
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))])
+    possible, kept, refused = [], [], []
+    for loop in loops:
+        earlier, later = loop.ends
+        drift = np.linalg.norm(
+            (invert(T_world_camera[earlier]) @ T_world_camera[later] - loop.measured.T_from_to)[:3, 3]
+        )
+        way = path[later] - path[earlier]
+        if drift > config.max_drift_share * way:
+            refused.append(loop.refused(f"moves the trajectory by {drift:.1f} on a way of {way:.0f}"))
+        else:
+            possible.append(loop)
+    for loop, (friends, foes) in zip(possible, _votes(possible, T_world_camera, config), strict=True):
+        if foes > friends:
+            refused.append(loop.refused(f"contradicted by {foes} of {foes + friends} loops nearby"))
+        elif friends < config.min_support and loop.inliers < config.alone_inliers:
+            refused.append(loop.refused(f"stands alone: {friends} loops nearby agree"))
+        else:
+            kept.append(loop)
+    return kept, refused
+
+
+def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfig) -> list[tuple[int, int]]:
+    """How many loops nearby agree and disagree with each loop; loops of the same image have one vote."""
+    ends = np.array([loop.ends for loop in loops]).reshape(-1, 2)
+    T_from_to = np.array([loop.measured.T_from_to for loop in loops]).reshape(-1, 4, 4)
+    sigmas = np.array([loop.measured.sigmas for loop in loops]).reshape(-1, 6)
+    votes = []
+    for k, (earlier, later) in enumerate(ends):
+        distance = np.abs(ends - ends[k])
+        near = np.flatnonzero((distance <= config.support_frames).all(axis=1) & (distance[:, 1] > 0))
+        T_earlier = invert(T_world_camera[earlier]) @ T_world_camera[ends[near, 0]]
+        T_later = invert(T_world_camera[ends[near, 1]]) @ T_world_camera[later]
+        ring = invert(T_from_to[k]) @ T_earlier @ T_from_to[near] @ T_later
+        turned = rotation_angle(ring[:, :3, :3])
+        moved = np.linalg.norm(ring[:, :3, 3], axis=1)
+        own = np.hypot(sigmas[near], sigmas[k])
+        way = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
+        agrees = turned < config.support_sigmas * own[:, 0] + np.deg2rad(config.support_drift_deg) * distance[near].sum(
+            1
+        )
+        agrees &= moved < config.support_sigmas * own[:, 3] + config.support_drift_share * way
+        votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
+    return votes

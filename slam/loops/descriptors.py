@@ -1,0 +1,118 @@
+"""What closing loops remembers of a frame: oriented binary corners (ORB) and their points from learned depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import LoopsConfig
+from slam.frames import DepthMap, Frame, Intrinsics
+from slam.se3 import FloatArray
+
+Descriptors = NDArray[np.uint8]
+_CELL_PX = 32
+_DETECTED_PER_KEPT = 4
+_EDGE_PX = 16
+
+
+@dataclass(frozen=True)
+class View:
+    """The features of one frame: about 60 bytes each.
+
+    ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
+    NaN where the learned depth is not trusted, in the unit of the depth.
+    """
+
+    index: int
+    pixels: NDArray[np.float32]
+    descriptors: Descriptors
+    points: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def scaled(self, factor: float) -> View:
+        """The same view with its points in another unit."""
+        return replace(self, points=self.points * np.float32(factor))
+
+
+class FeatureExtractor:
+    """Takes the features of frames of one sequence, the strongest of each part of the image."""
+
+    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics) -> None:
+        self._config = config
+        self._intrinsics = intrinsics
+        self._orb = cv2.ORB_create(
+            nfeatures=_DETECTED_PER_KEPT * config.max_features,
+            nlevels=6,
+            edgeThreshold=_EDGE_PX,
+            fastThreshold=config.corner_contrast,
+        )
+
+    def view(self, frame: Frame, depth_unscaled: DepthMap, height_unscaled: float | None = None) -> View:
+        """Features of a frame, at the size of its image.
+
+        Args:
+            frame: the frame, at the size of the intrinsics.
+            depth_unscaled: its learned z-depth ``(H, W)``.
+            height_unscaled: camera height in the same unit; where known, depths farther than
+                ``max_depth_heights`` of it are not trusted.
+        """
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        found = self._orb.detect(grey, None)
+        chosen = [found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)]
+        chosen, descriptors = self._orb.compute(grey, chosen)
+        if not chosen:
+            return View(frame.index, np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), _no_points(0))
+        pixels = np.array([keypoint.pt for keypoint in chosen], np.float32)  # (M, 2)
+        points = self._points(pixels, depth_unscaled, height_unscaled)
+        return View(frame.index, pixels, descriptors, points)
+
+    def _points(
+        self, pixels: NDArray[np.float32], depth: DepthMap, height_unscaled: float | None
+    ) -> NDArray[np.float32]:
+        camera = self._intrinsics
+        columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, depth.shape[1] - 1)
+        rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, depth.shape[0] - 1)
+        z = depth[rows, columns].astype(np.float64)
+        farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
+        z = np.where(np.isfinite(z) & (z > 0) & (z < farthest), z, np.nan)
+        points: FloatArray = np.stack(
+            [(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1
+        )
+        return points.astype(np.float32)
+
+
+def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
+    """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``.
+
+    One matrix product of signs; its sums are whole numbers, so no order of summation changes them.
+    """
+    agreement = _signs(first) @ _signs(second).T
+    distance: NDArray[np.float32] = np.float32(4 * first.shape[1]) - np.float32(0.5) * agreement
+    return distance
+
+
+def _signs(descriptors: Descriptors) -> NDArray[np.float32]:
+    return np.float32(2.0) * np.unpackbits(descriptors, axis=1) - np.float32(1.0)
+
+
+def _no_points(count: int) -> NDArray[np.float32]:
+    return np.full((count, 3), np.nan, np.float32)
+
+
+def _strongest_per_cell(keypoints: tuple[cv2.KeyPoint, ...], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
+    """Rows of at most ``count`` keypoints: the best of every cell first, then the second best, and so on."""
+    if len(keypoints) == 0:
+        return np.zeros(0, np.intp)
+    pixels = np.array([k.pt for k in keypoints])
+    response = np.array([k.response for k in keypoints])
+    cell = (pixels[:, 1] // _CELL_PX).astype(int) * (shape[1] // _CELL_PX + 1) + (pixels[:, 0] // _CELL_PX).astype(int)
+    by_cell = np.lexsort((-response, cell))
+    first_of_cell = np.searchsorted(cell[by_cell], cell[by_cell])
+    rank = np.arange(len(by_cell)) - first_of_cell
+    order = by_cell[np.lexsort((-response[by_cell], rank))]
+    return np.asarray(order[:count])

@@ -1,0 +1,108 @@
+"""Places that look alike: a vocabulary of binary words learned on the run itself, compared by tf-idf.
+
+As in DBoW2 (Galvez-Lopez and Tardos 2012), with one flat vocabulary instead of a downloaded tree: a run has
+few enough frames for it, and words of its own streets tell them apart better than those of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from slam.config import LoopsConfig
+from slam.loops.descriptors import Descriptors, View, hamming
+from slam.se3 import FloatArray
+
+_TRAINING_DESCRIPTORS = 15_000
+_ROUNDS = 3
+_BLOCK = 256
+_BLOCK_DESCRIPTORS = 2000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Two rows of a list of views that look alike; ``score`` is a share of what neighbouring frames reach."""
+
+    earlier: int
+    later: int
+    score: float
+
+
+def find_candidates(views: Sequence[View], path_m: FloatArray, config: LoopsConfig) -> list[Candidate]:
+    """For each view the earlier views that look most like it, the best first.
+
+    Args:
+        views: in time order.
+        path_m: way driven up to each view ``(V,)``, in the unit of the trajectory.
+        config: how many, and how far apart in time and on the way.
+    """
+    if len(views) < 2:
+        return []
+    weighted = _word_weights(views, train_vocabulary(views, config.words))
+    indices = np.array([view.index for view in views])
+    rows = np.arange(len(views))
+    neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
+    expected = np.maximum(np.concatenate([neighbour[:1], neighbour]), 1e-3)
+    found = []
+    for start in range(0, len(views), _BLOCK):
+        block = rows[start : start + _BLOCK]
+        scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
+        near = indices[block, None] - indices[None, :] < config.min_gap_frames
+        near |= path_m[block, None] - path_m[None, :] < config.min_path_m
+        scores[near] = 0.0
+        for later, row in zip(block, scores, strict=True):
+            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices, config)]
+    return found
+
+
+def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
+    """Binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of all descriptors."""
+    everything = np.concatenate([view.descriptors for view in views])
+    take = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING_DESCRIPTORS)).astype(int)
+    sample = everything[take]
+    centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)
+    bits = np.unpackbits(sample, axis=1).astype(np.float32)
+    for _ in range(_ROUNDS if len(centres) else 0):
+        word = nearest_words(sample, centres)
+        members = csr_array((np.ones(len(word), np.float32), (word, np.arange(len(word)))), (len(centres), len(word)))
+        count = np.bincount(word, minlength=len(centres))[:, None]
+        majority = np.packbits(members @ bits > count / 2.0, axis=1)
+        centres = np.where(count > 0, majority, centres)
+    return centres
+
+
+def nearest_words(descriptors: Descriptors, words: Descriptors) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """The word ``(M,)`` of each descriptor by Hamming distance."""
+    blocks = range(0, len(descriptors), _BLOCK_DESCRIPTORS)
+    nearest = [hamming(descriptors[k : k + _BLOCK_DESCRIPTORS], words).argmin(axis=1) for k in blocks]
+    return np.concatenate([np.zeros(0, np.int64), *nearest])
+
+
+def _word_weights(views: Sequence[View], words: Descriptors) -> csr_array:
+    """Unit tf-idf vectors ``(V, K)``, square roots of the counts against bursts of one word."""
+    word = np.concatenate([nearest_words(view.descriptors, words) for view in views])
+    row = np.repeat(np.arange(len(views)), [len(view) for view in views])
+    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), max(len(words), 1)))
+    counts.sum_duplicates()
+    seen_in = np.bincount(counts.indices, minlength=counts.shape[1])
+    idf = np.log(len(views) / np.maximum(seen_in, 1))
+    counts.data = np.sqrt(counts.data) * idf[counts.indices]
+    norm = np.sqrt(np.asarray((counts * counts).sum(axis=1)).ravel())
+    counts.data = counts.data / np.repeat(np.maximum(norm, 1e-12), np.diff(counts.indptr))
+    return counts
+
+
+def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]], config: LoopsConfig) -> list[int]:
+    """The best columns, none within ``peak_frames`` of a better one."""
+    scores = scores.copy()
+    peaks: list[int] = []
+    while len(peaks) < config.candidates_per_frame:
+        best = int(np.argmax(scores))
+        if scores[best] < config.min_score or scores[best] <= 0:
+            break
+        peaks.append(best)
+        scores[np.abs(indices - indices[best]) <= config.peak_frames] = 0.0
+    return peaks

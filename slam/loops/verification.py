@@ -1,0 +1,152 @@
+"""A loop is measured or refused: matched corners against learned depth, in both directions.
+
+Every gate is free of scale: pixels, shares, degrees, and lengths as a share of the depth of what was seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam.config import LoopsConfig
+from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
+from slam.loops.descriptors import View, hamming
+from slam.se3 import FloatArray, invert, make, rotation_angle
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A measured loop; ``inliers`` is the smaller of both directions."""
+
+    measured: RelativePose
+    inliers: int
+    score: float
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Earlier and later frame."""
+        return self.measured.from_index, self.measured.to_index
+
+    def refused(self, reason: str) -> RejectedLoop:
+        """The same loop, refused after all."""
+        return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)
+
+
+@dataclass(frozen=True)
+class RejectedLoop:
+    """A loop that was looked at and refused, with as much as was measured of it."""
+
+    from_index: int
+    to_index: int
+    reason: str
+    score: float
+    inliers: int = 0
+    T_from_to: FloatArray | None = None
+
+
+class LoopVerifier:
+    """Measures ``T_earlier_later`` between two views of one camera, in the unit of their points."""
+
+    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics) -> None:
+        self._config = config
+        self._intrinsics = intrinsics
+
+    def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
+        """Measure the pose of the later view in the earlier one, or say why not."""
+        rows_earlier, rows_later = matches(earlier, later, self._config)
+
+        def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
+            return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)
+
+        if len(rows_earlier) < self._config.min_inliers:
+            return refused(f"only {len(rows_earlier)} matches")
+        forward = self._resect(earlier.points[rows_earlier], later.pixels[rows_later])
+        if isinstance(forward, str):
+            return refused(forward)
+        backward = self._resect(later.points[rows_later], earlier.pixels[rows_earlier])
+        T_earlier_later = invert(forward.T_image_points)
+        if isinstance(backward, str):
+            return refused(f"backwards {backward}", len(forward.inliers), T_earlier_later)
+        inliers = min(len(forward.inliers), len(backward.inliers))
+        difference = forward.T_image_points @ backward.T_image_points
+        turned_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
+        depth = min(forward.depth, backward.depth)
+        moved_share = float(np.linalg.norm(difference[:3, 3])) / depth
+        if turned_deg > self._config.agreement_deg or moved_share > self._config.agreement_share:
+            reason = f"both directions differ by {turned_deg:.1f} degrees and {moved_share:.0%} of the depth"
+            return refused(reason, inliers, T_earlier_later)
+        T_middle = _halfway(T_earlier_later, backward.T_image_points)
+        sigmas = self._sigmas(T_middle, depth, np.deg2rad(turned_deg), moved_share * depth)
+        measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
+        return Loop(measured, inliers, score)
+
+    def _resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> _Resection | str:
+        """The camera that sees ``points`` at ``pixels``, or why there is none."""
+        config = self._config
+        known = np.isfinite(points).all(axis=1)
+        points, pixels = points[known].astype(np.float64), pixels[known].astype(np.float64)
+        if len(points) < config.min_inliers:
+            return f"only {len(points)} matches have a trusted depth"
+        cv2.setRNGSeed(0)
+        found, rotation, translation, chosen = cv2.solvePnPRansac(
+            points,
+            pixels,
+            self._intrinsics.K,
+            None,
+            iterationsCount=config.ransac_iterations,
+            reprojectionError=config.reprojection_px,
+            confidence=0.999,
+        )
+        count = 0 if not found or chosen is None else len(chosen)
+        if count < config.min_inliers or count < config.min_inlier_share * len(points):
+            return f"only {count} of {len(points)} matches agree"
+        chosen = chosen.ravel()
+        extent = pixels[chosen].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
+        if extent[0] < config.min_spread_share or extent[1] < config.min_spread_share / 2:
+            return f"{count} agreeing matches in a corner of the image"
+        rotation, translation = cv2.solvePnPRefineLM(
+            points[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
+        )
+        T_image_points = make(Rotation.from_rotvec(rotation.ravel()).as_matrix(), translation.ravel())
+        return _Resection(T_image_points, chosen, float(np.median(points[chosen, 2])))
+
+    def _sigmas(self, T_a_b: FloatArray, depth: float, turned: float, moved: float) -> FloatArray:
+        """Sigmas ``(6,)``: a floor, a share of the way between the views, and what both directions disagree about."""
+        config = self._config
+        rotation = np.hypot(np.deg2rad(config.rotation_floor_deg), turned / 2)
+        way = config.length_sigma_share * float(np.linalg.norm(T_a_b[:3, 3]))
+        translation = np.linalg.norm([config.translation_floor_share * depth, way, moved / 2])
+        return np.repeat([float(rotation), float(translation)], 3)
+
+
+@dataclass(frozen=True)
+class _Resection:
+    """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z."""
+
+    T_image_points: FloatArray
+    inliers: NDArray[np.intp]
+    depth: float
+
+
+def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of both views that are each other's nearest by Hamming distance, clearly before the second nearest."""
+    if min(len(first), len(second)) < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    distance = hamming(first.descriptors, second.descriptors)
+    rows, nearest = np.arange(len(first)), distance.argmin(axis=1)
+    best = distance[rows, nearest]
+    kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= config.max_hamming)
+    distance[rows, nearest] = np.inf
+    kept &= best < config.ratio * distance.min(axis=1)
+    return rows[kept], nearest[kept]
+
+
+def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:
+    """The mean of two measurements of one transform that lie close together."""
+    R_a_b = T_a_b[:3, :3]
+    half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(R_a_b.T @ T_a_b_again[:3, :3]).as_rotvec())
+    return make(R_a_b @ half.as_matrix(), 0.5 * (T_a_b[:3, 3] + T_a_b_again[:3, 3]))

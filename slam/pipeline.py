@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, Image, Predictor, RelativePose, SnippetPoses
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.geometric_factors import GeometricOdometry
+from slam.frontend.lidar_odometry import LidarPath, lidar_path
 from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors
 from slam.frontend.refusal import Refusal
 from slam.frontend.scale import (
@@ -79,6 +80,7 @@ class SlamResult:
     network: Trajectory
     odometry: Trajectory
     optimised: Trajectory
+    lidar: LidarPath | None
     reference: Trajectory | None
     observations: Observations
     scale: Scale
@@ -108,6 +110,11 @@ class SlamPipeline:
             SlamError: the sequence is too short, unreadable, lacks what the scale mode wants, or leaves the graph
                 without a solution.
         """
+        estimate = self.estimate()
+        return replace(estimate, map=self.fuse(estimate))
+
+    def estimate(self) -> SlamResult:
+        """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
         mode = self._require_possible()
         observations = self._observe()
         T_network = chain_raw(observations.snippets, len(self._sequence))
@@ -116,20 +123,35 @@ class SlamPipeline:
         T_odometry = self._dead_reckon(factors, T_network, scale)
         loops = self._close_loops(observations.views, scale, T_odometry)
         graph, T_optimised = self._optimise(factors, loops, T_odometry)
-        tsdf_map = self._fuse(observations.keyframes, scale, T_optimised)
         return SlamResult(
             network=self._trajectory(T_network),
             odometry=self._trajectory(T_odometry),
             optimised=self._trajectory(T_optimised),
+            lidar=self._follow_lidar(),
             reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
             observations=observations,
             scale=scale,
             factors=factors,
             loops=loops.without(graph.dropped),
             graph=graph,
-            map=tsdf_map,
+            map=None,
             stopwatch=self._watch,
         )
+
+    def fuse(self, estimate: SlamResult) -> TsdfMap | None:
+        """Learned depth at the optimised poses, fused into one surface; None where mapping is switched off."""
+        keyframes = estimate.observations.keyframes
+        if not self._config.mapping.enabled or not keyframes:
+            return None
+        height, width = keyframes[0].depth_unscaled.shape
+        tsdf_map = TsdfMap(self._config.mapping, self._sequence.intrinsics.resized(width, height))
+        with self._watch.stage("map"):
+            for done, keyframe in enumerate(keyframes):
+                metres = keyframe.depth_unscaled * np.float32(estimate.scale.per_frame[keyframe.index])
+                T_world_camera = estimate.optimised.T_world_camera[keyframe.index]
+                tsdf_map.integrate(metres, keyframe.image, T_world_camera)
+                self._progress("map", done + 1, len(keyframes))
+        return tsdf_map
 
     def _require_possible(self) -> ScaleMode:
         """The scale mode of this run; refuses before any work what could only fail after all of it."""
@@ -270,18 +292,10 @@ class SlamPipeline:
                 T_optimised = graph.optimise(T_odometry)
         return graph, T_optimised
 
-    def _fuse(self, keyframes: Sequence[Keyframe], scale: Scale, T_world_camera: FloatArray) -> TsdfMap | None:
-        """Learned depth at the optimised poses, fused into one surface."""
-        if not self._config.mapping.enabled or not keyframes:
-            return None
-        height, width = keyframes[0].depth_unscaled.shape
-        tsdf_map = TsdfMap(self._config.mapping, self._sequence.intrinsics.resized(width, height))
-        with self._watch.stage("map"):
-            for done, keyframe in enumerate(keyframes):
-                metres = keyframe.depth_unscaled * np.float32(scale.per_frame[keyframe.index])
-                tsdf_map.integrate(metres, keyframe.image, T_world_camera[keyframe.index])
-                self._progress("map", done + 1, len(keyframes))
-        return tsdf_map
+    def _follow_lidar(self) -> LidarPath | None:
+        """What the LiDAR on the same car measured, as a row to compare with; nothing else looks at it."""
+        with self._watch.stage("lidar"):
+            return lidar_path(self._sequence)
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)

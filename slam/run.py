@@ -7,7 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,9 @@ from slam.summary import (
     finite,
     null,
 )
+from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
-
-NOT_BUILT = "this part is not built yet"
 
 
 def run_slam(
@@ -139,13 +138,9 @@ def _seeded(networks: DepthPosePredictor, seed: int) -> Predictor:
 def _run(
     folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, report: bool
 ) -> None:
-    result = pipeline.run()
-    for name in ("network", "odometry", "optimised"):
-        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
-    if result.reference is not None:
-        folder.write_trajectory("reference", result.reference)
-    folder.write("graph.g2o", result.graph.write_g2o)
-    folder.write_text("loops.json", as_json(result.loops.details()))
+    estimate = pipeline.estimate()
+    _write_estimate(folder, estimate)
+    result = replace(estimate, map=pipeline.fuse(estimate))
     surface = _write_map(folder, result, sequence)
     folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
     if report:
@@ -153,16 +148,44 @@ def _run(
         write_report(folder, examples, surface.points, surface.colours)
 
 
+def _write_estimate(folder: RunFolder, result: SlamResult) -> None:
+    """Trajectories, graph and loops: kept even where the map fails."""
+    for name in ("network", "odometry", "optimised"):
+        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+    if result.reference is not None:
+        folder.write_trajectory("reference", result.reference)
+    lidar = _lidar_trajectory(result)
+    if lidar is not None:
+        folder.write_trajectory("trajectory_lidar", lidar)
+    folder.write("graph.g2o", result.graph.write_g2o)
+    folder.write_text("loops.json", as_json(result.loops.details()))
+
+
+def _lidar_trajectory(result: SlamResult) -> Trajectory | None:
+    """The LiDAR's path with the stamps of its frames."""
+    if result.lidar is None:
+        return None
+    return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
+
+
+def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
+    """Errors of the LiDAR's path against the truth at its own frames."""
+    lidar = _lidar_trajectory(result)
+    if lidar is None or result.lidar is None:
+        return null("lidar", "the sequence has no LiDAR scans")
+    reference = None if result.reference is None else result.reference.select(result.lidar.frames).rebased()
+    return {"lidar": trajectory_metrics(lidar, reference)}
+
+
 def _metrics(
     result: SlamResult, sequence: FrameSequence, provenance: Provenance, map_summary: dict[str, Any]
 ) -> dict[str, Any]:
     reference = result.reference
-    lidar = "the sequence has no LiDAR scans" if sequence.T_camera_lidar is None else NOT_BUILT
     trajectories = {
         "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
         "odometry": trajectory_metrics(result.odometry, reference),
         "optimised": trajectory_metrics(result.optimised, reference),
-        **null("lidar", lidar),
+        **_lidar_metrics(result),
     }
     metrics: dict[str, Any] = finite(
         {

@@ -115,6 +115,8 @@ def check_run() -> Callable[[Path], dict[str, Any]]:
         assert (metrics["schema"], metrics["status"]) == (1, "ok")
         maps = _MAP_FILES if metrics["map"]["triangles"] else ()
         stems = (*_STEMS, "reference") if metrics["sequence"]["length_m"] is not None else _STEMS
+        if metrics["trajectories"]["lidar"] is not None:
+            maps = (*maps, "trajectory_lidar.kitti.txt", "trajectory_lidar.tum.txt")
         wanted = {*_FILES, *maps, *(f"{stem}.{kind}.txt" for stem in stems for kind in ("kitti", "tum"))}
         assert {file.name for file in path.iterdir()} == wanted
         for stem in stems:

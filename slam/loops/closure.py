@@ -24,12 +24,16 @@ MOST_REJECTED = 200
 
 @dataclass(frozen=True)
 class LoopClosures:
-    """What became of all candidates; ``verified`` were measured, of these ``accepted`` support each other."""
+    """What became of all candidates; ``verified`` were measured, of these ``accepted`` support each other.
+
+    ``not_sought`` says why there was no search, where there was none.
+    """
 
     candidates: int = 0
     verified: int = 0
     accepted: tuple[Loop, ...] = ()
     rejected: tuple[RejectedLoop, ...] = ()
+    not_sought: str | None = None
 
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph gave up some accepted loops."""
@@ -40,6 +44,10 @@ class LoopClosures:
 
     def summary(self) -> dict[str, Any]:
         """For ``metrics.json``: how many, and why the most telling others were refused."""
+        if self.not_sought is not None:
+            names = ("candidates", "verified", "accepted")
+            absent = dict.fromkeys(names) | {f"{name}_reason": self.not_sought for name in names}
+            return {**absent, "rejected": []}
         return {
             "candidates": self.candidates,
             "verified": self.verified,
@@ -91,9 +99,11 @@ def close_loops(
         intrinsics: of the images that the views were taken from.
         config: gates and bounds.
     """
+    if not config.enabled:
+        return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    candidates = find_candidates(views, path[[view.index for view in views]], config)
+    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], config)
     verifier = LoopVerifier(config, intrinsics)
     verdicts = [verifier.verify(views[c.earlier], views[c.later], c.score) for c in candidates]
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]

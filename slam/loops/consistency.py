@@ -29,9 +29,8 @@ def agreeing(
     possible, kept, refused = [], [], []
     for loop in loops:
         earlier, later = loop.ends
-        drift = np.linalg.norm(
-            (invert(T_world_camera[earlier]) @ T_world_camera[later] - loop.measured.T_from_to)[:3, 3]
-        )
+        T_earlier_later = invert(T_world_camera[earlier]) @ T_world_camera[later]
+        drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         way = path[later] - path[earlier]
         if drift > config.max_drift_share * way:
             refused.append(loop.refused(f"moves the trajectory by {drift:.1f} on a way of {way:.0f}"))
@@ -63,9 +62,8 @@ def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfi
         moved = np.linalg.norm(ring[:, :3, 3], axis=1)
         own = np.hypot(sigmas[near], sigmas[k])
         way = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
-        agrees = turned < config.support_sigmas * own[:, 0] + np.deg2rad(config.support_drift_deg) * distance[near].sum(
-            1
-        )
+        drift = np.deg2rad(config.support_drift_deg) * distance[near].sum(axis=1)
+        agrees = turned < config.support_sigmas * own[:, 0] + drift
         agrees &= moved < config.support_sigmas * own[:, 3] + config.support_drift_share * way
         votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
     return votes

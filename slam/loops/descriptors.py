@@ -45,7 +45,7 @@ class FeatureExtractor:
     def __init__(self, config: LoopsConfig, intrinsics: Intrinsics) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=_DETECTED_PER_KEPT * config.max_features,
             nlevels=6,
             edgeThreshold=_EDGE_PX,

@@ -39,9 +39,10 @@ def find_candidates(views: Sequence[View], path_m: FloatArray, config: LoopsConf
         path_m: way driven up to each view ``(V,)``, in the unit of the trajectory.
         config: how many, and how far apart in time and on the way.
     """
-    if len(views) < 2:
+    words = train_vocabulary(views, config.words)
+    if len(views) < 2 or len(words) == 0:
         return []
-    weighted = _word_weights(views, train_vocabulary(views, config.words))
+    weighted = _word_weights(views, words)
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
@@ -60,7 +61,7 @@ def find_candidates(views: Sequence[View], path_m: FloatArray, config: LoopsConf
 
 def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
     """Binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of all descriptors."""
-    everything = np.concatenate([view.descriptors for view in views])
+    everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
     take = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING_DESCRIPTORS)).astype(int)
     sample = everything[take]
     centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)

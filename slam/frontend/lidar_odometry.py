@@ -1,0 +1,65 @@
+"""The path that a LiDAR on the same car measured: kiss-icp (Vizzo et al. 2023) on the scans beside the frames."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+from slam.frames import Sequence
+from slam.se3 import FloatArray, invert
+
+logger = logging.getLogger(__name__)
+
+LEAST_SCANS = 2
+
+
+@dataclass(frozen=True)
+class LidarPath:
+    """``frames`` ``(S,)`` that have a scan, and ``T_world_camera`` ``(S, 4, 4)`` there, metres, first the identity."""
+
+    frames: NDArray[np.int64]
+    T_world_camera: FloatArray
+
+
+def lidar_path(sequence: Sequence) -> LidarPath | None:
+    """Register all scans of a sequence one after the other; None where it has fewer than two.
+
+    Raises:
+        SlamError: a scan cannot be read.
+    """
+    frames = [k for k in range(len(sequence)) if sequence.scan_path(k) is not None]
+    T_camera_lidar = sequence.T_camera_lidar
+    if len(frames) < LEAST_SCANS or T_camera_lidar is None:
+        return None
+    # kiss-icp takes a while to import and most sequences have no scans
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    settings = load_config(None)
+    settings.data.deskew = False  # the scans carry no time of their own
+    settings.registration.max_num_threads = 1  # the same bytes every time
+    odometry = KissICP(settings)
+    T_first_lidar = []
+    for frame in frames:
+        odometry.register_frame(_points(sequence, frame), np.array([]))
+        T_first_lidar.append(odometry.last_pose.copy())
+    T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
+    logger.info("kiss-icp registered %d scans", len(frames))
+    return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera)
+
+
+def _points(sequence: Sequence, frame: int) -> FloatArray:
+    """The points of a Velodyne file ``(P, 3)``, metres, in the LiDAR frame."""
+    path = sequence.scan_path(frame)
+    assert path is not None
+    try:
+        values = np.fromfile(path, dtype=np.float32)
+    except OSError as error:
+        raise SlamError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
+    if len(values) == 0 or len(values) % 4:
+        raise SlamError(f"{path} is no Velodyne scan: wanted four float32 a point; got {values.nbytes} bytes")
+    return values.reshape(-1, 4)[:, :3].astype(np.float64)

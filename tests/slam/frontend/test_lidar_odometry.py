@@ -1,0 +1,70 @@
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import SlamError
+from slam.frontend.lidar_odometry import lidar_path
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.simulated import SimulatedStreet, SimulationOptions
+
+FRAMES = 15
+
+
+@dataclass
+class Scanned:
+    """As much of a sequence as the LiDAR odometry looks at."""
+
+    T_camera_lidar: np.ndarray | None
+    paths: dict[int, Path] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def scan_path(self, index: int) -> Path | None:
+        return self.paths.get(index)
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedStreet:
+    return SimulatedStreet(SimulationOptions(route="straight", frames=FRAMES, seed=701))
+
+
+def test_the_path_of_simulated_scans_is_the_camera_s(street, tmp_path):
+    sequence = Scanned(street.T_camera_lidar)
+    for k in range(0, FRAMES):
+        sequence.paths[k] = tmp_path / f"{k:06d}.bin"
+        street.scan(k).tofile(sequence.paths[k])
+    path = lidar_path(sequence)
+    assert path is not None
+    np.testing.assert_array_equal(path.frames, np.arange(FRAMES))
+    np.testing.assert_allclose(path.T_world_camera[0], np.eye(4), atol=1e-12)
+    travelled = np.linalg.norm(street.T_world_camera[-1, :3, 3])
+    error = np.linalg.norm(path.T_world_camera[-1, :3, 3] - street.T_world_camera[-1, :3, 3])
+    assert error < 0.03 * travelled
+
+
+def test_without_scans_there_is_no_path(street):
+    assert lidar_path(Scanned(street.T_camera_lidar)) is None
+    assert lidar_path(Scanned(None)) is None
+
+
+def test_a_scan_cut_short_is_named(street, tmp_path):
+    sequence = Scanned(street.T_camera_lidar, {k: tmp_path / f"{k}.bin" for k in range(2)})
+    for path in sequence.paths.values():
+        path.write_bytes(b"12345")
+    with pytest.raises(SlamError, match="0.bin is no Velodyne scan.*5 bytes|0.bin is no Velodyne scan.*4 bytes"):
+        lidar_path(sequence)
+
+
+@pytest.mark.data
+def test_drive_0013_is_as_long_as_its_oxts_path(data_root):
+    sequence = open_sequence(data_root / "kitti_raw")
+    path = lidar_path(sequence)
+    assert path is not None and sequence.reference is not None
+    lengths = [
+        np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum()
+        for T in (path.T_world_camera, sequence.reference[path.frames])
+    ]
+    assert lengths[0] == pytest.approx(lengths[1], rel=0.01)

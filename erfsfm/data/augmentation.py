@@ -14,7 +14,7 @@ Images = list[NDArray[np.uint8]]
 
 def augment(
     images: Images, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
-) -> tuple[Images, Camera]:
+) -> tuple[Images, Camera, bool]:
     """Flip, scale-crop and recolour a snippet, all frames alike.
 
     Args:
@@ -25,16 +25,17 @@ def augment(
         rng: the only source of chance.
 
     Returns:
-        Images of the same size and their camera.
+        Images of the same size, their camera, and whether they are mirrored.
     """
-    if rng.random() < config.flip:
+    mirrored = bool(rng.random() < config.flip)
+    if mirrored:
         images = [np.ascontiguousarray(image[:, ::-1]) for image in images]
         camera = camera.flipped(fidelity)
     if config.zoom > 1:
         images, camera = _scale_crop(images, camera, config.zoom, rng)
     if config.colour_jitter > 0:
         images = _recolour(images, config.colour_jitter, rng)
-    return images, camera
+    return images, camera, mirrored
 
 
 def _scale_crop(images: Images, camera: Camera, zoom: float, rng: np.random.Generator) -> tuple[Images, Camera]:

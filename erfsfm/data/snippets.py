@@ -18,6 +18,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import augment
+from erfsfm.data.ego_rotation import relative_rotation, source_rotations
 from erfsfm.data.recordings import Recording, discover
 from erfsfm.data.splits import EVERYTHING, FrameRange, overlapping
 from erfsfm.errors import DataError
@@ -65,6 +66,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._cache = ImageCache(config.data.cache_mb)
+        self._rotations: dict[tuple[int, int], NDArray[np.float64] | None] = {}
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         self._probabilities = _probabilities(self.recordings, length, config.data)
@@ -78,7 +80,10 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3)."""
+        """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
+
+        With ``loss.rotation_weight``, also ``R_source_target`` (N, 3, 3) from tracked corners, NaN where unknown.
+        """
         rng = np.random.default_rng([self._config.training.seed, number])
         recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
         network = self._config.network
@@ -86,8 +91,22 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         snippet = Snippet(recording, first)
         images = load_window(self._cache, snippet, network.sources + 1, network.height, network.width)
         camera = recording.camera.resized(network.width, network.height)
-        images, camera = augment(images, camera, self._config.data, network.fidelity, rng)
-        return as_tensors(images, camera.K)
+        seen = images
+        images, varied, mirrored = augment(images, camera, self._config.data, network.fidelity, rng)
+        sample = as_tensors(images, varied.K)
+        if self._config.loss.rotation_weight > 0:
+            steps = [self._rotation(snippet, k, seen, camera.K) for k in range(network.sources)]
+            sample["R_source_target"] = torch.from_numpy(source_rotations(steps, mirrored))
+        return sample
+
+    def _rotation(
+        self, snippet: Snippet, step: int, images: list[NDArray[np.uint8]], K: NDArray[np.float32]
+    ) -> NDArray[np.float64] | None:
+        """``R_k_next`` of one step of a snippet, measured once for each pair of frames."""
+        key = (id(snippet.recording), snippet.first + step)
+        if key not in self._rotations:
+            self._rotations[key] = relative_rotation(images[step], images[step + 1], K)
+        return self._rotations[key]
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

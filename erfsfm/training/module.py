@@ -35,7 +35,7 @@ class SelfSupervision(lightning.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The objective of one batch; stops the run where it is not a number."""
-        snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"])
+        snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"], batch.get("R_source_target"))
         warm = self.global_step < self.config.loss.warm_up_steps
         outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._warm_up if warm else self.config)
         if not torch.isfinite(outcome.total):

@@ -13,7 +13,7 @@ from erfsfm.errors import ConfigError
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample
-from erfsfm.losses.consistency import depth_inconsistency
+from erfsfm.losses.consistency import depth_inconsistency, rotation_disagreement
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.regularisation import (
     edge_aware_smoothness,
@@ -24,11 +24,15 @@ from erfsfm.losses.regularisation import (
 
 @dataclass(frozen=True)
 class SnippetBatch:
-    """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``."""
+    """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
+
+    ``R_source_target`` ``(B, N, 3, 3)``: rotations measured from tracked corners, NaN where there are none.
+    """
 
     target: Tensor
     sources: Tensor
     K: Tensor
+    R_source_target: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,9 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
     if said.masks is not None and loss.mask_weight > 0:
         terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
+    if loss.rotation_weight > 0 and batch.R_source_target is not None:
+        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], batch.R_source_target)
+        total = total + loss.rotation_weight * terms["rotation"]
     if loss.consistency_weight > 0:
         terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -104,7 +105,7 @@ def _no_points(count: int) -> NDArray[np.float32]:
     return np.full((count, 3), np.nan, np.float32)
 
 
-def _strongest_per_cell(keypoints: tuple[cv2.KeyPoint, ...], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
+def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:
     """Rows of at most ``count`` keypoints: the best of every cell first, then the second best, and so on."""
     if len(keypoints) == 0:
         return np.zeros(0, np.intp)

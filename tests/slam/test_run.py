@@ -15,9 +15,10 @@ import yaml
 
 import slam.run
 from slam import run_slam
-from slam.config import load_config
+from slam.config import PoseGraphConfig, load_config
 from slam.errors import RunError, SlamError
 from slam.pipeline import SlamPipeline
+from slam.pose_graph import PoseGraph
 from slam.run_folder import RunFolder
 
 CheckRun = Callable[[Path], dict[str, Any]]
@@ -162,7 +163,7 @@ def test_whatever_ends_a_run_its_folder_says_so(
     def stop(self: SlamPipeline) -> None:
         raise error
 
-    monkeypatch.setattr(SlamPipeline, "run", stop)
+    monkeypatch.setattr(SlamPipeline, "estimate", stop)
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
     metrics = RunFolder.open(tmp_path / "ended").metrics()
@@ -214,7 +215,7 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     class Result:
         optimised = run.trajectory("network")
         reference = run.trajectory("reference")
-        factors = ()
+        graph = PoseGraph(PoseGraphConfig())
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)

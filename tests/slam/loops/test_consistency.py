@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import numpy as np
+
+from slam.config import LoopsConfig
+from slam.frames import LOOP_SOURCE, RelativePose
+from slam.loops.consistency import agreeing
+from slam.loops.verification import Loop
+from slam.se3 import FloatArray, chain, from_rotation_vector, invert
+
+CONFIG = LoopsConfig()
+SIGMAS = np.repeat([np.deg2rad(0.3), 0.2], 3)
+
+
+def ring(yaw_error: float = 0.0) -> FloatArray:
+    """Once and a quarter round a circle of 200 frames, one metre a frame."""
+    vector = np.tile([0.0, 2 * np.pi / 200 + yaw_error, 0.0], (249, 1))
+    return chain(from_rotation_vector(vector, np.tile([0.0, 0.0, 1.0], (249, 1))))
+
+
+def loop(earlier: int, later: int, T: FloatArray, shift: float = 0.0, inliers: int = 40) -> Loop:
+    T_from_to = invert(T[earlier]) @ T[later] @ from_rotation_vector(np.zeros(3), np.array([shift, 0.0, 0.0]))
+    return Loop(RelativePose(earlier, later, T_from_to, SIGMAS, LOOP_SOURCE), inliers, 0.5)
+
+
+def test_loops_of_one_stretch_support_each_other_through_drift() -> None:
+    true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
+    kept, refused = agreeing(true, ring(yaw_error=0.0005), CONFIG)
+    assert len(kept) == 10 and refused == []
+
+
+def test_a_contradicted_loop_is_refused() -> None:
+    true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
+    kept, refused = agreeing([*true, loop(6, 206, ring(), shift=8.0)], ring(), CONFIG)
+    assert [k.ends for k in kept] == [k.ends for k in true]
+    assert [r.from_index for r in refused] == [6] and "contradicted by 8 of 8" in refused[0].reason
+
+
+def test_a_loop_alone_needs_to_be_strong() -> None:
+    for inliers, expected in ((40, 0), (300, 1)):
+        kept, refused = agreeing([loop(5, 205, ring(), inliers=inliers)], ring(), CONFIG)
+        assert len(kept) == expected and len(kept) + len(refused) == 1
+    assert "stands alone" in agreeing([loop(5, 205, ring())], ring(), CONFIG)[1][0].reason
+
+
+def test_a_loop_that_would_fold_the_drive_is_refused() -> None:
+    far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
+    kept, refused = agreeing(far, ring(), CONFIG)
+    assert kept == [] and all("moves the trajectory by" in r.reason for r in refused)
+
+
+def test_loops_of_one_image_do_not_support_each_other() -> None:
+    same = [loop(k, 220, ring()) for k in range(12, 30, 2)]
+    kept, refused = agreeing(same, ring(), CONFIG)
+    assert kept == [] and len(refused) == len(same)
+
+
+def test_nothing_comes_of_nothing() -> None:
+    assert agreeing([], ring(), CONFIG) == ([], [])

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.config import LoopsConfig
+from slam.loops.descriptors import View, hamming
+from slam.loops.retrieval import find_candidates, nearest_words, train_vocabulary
+
+CONFIG = LoopsConfig(words=200, min_gap_frames=10, min_path_m=5.0, peak_frames=4)
+
+
+def place(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (80, 32), dtype=np.uint8)
+
+
+def seen_again(descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The same corners with a few bits flipped, in another order."""
+    bits = np.unpackbits(descriptors, axis=1) ^ (rng.random((len(descriptors), 256)) < 0.04)
+    return rng.permutation(np.packbits(bits, axis=1))
+
+
+def view(index: int, descriptors: np.ndarray) -> View:
+    count = len(descriptors)
+    return View(index, np.zeros((count, 2), np.float32), descriptors, np.full((count, 3), np.nan, np.float32))
+
+
+def drive(places: int, again: int) -> list[View]:
+    """Each place is seen in two frames; after ``places`` new ones the first ``again`` come back."""
+    rng = np.random.default_rng(0)
+    known = [place(rng) for _ in range(places)]
+    order = [*range(places), *range(again)]
+    return [view(2 * k + j, seen_again(known[p], rng)) for k, p in enumerate(order) for j in range(2)]
+
+
+def test_hamming_counts_bits() -> None:
+    rng = np.random.default_rng(1)
+    first, second = place(rng), place(rng)[:50]
+    slow = np.unpackbits(first[:, None] ^ second[None], axis=2).sum(axis=2)
+    np.testing.assert_array_equal(hamming(first, second), slow)
+
+
+def test_words_find_their_own() -> None:
+    rng = np.random.default_rng(2)
+    views = drive(10, 0)
+    words = train_vocabulary(views, 200)
+    assert words.shape[1] == 32 and 100 < len(words) <= 200
+    descriptors = views[0].descriptors
+    same = nearest_words(descriptors, words) == nearest_words(descriptors ^ (rng.random((80, 32)) < 0.01), words)
+    assert same.mean() > 0.8
+
+
+def test_places_are_found_again() -> None:
+    views = drive(20, 5)
+    found = find_candidates(views, np.arange(50.0), CONFIG)
+    best = {}
+    for candidate in found:
+        best.setdefault(candidate.later, candidate)
+    for later in range(40, 50):
+        assert best[later].earlier // 2 == (later - 40) // 2
+        assert best[later].score > 0.5
+    assert all(views[c.later].index - views[c.earlier].index >= 10 for c in found)
+
+
+@pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
+def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
+    assert find_candidates(drive(20, 5), path_m, CONFIG) == []
+
+
+def test_candidates_keep_their_distance() -> None:
+    found = find_candidates(drive(20, 5), np.arange(50.0), CONFIG)
+    for later in {c.later for c in found}:
+        earlier = [c.earlier for c in found if c.later == later]
+        assert len(earlier) <= CONFIG.candidates_per_frame
+        assert len(earlier) < 2 or abs(earlier[0] - earlier[1]) > CONFIG.peak_frames
+
+
+@pytest.mark.parametrize("count", [0, 1, 30])
+def test_images_without_corners(count: int) -> None:
+    blank = [view(k, np.zeros((0, 32), np.uint8)) for k in range(count)]
+    assert find_candidates(blank, np.arange(float(count)), CONFIG) == []
+
+
+def test_blank_frames_among_others_are_no_place() -> None:
+    views = drive(20, 5)
+    views[3] = views[44] = view(views[3].index, np.zeros((0, 32), np.uint8))
+    found = find_candidates(views, np.arange(50.0), CONFIG)
+    assert not {3, 44} & {row for c in found for row in (c.earlier, c.later)}

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.config import LoopsConfig
+from slam.frames import LOOP_SOURCE, Intrinsics
+from slam.loops.descriptors import View
+from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
+from slam.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
+
+CAMERA = Intrinsics(width=416, height=128, fx=240.0, fy=240.0, cx=207.5, cy=63.5)
+T_A_B = from_rotation_vector(np.array([0.01, 0.08, -0.02]), np.array([0.7, 0.1, 2.0]))
+
+
+class Scene:
+    """Points before two cameras; ``unit`` and ``noise`` are of the depth that the views remember."""
+
+    def __init__(self, T_a_b: FloatArray = T_A_B, count: int = 200, noise: float = 0.0, unit: float = 1.0) -> None:
+        rng = np.random.default_rng(0)
+        u, v = rng.uniform(60, 350, count), rng.uniform(20, 110, count)
+        z = rng.uniform(6.0, 25.0, count)
+        self.descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
+        self.points_a = np.stack([(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z], axis=1)
+        self.points_b = apply(invert(T_a_b), self.points_a)
+        self.rng, self.noise, self.unit = rng, noise, unit
+
+    def view(self, index: int, points: FloatArray) -> View:
+        pixels = (points / points[:, 2:]) @ CAMERA.K.T
+        wrong = self.unit * np.exp(self.noise * self.rng.normal(size=(len(points), 1)))
+        return View(index, pixels[:, :2].astype(np.float32), self.descriptors, (points * wrong).astype(np.float32))
+
+    def views(self) -> tuple[View, View]:
+        return self.view(3, self.points_a), self.view(90, self.points_b)
+
+
+def verify(earlier: View, later: View, **changes: float) -> Loop | RejectedLoop:
+    return LoopVerifier(LoopsConfig(**changes), CAMERA).verify(earlier, later, 0.7)
+
+
+def error(loop: Loop, T_true: FloatArray) -> tuple[float, float]:
+    difference = invert(T_true) @ loop.measured.T_from_to
+    return float(np.linalg.norm(difference[:3, 3])), float(np.rad2deg(rotation_angle(difference[:3, :3])))
+
+
+def test_exact_points_give_the_pose() -> None:
+    loop = verify(*Scene().views())
+    assert isinstance(loop, Loop) and loop.ends == (3, 90) and loop.measured.source == LOOP_SOURCE
+    np.testing.assert_allclose(loop.measured.T_from_to, T_A_B, atol=1e-3)
+    assert loop.inliers == 200 and loop.score == 0.7
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0, 50.0])
+def test_verdict_does_not_depend_on_the_unit(unit: float) -> None:
+    loop = verify(*Scene(unit=unit).views())
+    assert isinstance(loop, Loop)
+    scaled = T_A_B.copy()
+    scaled[:3, 3] *= unit
+    np.testing.assert_allclose(loop.measured.T_from_to, scaled, atol=2e-3 * max(unit, 1.0))
+    assert loop.measured.sigmas[3] == pytest.approx(unit * 0.28, rel=0.4)
+
+
+def test_noisy_depth_stays_within_its_sigmas() -> None:
+    loop = verify(*Scene(noise=0.15).views())
+    assert isinstance(loop, Loop)
+    moved, turned_deg = error(loop, T_A_B)
+    assert moved < 2 * loop.measured.sigmas[3] and np.deg2rad(turned_deg) < 3 * loop.measured.sigmas[0]
+
+
+def test_wrong_matches_are_outvoted() -> None:
+    earlier, later = Scene().views()
+    later.pixels[:80] = np.random.default_rng(1).uniform([0, 0], [415, 127], (80, 2))
+    loop = verify(earlier, later)
+    assert isinstance(loop, Loop) and 115 <= loop.inliers <= 130
+    assert error(loop, T_A_B)[0] < 0.05
+
+
+def test_another_place_is_refused() -> None:
+    earlier, later = Scene().views()
+    other = np.random.default_rng(5).integers(0, 256, later.descriptors.shape, dtype=np.uint8)
+    verdict = verify(earlier, View(90, later.pixels, other, later.points))
+    assert isinstance(verdict, RejectedLoop) and "matches" in verdict.reason
+
+
+def test_matches_without_geometry_are_refused() -> None:
+    earlier, later = Scene().views()
+    later.pixels[:] = np.random.default_rng(1).uniform([0, 0], [415, 127], (200, 2))
+    verdict = verify(earlier, later)
+    assert isinstance(verdict, RejectedLoop) and "matches agree" in verdict.reason
+
+
+def test_no_trusted_depth_is_refused() -> None:
+    earlier, later = Scene().views()
+    earlier.points[15:] = np.nan
+    verdict = verify(earlier, later)
+    assert isinstance(verdict, RejectedLoop) and "only 15 matches have a trusted depth" in verdict.reason
+
+
+def test_one_poster_is_not_a_place() -> None:
+    """All matches on one small patch: a sign, a shop front that stands elsewhere too."""
+    scene = Scene()
+    scene.points_a[:, :2] = scene.points_a[:, :2] * 0.05
+    scene.points_b = apply(invert(T_A_B), scene.points_a)
+    verdict = verify(*scene.views())
+    assert isinstance(verdict, RejectedLoop) and "corner of the image" in verdict.reason
+
+
+def test_directions_that_disagree_are_refused() -> None:
+    """The later image's depth is of another size than the earlier one's: something is not what it seems."""
+    earlier, later = Scene(from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 5.0]))).views()
+    verdict = verify(earlier, later.scaled(1.6))
+    assert isinstance(verdict, RejectedLoop) and "both directions differ" in verdict.reason
+    assert verdict.T_from_to is not None and verdict.inliers > 100
+
+
+def test_empty_views_are_refused() -> None:
+    nothing = View(3, np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3), np.float32))
+    assert isinstance(verify(nothing, Scene().views()[1]), RejectedLoop)

@@ -83,7 +83,10 @@ class LossConfig(Section):
     smoothness_weight: float = Field(default=0.2, ge=0)
     mask_weight: float = Field(default=0.0, ge=0, description="explainability regularisation; needs network.masks")
     rotation_weight: float = Field(
-        default=0.0, ge=0, description="pull of the predicted rotations towards those of tracked corners"
+        default=0.0,
+        ge=0,
+        description="pull of the predicted rotations towards those of tracked corners, which then "
+        "also warp the images: depth does not wait for the pose network to find large turns",
     )
     consistency_weight: float = Field(default=0.0, ge=0, description="depth agreement of adjacent frames")
 

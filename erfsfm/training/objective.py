@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.errors import ConfigError
 from erfsfm.geometry.camera import scale_intrinsics
-from erfsfm.geometry.transforms import pose_vector_to_matrix
+from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
 from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample
 from erfsfm.losses.consistency import depth_inconsistency, rotation_disagreement
 from erfsfm.losses.photometric import photometric_error
@@ -123,11 +123,14 @@ def _adjacent(count: int) -> tuple[int, int]:
 def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
     T_source_target = pose_vector_to_matrix(said.pose_vectors)
     loss = config.loss
+    T_warp = T_source_target
+    if loss.rotation_weight > 0 and batch.R_source_target is not None:
+        T_warp = with_rotation(T_source_target, batch.R_source_target)
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: tuple[Tensor, Projection] | None = None
     for level in range(loss.scales):
         scale = _Level.of(batch, said.disparities[level], config)
-        warped, projection = scale.warp(T_source_target)
+        warped, projection = scale.warp(T_warp)
         mask = said.masks[level] if said.masks is not None else None
         photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
         smoothness = smoothness + scale.smoothness(loss) / 2**level

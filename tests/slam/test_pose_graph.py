@@ -196,3 +196,15 @@ def test_newest_loops_are_given_up_when_the_system_is_singular(monkeypatch):
     monkeypatch.setattr(graph, "_solve", lambda start: (_ for _ in ()).throw(RuntimeError("singular")))
     with pytest.raises(SlamError, match=r"singular$"):
         graph.optimise(initial)
+
+
+def test_a_loop_that_the_rest_contradicts_is_given_up():
+    truth, odometry, skips, loops, initial = noisy_problem()
+    wrong = truth[0] @ truth[100] @ se3.from_rotation_vector(np.zeros(3), np.array([30.0, 0.0, 0.0]))
+    false = RelativePose(20, 120, wrong, loops[0].sigmas, LOOP_SOURCE)
+    graph = PoseGraph(PoseGraphConfig())
+    graph.add_relative(*odometry, *skips, *loops, false)
+    graph.optimise(initial)
+    assert graph.drop_contradicted_loops() == (false,) == graph.dropped
+    graph.optimise(initial)
+    assert graph.drop_contradicted_loops() == () and len(graph.relative_poses) == len(odometry + skips + loops)

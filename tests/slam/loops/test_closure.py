@@ -1,0 +1,101 @@
+"""Loops on simulated streets, driven by an oracle: what is found, that nothing false is, and what it is worth."""
+
+from __future__ import annotations
+
+import functools
+import json
+
+import numpy as np
+import pytest
+
+from slam.config import LoopsConfig, load_config
+from slam.evaluation import trajectory_metrics
+from slam.frames import Frame
+from slam.loops.closure import MOST_REJECTED, close_loops
+from slam.loops.descriptors import FeatureExtractor
+from slam.loops.verification import Loop
+from slam.oracle import OracleNoise, OraclePredictor
+from slam.pipeline import SlamPipeline, SlamResult
+from slam.se3 import FloatArray, invert, rotation_angle
+from slam.sequences.simulated import SimulationOptions
+from slam.sequences.simulated_sequence import SimulatedSequence
+
+SIZE = (312, 96)
+FACTOR = 0.2
+NOISE = OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3)
+
+
+def drive(route: str, frames: int, seed: int) -> SimulatedSequence:
+    sequence = SimulatedSequence(SimulationOptions(route, frames, seed, *SIZE))
+    # image and depth of a frame come from one rendering
+    sequence.street.render = functools.lru_cache(2)(sequence.street.render)
+    return sequence
+
+
+def run(sequence: SimulatedSequence, *overrides: str) -> SlamResult:
+    def depth_of(index: int) -> FloatArray:
+        depth = sequence.street.render(index).depth.astype(np.float64)
+        return np.where(depth > 0, depth, 200.0)
+
+    oracle = OraclePredictor(sequence.reference, depth_of, NOISE, FACTOR)
+    settings = load_config(None, ["geometry.enabled=false", "mapping.enabled=false", *overrides])
+    return SlamPipeline(sequence, oracle, settings).run()
+
+
+def is_false(loop: Loop, T_true: FloatArray) -> bool:
+    """More than 2 m or 5 degrees off the truth: the design, section 7."""
+    earlier, later = loop.ends
+    error = invert(invert(T_true[earlier]) @ T_true[later]) @ loop.measured.T_from_to
+    return bool(np.linalg.norm(error[:3, 3]) > 2.0 or rotation_angle(error[:3, :3]) > np.deg2rad(5.0))
+
+
+def ate(result: SlamResult, name: str) -> float:
+    return float(trajectory_metrics(getattr(result, name), result.reference)["align"]["7dof"]["ate_rmse_m"])
+
+
+@pytest.mark.parametrize("seed", [610, 611])
+def test_a_drive_that_comes_back_is_closed(seed: int) -> None:
+    sequence = drive("loop", 250, seed)
+    result = run(sequence, "loops.frame_stride=3")
+    accepted = result.loops.accepted
+    assert len(accepted) >= 5
+    assert not any(is_false(loop, sequence.reference) for loop in accepted)
+    assert ate(result, "optimised") < 0.5 * ate(result, "odometry")
+    summary, details = result.loops.summary(), json.loads(json.dumps(result.loops.details()))
+    assert summary["accepted"] == len(details["accepted"]) == len(accepted)
+    assert summary["candidates"] >= summary["verified"] >= summary["accepted"]
+    assert 0 < len(summary["rejected"]) <= MOST_REJECTED and all(r["reason"] for r in details["rejected"])
+    assert {"from", "to", "inliers", "score", "reason", "T_from_to"} <= set(details["accepted"][0])
+
+
+def test_a_straight_drive_has_no_loop() -> None:
+    result = run(drive("straight", 160, 620), "loops.frame_stride=3")
+    assert result.loops.accepted == () and result.loops.candidates > 0
+
+
+def test_switched_off_it_says_so() -> None:
+    result = run(drive("straight", 20, 620), "loops.enabled=false")
+    summary = result.loops.summary()
+    assert summary["candidates"] is None and "loops.enabled" in summary["candidates_reason"]
+    assert result.observations.views == []
+
+
+def test_features_are_spread_and_bounded() -> None:
+    sequence = drive("straight", 20, 621)
+    extractor = FeatureExtractor(LoopsConfig(max_features=200), sequence.intrinsics)
+    depth = sequence.street.render(3).depth
+    view = extractor.view(sequence.frame(3), depth, height_unscaled=sequence.camera_height_m)
+    assert 100 < len(view) <= 200 and view.descriptors.shape == (len(view), 32)
+    known = np.isfinite(view.points).all(axis=1)
+    assert known.any() and view.points[known, 2].max() < 30 * sequence.camera_height_m
+    again = view.points[known] / view.points[known, 2:] @ sequence.intrinsics.K.T
+    np.testing.assert_allclose(again[:, :2], view.pixels[known], atol=1e-3)
+    assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
+    blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
+    assert len(blank) == 0
+
+
+def test_no_views_no_loops() -> None:
+    sequence = drive("straight", 20, 621)
+    closures = close_loops([], sequence.reference, sequence.intrinsics, LoopsConfig())
+    assert closures.candidates == 0 and closures.accepted == ()

@@ -147,7 +147,7 @@ class TsdfMap:
         written = o3d.geometry.TriangleMesh(
             o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
         )
-        written.vertex_colors = o3d.utility.Vector3dVector(mesh.colours)
+        written.vertex_colors = o3d.utility.Vector3dVector(np.clip(mesh.colours, 0, 1))
         written.compute_vertex_normals()
         _write_ply(path, lambda name: o3d.io.write_triangle_mesh(name, written))
 
@@ -157,7 +157,7 @@ class TsdfMap:
         cloud = self.cloud()
         written = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_world))
         written.normals = o3d.utility.Vector3dVector(cloud.normals_world)
-        written.colors = o3d.utility.Vector3dVector(cloud.colours)
+        written.colors = o3d.utility.Vector3dVector(np.clip(cloud.colours, 0, 1))
         _write_ply(path, lambda name: o3d.io.write_point_cloud(name, written))
 
     def _new_grid(self) -> Any:

@@ -94,6 +94,7 @@ def _fit(
         with _opencv_without_threads(), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
+            warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
     except DataError as error:

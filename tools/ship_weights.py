@@ -28,6 +28,7 @@ CARD = """# Weights `{name}`
 | licence | {licence} |
 
 Trained without labels, from the photometric error between frames. Depth and poses share one unknown scale.
+{note}
 
 Measured (`{evaluation}`):
 
@@ -42,18 +43,21 @@ def main() -> None:
     parser.add_argument("name", help="name of the shipped weights")
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
     parser.add_argument("--held-out", default="simulated seeds 500-599", help="one line: what it never saw")
+    parser.add_argument("--command", help="in place of the recorded one, without the paths of one machine")
+    parser.add_argument("--note", default="", help="a paragraph for the card")
     parser.add_argument("--metrics", type=Path, help="output of erfsfm evaluate ... --json")
     parser.add_argument("--evaluation", default="validation of the training run", help="the command behind --metrics")
     arguments = parser.parse_args()
 
     model = load_model(arguments.run)
     folder = SHIPPED / arguments.name
-    save_model(folder, Model(model.record, model.depth_net, model.pose_net), half=True)
+    record = model.record.model_copy(update={"command": arguments.command or model.record.command})
+    save_model(folder, Model(record, model.depth_net, model.pose_net), half=True)
     for file in FILES:
         size = (folder / file).stat().st_size / 1e6
         if size > LARGEST_MB:
             raise SystemExit(f"{file} has {size:.1f} MB; shipped weights have at most {LARGEST_MB}: train narrower")
-    record, network = model.record, model.record.network
+    network = record.network
     card = CARD.format(
         name=arguments.name,
         **network.model_dump(),
@@ -65,6 +69,7 @@ def main() -> None:
         command=record.command,
         commit=record.commit,
         licence=record.licence,
+        note=arguments.note,
         evaluation=arguments.evaluation,
         metrics=_table(arguments.metrics, record.metrics),
     )

@@ -14,7 +14,7 @@ C1, C2 = 0.01**2, 0.03**2
 class BoxMean(torch.autograd.Function):
     """Mean over each 3 x 3 window, as ``avg_pool2d(x, 3, 1)``, by two runs of additions.
 
-    On a CPU this is nine times faster than the pooling operator, which dominated the training step.
+    On a CPU this is several times faster than the pooling operator (make benchmark), which dominated the training step.
     """
 
     @staticmethod

@@ -6,7 +6,6 @@ The front end, the graph, the map and the evaluation never import each other; th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -131,9 +130,3 @@ class RelativePose:
     T_from_to: FloatArray
     sigmas: FloatArray
     source: str
-
-
-def iterate(sequence: Sequence) -> Iterator[Frame]:
-    """The frames of a sequence in order."""
-    for index in range(len(sequence)):
-        yield sequence.frame(index)

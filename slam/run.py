@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
-import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -23,7 +21,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import DepthPosePredictor, commit
 from slam.config import dump_yaml, load_config
 from slam.errors import SlamError
 from slam.evaluation import trajectory_metrics
@@ -96,7 +94,7 @@ def run_slam(
     networks = DepthPosePredictor.from_weights(weights, device)
     provenance = Provenance(
         version=__version__,
-        commit=_commit(),
+        commit=commit(),
         command=command,
         seed=seed,
         device=str(networks.device),
@@ -301,12 +299,3 @@ def _logging_to(path: Path) -> Iterator[None]:
         root.removeHandler(handler)
         root.setLevel(level)
         handler.close()
-
-
-def _commit() -> str:
-    """The revision of the source tree this runs from, or an empty string outside one."""
-    root = Path(__file__).resolve().parents[1]
-    if not (root / ".git").exists() or shutil.which("git") is None:
-        return ""
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import pickle
-import subprocess
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import erfsfm
-from erfsfm.checkpoint import Model, ModelRecord, load_model, read_record, save_model, write_atomically
+from erfsfm.checkpoint import Model, ModelRecord, commit, load_model, read_record, save_model, write_atomically
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
@@ -170,16 +169,6 @@ def licence_of(seen: list[str]) -> str:
     if any(name.startswith(("kitti", "folder/kitti", "folder/karlsruhe")) for name in seen):
         return "CC BY-NC-SA 3.0 (trained on KITTI)"
     return "unknown: depends on the training data"
-
-
-def commit() -> str:
-    """The revision of the source tree this runs from, or an empty string outside one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return ""
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    return finished.stdout.strip()
 
 
 def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, resume: bool) -> int:

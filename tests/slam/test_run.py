@@ -208,7 +208,7 @@ def test_progress_is_told(quick: dict[str, Any]) -> None:
 
 def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
-    assert slam.run._commit() == ""
+    assert slam.run.commit() == ""
 
 
 def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: RunFolder) -> None:

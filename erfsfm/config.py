@@ -65,6 +65,7 @@ class DataConfig(Section):
 class LossConfig(Section):
     """The objective: which terms, with which weights. The defaults are the paper's."""
 
+    photometric_weight: float = Field(default=1.0, ge=0, description="of the photometric error; 0 saves its work")
     ssim_weight: float = Field(default=0.0, ge=0, le=1, description="share of structural dissimilarity; 0 is L1")
     reduction: Literal["mean", "minimum"] = Field(
         default="mean", description="over sources: 'minimum' forgives occlusion (Godard et al. 2019)"
@@ -82,13 +83,35 @@ class LossConfig(Section):
     )
     smoothness_weight: float = Field(default=0.2, ge=0)
     mask_weight: float = Field(default=0.0, ge=0, description="explainability regularisation; needs network.masks")
-    rotation_weight: float = Field(
-        default=0.0,
-        ge=0,
-        description="pull of the predicted rotations towards those of tracked corners, which then "
-        "also warp the images: depth does not wait for the pose network to find large turns",
-    )
     consistency_weight: float = Field(default=0.0, ge=0, description="depth agreement of adjacent frames")
+
+
+class TeacherConfig(Section):
+    """Pull towards what classical two-view geometry measures in the same images, without labels; off by default."""
+
+    rotation_weight: float = Field(
+        default=0.0, ge=0, description="of the rotations; measured ones then also warp the images"
+    )
+    translation_weight: float = Field(default=0.0, ge=0, description="of the translations, in the depth's unit")
+    structure_weight: float = Field(default=0.0, ge=0, description="of depth up to a scale per image")
+    unit_weight: float = Field(
+        default=0.0, ge=0, description="of the depth's unit: heights of the camera over the road"
+    )
+    alone_steps: int = Field(
+        default=0, ge=0, description="first steps without photometric error, half as long: it pulls best from near by"
+    )
+    cache: Path | None = Field(default=None, description="folder that keeps measurements between runs")
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weight of each term that is wanted."""
+        every = {
+            "rotation": self.rotation_weight,
+            "translation": self.translation_weight,
+            "structure": self.structure_weight,
+            "unit": self.unit_weight,
+        }
+        return {name: weight for name, weight in every.items() if weight > 0}
 
 
 class TrainingConfig(Section):
@@ -112,6 +135,7 @@ class ExperimentConfig(Section):
     network: NetworkConfig = Field(default_factory=NetworkConfig)
     data: DataConfig = Field(default_factory=DataConfig)
     loss: LossConfig = Field(default_factory=LossConfig)
+    teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     initial_weights: str | None = Field(default=None, description="weights to start from; architecture must match")
 

@@ -10,48 +10,50 @@ from erfsfm.config import DataConfig, Fidelity
 from erfsfm.geometry.camera import Camera
 
 Images = list[NDArray[np.uint8]]
+Maps = list[NDArray[np.float32]]
 
 
 def augment(
-    images: Images, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
-) -> tuple[Images, Camera, bool]:
+    images: Images, maps: Maps, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
+) -> tuple[Images, Maps, Camera, bool]:
     """Flip, scale-crop and recolour a snippet, all frames alike.
 
     Args:
         images: ``(H, W, 3)`` uint8 each.
+        maps: ``(H, W)`` each, about the pixels of the images: they are moved, never mixed or recoloured.
         camera: of these images.
         config: probabilities and largest changes.
         fidelity: ``paper`` mirrors the principal point as the reference does.
         rng: the only source of chance.
 
     Returns:
-        Images of the same size, their camera, and whether they are mirrored.
+        Images and maps of the same size, their camera, and whether they are mirrored.
     """
     mirrored = bool(rng.random() < config.flip)
     if mirrored:
         images = [np.ascontiguousarray(image[:, ::-1]) for image in images]
+        maps = [np.ascontiguousarray(values[:, ::-1]) for values in maps]
         camera = camera.flipped(fidelity)
     if config.zoom > 1:
-        images, camera = _scale_crop(images, camera, config.zoom, rng)
+        images, maps, camera = _scale_crop(images, maps, camera, config.zoom, rng)
     if config.colour_jitter > 0:
         images = _recolour(images, config.colour_jitter, rng)
-    return images, camera, mirrored
+    return images, maps, camera, mirrored
 
 
-def _scale_crop(images: Images, camera: Camera, zoom: float, rng: np.random.Generator) -> tuple[Images, Camera]:
+def _scale_crop(
+    images: Images, maps: Maps, camera: Camera, zoom: float, rng: np.random.Generator
+) -> tuple[Images, Maps, Camera]:
     """Enlarge each axis by its own factor and crop back at a random place."""
     width, height = camera.width, camera.height
     zoom_x, zoom_y = rng.uniform(1, zoom, 2)
     enlarged = camera.resized(int(width * zoom_x), int(height * zoom_y))
     left = int(rng.integers(enlarged.width - width + 1))
     top = int(rng.integers(enlarged.height - height + 1))
-    crops = [
-        cv2.resize(image, (enlarged.width, enlarged.height), interpolation=cv2.INTER_LINEAR)[
-            top : top + height, left : left + width
-        ]
-        for image in images
-    ]
-    return [np.ascontiguousarray(c) for c in crops], enlarged.cropped(left, top, width, height)
+    size, part = (enlarged.width, enlarged.height), (slice(top, top + height), slice(left, left + width))
+    crops = [np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part]) for i in images]
+    moved = [np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST)[part]) for m in maps]
+    return crops, moved, enlarged.cropped(left, top, width, height)
 
 
 def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Images:

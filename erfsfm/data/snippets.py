@@ -18,9 +18,9 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import augment
-from erfsfm.data.ego_rotation import relative_rotation, source_rotations
 from erfsfm.data.recordings import Recording, discover
 from erfsfm.data.splits import EVERYTHING, FrameRange, overlapping
+from erfsfm.data.structure import StructureCache
 from erfsfm.errors import DataError
 
 
@@ -66,7 +66,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._cache = ImageCache(config.data.cache_mb)
-        self._rotations: dict[tuple[int, int], NDArray[np.float64] | None] = {}
+        self._structures = StructureCache(config.teacher.cache)
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         self._probabilities = _probabilities(self.recordings, length, config.data)
@@ -82,7 +82,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
 
-        With ``loss.rotation_weight``, also ``R_source_target`` (N, 3, 3) from tracked corners, NaN where unknown.
+        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `Structure`.
         """
         rng = np.random.default_rng([self._config.training.seed, number])
         recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
@@ -91,22 +91,17 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         snippet = Snippet(recording, first)
         images = load_window(self._cache, snippet, network.sources + 1, network.height, network.width)
         camera = recording.camera.resized(network.width, network.height)
-        seen = images
-        images, varied, mirrored = augment(images, camera, self._config.data, network.fidelity, rng)
+        if not self._config.teacher.weights:
+            images, _, varied, _ = augment(images, [], camera, self._config.data, network.fidelity, rng)
+            return as_tensors(images, varied.K)
+        seen = self._structures.structure(images, camera.K)
+        bounds = [seen.least.astype(np.float32), seen.most.astype(np.float32)]
+        images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
         sample = as_tensors(images, varied.K)
-        if self._config.loss.rotation_weight > 0:
-            steps = [self._rotation(snippet, k, seen, camera.K) for k in range(network.sources)]
-            sample["R_source_target"] = torch.from_numpy(source_rotations(steps, mirrored))
+        T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
+        sample["T_source_target"] = torch.from_numpy(T_source_target)
+        sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
         return sample
-
-    def _rotation(
-        self, snippet: Snippet, step: int, images: list[NDArray[np.uint8]], K: NDArray[np.float32]
-    ) -> NDArray[np.float64] | None:
-        """``R_k_next`` of one step of a snippet, measured once for each pair of frames."""
-        key = (id(snippet.recording), snippet.first + step)
-        if key not in self._rotations:
-            self._rotations[key] = relative_rotation(images[step], images[step + 1], K)
-        return self._rotations[key]
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):
@@ -156,6 +151,12 @@ def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[
     stacked = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255  # (N+1, 3, H, W)
     sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
     return {"target": stacked[middle], "sources": sources, "K": torch.from_numpy(K)}
+
+
+def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The same motion ``(..., 4, 4)`` seen in a mirror, x turned round."""
+    mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
+    return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:

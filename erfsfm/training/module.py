@@ -18,6 +18,7 @@ from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
+from erfsfm.losses.structure import Bounds
 from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
 
 
@@ -29,15 +30,17 @@ class SelfSupervision(lightning.LightningModule):
         self.config = config
         plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
         self._warm_up = config.model_copy(update={"loss": plain})
+        unlooked = config.loss.model_copy(update={"photometric_weight": 0.0})
+        self._alone = config.model_copy(update={"loss": unlooked})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The objective of one batch; stops the run where it is not a number."""
-        snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"], batch.get("R_source_target"))
-        warm = self.global_step < self.config.loss.warm_up_steps
-        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._warm_up if warm else self.config)
+        bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
+        snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds)
+        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
         if not torch.isfinite(outcome.total):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
             raise TrainingError(
@@ -49,6 +52,12 @@ class SelfSupervision(lightning.LightningModule):
         if self.global_step % (20 * self.config.training.log_every) == 0:
             self._log_pictures(snippets, outcome.disparities[0], outcome.warped)
         return outcome.total
+
+    def _present(self) -> ExperimentConfig:
+        """The configuration with the objective of this step."""
+        if self.global_step < self.config.teacher.alone_steps:
+            return self._alone
+        return self._warm_up if self.global_step < self.config.loss.warm_up_steps else self.config
 
     def configure_optimizers(self) -> Any:
         """Adam on both networks; the schedule counts steps."""
@@ -100,14 +109,15 @@ class SelfSupervision(lightning.LightningModule):
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)
 
-    def _log_pictures(self, snippets: SnippetBatch, disparity: Tensor, warped: Tensor) -> None:
+    def _log_pictures(self, snippets: SnippetBatch, disparity: Tensor, warped: Tensor | None) -> None:
         """Input, a warped source and the disparity of the first sample, for TensorBoard."""
         for logger in self.loggers:
             if isinstance(logger, lightning.pytorch.loggers.TensorBoardLogger):
                 shown = disparity[0] / disparity[0].max()
                 board = logger.experiment
                 board.add_image("target", snippets.target[0], self.global_step)
-                board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
+                if warped is not None:
+                    board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
                 board.add_image("disparity", shown, self.global_step)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -20,19 +21,24 @@ from erfsfm.losses.regularisation import (
     explainability_prior,
     second_order_smoothness,
 )
+from erfsfm.losses.structure import Bounds, outside, translation_disagreement
+
+HEIGHTS = 10.0  # camera heights in a taught network's unit: steps are hundredths, as the pose network's first outputs
 
 
 @dataclass(frozen=True)
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    ``R_source_target`` ``(B, N, 3, 3)``: rotations measured from tracked corners, NaN where there are none.
+    What classical geometry measured, where it was asked (`erfsfm.data.structure`): ``T_source_target``
+    ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
     """
 
     target: Tensor
     sources: Tensor
     K: Tensor
-    R_source_target: Tensor | None = None
+    T_source_target: Tensor | None = None
+    bounds: Bounds | None = None
 
 
 @dataclass(frozen=True)
@@ -40,14 +46,15 @@ class Outcome:
     """The loss, its terms, and what the networks said.
 
     ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
-    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution seen from the target.
+    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution seen from the target, None where no photometric
+    error was asked for.
     """
 
     total: Tensor
     terms: dict[str, Tensor]
     disparities: list[Tensor]
     T_source_target: Tensor
-    warped: Tensor
+    warped: Tensor | None
 
 
 def to_network_range(image: Tensor) -> Tensor:
@@ -124,30 +131,56 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
     T_source_target = pose_vector_to_matrix(said.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
-    if loss.rotation_weight > 0 and batch.R_source_target is not None:
-        T_warp = with_rotation(T_source_target, batch.R_source_target)
+    if config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
+        T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: tuple[Tensor, Projection] | None = None
     for level in range(loss.scales):
         scale = _Level.of(batch, said.disparities[level], config)
-        warped, projection = scale.warp(T_warp)
-        mask = said.masks[level] if said.masks is not None else None
-        photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
-        finest = finest or (warped, projection)
-    assert finest is not None
+        if loss.photometric_weight > 0:
+            warped, projection = scale.warp(T_warp)
+            mask = said.masks[level] if said.masks is not None else None
+            photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
+            finest = finest or (warped, projection)
     terms = {"photometric": photometric, "smoothness": smoothness}
-    total = photometric + loss.smoothness_weight * smoothness
+    total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if said.masks is not None and loss.mask_weight > 0:
         terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
-    if loss.rotation_weight > 0 and batch.R_source_target is not None:
-        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], batch.R_source_target)
-        total = total + loss.rotation_weight * terms["rotation"]
-    if loss.consistency_weight > 0:
+    if batch.T_source_target is not None and batch.bounds is not None:
+        taught = _taught(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
+        terms |= taught
+        for name, weight in config.teacher.weights.items():
+            total = total + weight * taught[name]
+    if loss.consistency_weight > 0 and finest is not None:
         terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
-    return Outcome(total, terms, said.disparities, T_source_target, finest[0].reshape(batch.sources.shape))
+    warped_finest = None if finest is None else finest[0].reshape(batch.sources.shape)
+    return Outcome(total, terms, said.disparities, T_source_target, warped_finest)
+
+
+def _taught(
+    said: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
+) -> dict[str, Tensor]:
+    """How far the networks are from measured structure.
+
+    Shape and motion are compared after the unit, which the road gives only roughly, has been fitted to the depth
+    network's; the unit itself is a term of its own.
+    """
+    finest = said.disparities[0]
+    log_scale = bounds.log_scale(finest)
+    unit = log_scale.detach()
+    structure = sum(
+        (outside(said.disparities[k], bounds.strided(2**k), unit) for k in range(scales)), unit.new_zeros(())
+    )
+    t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
+    return {
+        "rotation": rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3]),
+        "translation": translation_disagreement(T_source_target[..., :3, 3], t_measured),
+        "structure": structure / scales,
+        "unit": (log_scale - math.log(HEIGHTS)).abs().mean(),
+    }
 
 
 @dataclass(frozen=True)

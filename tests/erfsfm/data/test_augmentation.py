@@ -38,7 +38,7 @@ def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 def test_points_are_where_the_camera_says(seed: int, flip: float, zoom: float) -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(flip=flip, zoom=zoom)
-    varied, camera, _ = augment(images, CAMERA, config, "default", np.random.default_rng(seed))
+    varied, _, camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(seed))
     assert (camera.width, camera.height) == (160, 96)
     for image, point in zip(varied, POINTS):
         assert image.shape == (96, 160, 3)
@@ -47,15 +47,27 @@ def test_points_are_where_the_camera_says(seed: int, flip: float, zoom: float) -
         np.testing.assert_allclose(centre_of(image), seen, atol=0.1)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_maps_move_with_the_images(seed: int) -> None:
+    image = blob(project(CAMERA, POINTS[0]))
+    values = image[..., 0].astype(np.float32)
+    config = DataConfig(flip=0.5, zoom=1.3)
+    (varied,), (moved,), _, _ = augment([image], [values], CAMERA, config, "default", np.random.default_rng(seed))
+    assert set(np.unique(moved)) <= set(np.unique(values))  # never mixed
+    v, u = np.mgrid[:96, :160]
+    centre = np.array([(u * moved).sum(), (v * moved).sum()]) / moved.sum()
+    np.testing.assert_allclose(centre, centre_of(varied), atol=0.6)
+
+
 def test_the_papers_flip_is_one_pixel_off() -> None:
     images = [blob(project(CAMERA, POINTS[0]))]
-    varied, camera, _ = augment(images, CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0))
+    varied, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=1, zoom=1), "paper", np.random.default_rng(0))
     assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(1, abs=0.05)
 
 
 def test_nothing_to_vary_leaves_all_as_it_was() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
-    varied, camera, _ = augment(images, CAMERA, DataConfig(flip=0, zoom=1), "default", np.random.default_rng(0))
+    varied, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=0, zoom=1), "default", np.random.default_rng(0))
     assert camera == CAMERA
     assert all((a == b).all() for a, b in zip(varied, images))
 
@@ -65,7 +77,9 @@ def test_colour_is_one_change_for_all_frames(seed: int) -> None:
     rng = np.random.default_rng(9)
     image = rng.integers(0, 256, (96, 160, 3), dtype=np.uint8)
     config = DataConfig(flip=0, zoom=1, colour_jitter=0.3)
-    (first, second), camera, _ = augment([image, image.copy()], CAMERA, config, "default", np.random.default_rng(seed))
+    (first, second), _, camera, _ = augment(
+        [image, image.copy()], [], CAMERA, config, "default", np.random.default_rng(seed)
+    )
     assert camera == CAMERA
     assert (first == second).all()
     assert (first != image).any()
@@ -76,7 +90,7 @@ def test_weak_colour_changes_are_weak() -> None:
     image = np.random.default_rng(9).integers(0, 256, (96, 160, 3), dtype=np.uint8)
     config = DataConfig(flip=0, zoom=1, colour_jitter=1e-9)
     for seed in range(4):
-        (varied,), _, _ = augment([image], CAMERA, config, "default", np.random.default_rng(seed))
+        (varied,), _, _, _ = augment([image], [], CAMERA, config, "default", np.random.default_rng(seed))
         if (varied[..., 0] == varied[..., 1]).all():
             continue  # turned grey
         assert (varied == image).all()
@@ -85,9 +99,9 @@ def test_weak_colour_changes_are_weak() -> None:
 def test_the_generator_is_the_only_chance() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(colour_jitter=0.2)
-    first, camera, _ = augment(images, CAMERA, config, "default", np.random.default_rng(4))
-    again, same_camera, _ = augment(images, CAMERA, config, "default", np.random.default_rng(4))
-    other, other_camera, _ = augment(images, CAMERA, config, "default", np.random.default_rng(5))
+    first, _, camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(4))
+    again, _, same_camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(4))
+    other, _, other_camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(5))
     assert camera == same_camera != other_camera
     assert all((a == b).all() for a, b in zip(first, again))
     assert any((a != b).any() for a, b in zip(first, other))
@@ -96,5 +110,5 @@ def test_the_generator_is_the_only_chance() -> None:
 def test_inputs_are_left_alone() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     before = [image.copy() for image in images]
-    augment(images, CAMERA, DataConfig(flip=1, colour_jitter=0.5), "default", np.random.default_rng(1))
+    augment(images, [], CAMERA, DataConfig(flip=1, colour_jitter=0.5), "default", np.random.default_rng(1))
     assert all((a == b).all() for a, b in zip(images, before))

@@ -15,7 +15,7 @@ import yaml
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from erfsfm.config import DataConfig, ExperimentConfig
+from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.recordings import discover
 from erfsfm.data.snippets import (
     ImageCache,
@@ -26,6 +26,7 @@ from erfsfm.data.snippets import (
     usable,
 )
 from erfsfm.errors import DataError
+from slam.sequences.simulated import SimulatedStreet, SimulationOptions
 
 FRAMES = 9
 
@@ -312,3 +313,30 @@ def test_several_roots_add_up(kitti: Path, coded: Path) -> None:
 def test_no_root() -> None:
     with pytest.raises(DataError, match="--dataset"):
         split_recordings(DataConfig())
+
+
+def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
+    street = SimulatedStreet(SimulationOptions(frames=250, seed=702))
+    camera = {"width": 416, "height": 128, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    camera |= dict(zip(("fx", "fy", "cx", "cy"), map(float, street.K[[0, 1, 0, 1], [0, 1, 2, 2]])))
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
+    for index in range(3):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), street.render(30 + index).image[..., ::-1])
+    samples = []
+    for flip in (0.0, 1.0):
+        config = experiment(sources=2, flip=flip, zoom=1.0).model_copy(
+            update={
+                "network": NetworkConfig(sources=2),
+                "teacher": TeacherConfig(structure_weight=1, cache=tmp_path / "kept"),
+            }
+        )
+        samples.append(SnippetDraws(discover(tmp_path), config, draws=4).draw(0))
+    straight, mirrored = samples
+    assert torch.isfinite(straight["most"]).float().mean() > 0.5
+    for name in ("least", "most", "target"):
+        torch.testing.assert_close(mirrored[name], straight[name].flip(-1))
+    signs = torch.tensor([-1.0, 1, 1])
+    torch.testing.assert_close(mirrored["T_source_target"][:, :3, 3], straight["T_source_target"][:, :3, 3] * signs)
+    torch.testing.assert_close(
+        mirrored["T_source_target"][:, 0, 2], -straight["T_source_target"][:, 0, 2]
+    )  # the other way round

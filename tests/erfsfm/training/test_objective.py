@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
-from erfsfm.config import ExperimentConfig
+from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig
 from erfsfm.errors import ConfigError
+from erfsfm.geometry.transforms import pose_vector_to_matrix
+from erfsfm.losses.structure import Bounds
 from erfsfm.training.objective import Outcome, SnippetBatch, evaluate_objective
 
 PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the target is at the origin
@@ -339,3 +342,25 @@ def test_autocast_does_not_reach_the_geometry(plane, batch: SnippetBatch) -> Non
 def test_evaluation_mode_is_refused(batch: SnippetBatch) -> None:
     with pytest.raises(ValueError, match="training mode"):
         evaluate_objective(FixedDepth(0.3).eval(), FixedPose(true_poses()), batch, experiment())
+
+
+def test_a_teacher_that_tells_the_truth_costs_nothing_and_a_wrong_one_does(batch: SnippetBatch, plane) -> None:
+    config = ExperimentConfig(
+        loss=LossConfig(photometric_weight=0, smoothness_weight=0),
+        teacher=TeacherConfig(rotation_weight=1, translation_weight=1, structure_weight=1, unit_weight=1),
+    )
+    vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
+    height, width = batch.target.shape[-2:]
+    half = torch.full((2, 1, height, width), 0.5).double()
+    in_heights = vectors * torch.tensor([10.0] * 3 + [1] * 3)  # the networks' unit is ten of them
+    T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
+    right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
+    outcome = judge(right, config, 0.5, vectors)
+    assert outcome.warped is None
+    assert outcome.total.item() == pytest.approx(0, abs=1e-3)
+    for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
+        assert judge(right, config, 0.5, vector).terms[term].item() > 0.1
+    twice = judge(right, config, 1.0, vectors)  # all twice as near: only the unit is wrong, and translations by it
+    assert twice.terms["structure"].item() == pytest.approx(0, abs=1e-3)
+    assert twice.terms["unit"].item() == pytest.approx(math.log(2), rel=1e-3)
+    assert judge(right, config, 1.0, vectors * torch.tensor([0.5] * 3 + [1] * 3)).terms["translation"].item() < 1e-3

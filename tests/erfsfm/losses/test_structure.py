@@ -1,0 +1,58 @@
+import pytest
+import torch
+
+from erfsfm.losses.structure import Bounds, outside, translation_disagreement
+
+
+def bounds(least: float, most: float) -> Bounds:
+    return Bounds(torch.full((1, 1, 4, 4), least), torch.full((1, 1, 4, 4), most))
+
+
+ZERO = torch.zeros(1, 1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("disparity", "expected"),
+    [(0.2, 0.0), (0.25, 0.0), (0.1, 0.6931), (0.6, 0.6931)],
+    ids=["least", "in", "far", "near"],
+)
+def test_distance_from_an_interval_is_a_log_ratio(disparity, expected):
+    distance = outside(torch.full((1, 1, 4, 4), disparity), bounds(0.2, 0.3), ZERO)
+    assert distance.item() == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_unit_is_taken_out_first():
+    disparity = torch.full((1, 1, 4, 4), 0.25 * 3)
+    interval = bounds(0.24, 0.26)
+    log_scale = interval.log_scale(disparity)
+    assert log_scale.exp().item() == pytest.approx(3, rel=1e-2)
+    assert outside(disparity, interval, log_scale).item() == 0
+
+
+def test_unknown_pixels_neither_count_nor_spoil_gradients():
+    disparity = torch.full((1, 1, 4, 4), 0.5, requires_grad=True)
+    least, most = torch.zeros(1, 1, 4, 4), torch.full((1, 1, 4, 4), torch.inf)
+    most[..., 0, 0] = 0.25  # something far: only bounded from above
+    interval = Bounds(least, most)
+    distance = outside(disparity, interval, interval.log_scale(disparity))
+    assert distance.item() == pytest.approx(0.6931, abs=1e-4)
+    distance.backward()
+    assert disparity.grad is not None and torch.isfinite(disparity.grad).all()
+    assert disparity.grad.count_nonzero() == 1
+
+
+def test_nothing_known_is_no_loss():
+    assert (
+        outside(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0
+    )
+
+
+def test_coarser_bounds_are_pixels_of_the_finest():
+    least = torch.arange(16.0).reshape(1, 1, 4, 4)
+    assert Bounds(least, least + 1).strided(2).least.flatten().tolist() == [5, 7, 13, 15]
+
+
+def test_translation_by_hand_with_one_unmeasured():
+    predicted = torch.tensor([[0.0, 0.0, 1.0], [5.0, 5.0, 5.0]])
+    measured = torch.tensor([[0.0, 0.0, 2.0], [torch.nan] * 3])
+    assert translation_disagreement(predicted, measured).item() == pytest.approx(1 / 2.01, rel=1e-5)

@@ -57,14 +57,15 @@ class ImageCache:
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
-    """Random snippets from draw number ``first_draw`` to ``draws``, whole batches dealt out to the workers."""
+    """Random snippets from draw number ``first_draw`` to ``draws``, whole batches dealt out to devices and workers."""
 
     def __init__(
-        self, recordings: Sequence[Recording], config: ExperimentConfig, draws: int, first_draw: int = 0
+        self, recordings: Sequence[Recording], config: ExperimentConfig, draws: int, first_draw: int = 0, rank: int = 0
     ) -> None:
         self._config = config
         self._draws = draws
         self._first_draw = first_draw
+        self._rank = rank
         self._cache = ImageCache(config.data.cache_mb)
         self._structures = StructureCache(config.teacher.cache)
         length = config.network.sources + 1
@@ -74,8 +75,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
         index, count = (worker.id, worker.num_workers) if worker else (0, 1)
-        batch = self._config.training.batch
-        for number, first in enumerate(range(self._first_draw, self._draws, batch)):
+        batch, devices = self._config.training.batch, self._config.training.devices
+        mine = self._first_draw + self._rank * batch
+        for number, first in enumerate(range(mine, self._draws, batch * devices)):
             if number % count == index:
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 

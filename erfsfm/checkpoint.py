@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -24,11 +24,12 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from erfsfm.config import NetworkConfig, Section, dump_yaml
-from erfsfm.errors import CheckpointError
-from erfsfm.networks.presets import build
+from erfsfm.errors import CheckpointError, ConfigError
+from erfsfm.networks.presets import PRESETS, NetworkKind, build
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
+KINDS: tuple[NetworkKind, NetworkKind] = ("depth", "pose")
 FILES = ("depth.safetensors", "pose.safetensors")
 
 
@@ -37,6 +38,7 @@ class ModelRecord(Section):
 
     format: Literal[1] = FORMAT
     network: NetworkConfig
+    networks: Literal["both", "depth", "pose"] = Field(default="both", description="which of the two are there")
     trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
     licence: str = Field("unknown: depends on the training data", description="of the weights")
     step: int = 0
@@ -55,9 +57,45 @@ class Model:
     pose_net: nn.Module
 
 
+class Absent(nn.Module):
+    """Stands where a folder holds only one of the two networks; using it is an error of one line."""
+
+    def __init__(self, kind: NetworkKind, folder: Path) -> None:
+        super().__init__()
+        self.kind = kind
+        self._folder = folder
+
+    def forward(self, *_images: Any) -> Any:
+        """Refuse.
+
+        Raises:
+            CheckpointError: always.
+        """
+        raise CheckpointError(
+            f"{self._folder} holds no {self.kind} network: it was converted from one checkpoint alone; convert both "
+            "together"
+        )
+
+    def state_dict(self, *_args: Any, **_options: Any) -> Any:
+        """Refuse, as `forward` does."""
+        return self.forward()
+
+
 def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
-    """Freshly initialised depth and pose networks."""
-    depth_net = build(config.depth, config.fidelity, config.depth_width, normalisation=config.normalisation)
+    """Freshly initialised depth and pose networks.
+
+    Raises:
+        ConfigError: an unknown preset, or one of the other kind.
+    """
+    _require_kind("depth", config.depth)
+    _require_kind("pose", config.pose)
+    depth_net = build(
+        config.depth,
+        config.fidelity,
+        config.depth_width,
+        normalisation=config.normalisation,
+        activation=config.activation,
+    )
     pose_net = build(
         config.pose,
         config.fidelity,
@@ -65,8 +103,16 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
         sources=config.sources,
         normalisation=config.normalisation,
         mask_branch=config.masks,
+        activation=config.activation,
     )
     return depth_net, pose_net
+
+
+def _require_kind(kind: NetworkKind, name: str) -> None:
+    """Refuse a pose network where depth is wanted, and the reverse; unknown names are the builder's to refuse."""
+    if name in PRESETS and PRESETS[name].kind != kind:
+        known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
+        raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
 
 
 def save_model(folder: Path, model: Model, half: bool = False) -> None:
@@ -79,6 +125,8 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, net in zip(FILES, (model.depth_net, model.pose_net)):
+        if isinstance(net, Absent):
+            continue
         tensors = {key: _stored(key, value, half) for key, value in net.state_dict().items()}
         write_atomically(folder / name, lambda path, t=tensors: save_file(t, path))  # type: ignore[misc]
     text = dump_yaml(model.record)
@@ -93,10 +141,13 @@ def load_model(name_or_folder: str | Path) -> Model:
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
-    depth_net, pose_net = build_networks(record.network)
-    for name, net in zip(FILES, (depth_net, pose_net)):
-        _load_into(net, folder / name)
-    return Model(record, depth_net.eval(), pose_net.eval())
+    nets: list[nn.Module] = list(build_networks(record.network))
+    for index, (kind, name) in enumerate(zip(KINDS, FILES)):
+        if record.networks in ("both", kind):
+            fill_network(nets[index], _read_tensors(folder / name), folder / name, "model.yaml says")
+        else:
+            nets[index] = Absent(kind, folder)
+    return Model(record, nets[0].eval(), nets[1].eval())
 
 
 def find_weights(name_or_folder: str | Path) -> Path:
@@ -120,10 +171,10 @@ def find_weights(name_or_folder: str | Path) -> Path:
 
 
 def weights_sha256(folder: Path) -> str:
-    """One fingerprint of both weight files."""
+    """One fingerprint of the weight files."""
     digest = hashlib.sha256()
-    for name in FILES:
-        digest.update((folder / name).read_bytes())
+    for path in (folder / name for name in FILES):
+        digest.update(path.read_bytes() if path.exists() else b"")
     return digest.hexdigest()
 
 
@@ -156,28 +207,43 @@ def read_record(path: Path) -> ModelRecord:
         raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {detail}") from error
 
 
-def _load_into(net: nn.Module, path: Path) -> None:
-    try:
-        tensors = load_file(path)
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
+def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:
+    """Put weights into a network, all of them or none.
+
+    Args:
+        net: of the architecture that the weights should have.
+        tensors: weights by name.
+        origin: file they came from, for the error.
+        wanted_by: who says what the architecture is, for the error.
+
+    Raises:
+        CheckpointError: of another architecture.
+    """
     wanted = net.state_dict()
     missing, extra = wanted.keys() - tensors.keys(), tensors.keys() - wanted.keys()
     if missing or extra:
         example = sorted(missing or extra)[0]
         raise CheckpointError(
-            f"{path} is of another architecture than model.yaml says: {len(missing)} tensors missing, {len(extra)} "
+            f"{origin} is of another architecture than {wanted_by}: {len(missing)} tensors missing, {len(extra)} "
             f"unknown, first '{example}'"
         )
     for key, value in tensors.items():
         if value.shape != wanted[key].shape:
             raise CheckpointError(
-                f"{path}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
-                "another width or preset than model.yaml says"
+                f"{origin}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
+                f"another width or preset than {wanted_by}"
             )
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
+
+
+def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    try:
+        tensors: dict[str, torch.Tensor] = load_file(path)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
+    return tensors
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

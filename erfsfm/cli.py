@@ -118,23 +118,150 @@ def networks(
         typer.echo(f"{row['name']:24}{row['parameters']:>12,}{work:>15}{row['receptive_field']:>14} px")
 
 
+@app.command("receptive-field")
+def receptive_field(
+    network: Annotated[list[str] | None, typer.Option(help="preset; repeat; all if left out")] = None,
+    output: Annotated[Path, typer.Option(help="the picture: png, pdf or svg")] = Path("receptive-field.png"),
+    images: Annotated[
+        Path | None, typer.Option(help="a folder whose first five images are looked at; else a drawn street")
+    ] = None,
+    weights: Annotated[str, typer.Option(help="learned weights for their own presets; none: all untrained")] = "none",
+    fidelity: Fidelity = "default",
+    offsets_px: Annotated[float, typer.Option(min=0, help="how far deformable taps are pushed outwards")] = 1.0,
+    height: Annotated[int, typer.Option(min=32, help="of the image, pixels")] = 128,
+    width: Annotated[int, typer.Option(min=32, help="of the image, pixels")] = 416,
+    device: Device = "auto",
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """What the networks see: theoretical box, pixels that count, and how much (the paper's figure 4).
+
+    Example: erfsfm receptive-field --network posenet --network erf-posenet-dfc --weights default --output field.png
+    """
+    import torch
+
+    from erfsfm.checkpoint import load_model
+    from erfsfm.data.recordings import image_files, resize_image
+    from erfsfm.errors import ConfigError, DataError
+    from erfsfm.fields.figure import draw_survey
+    from erfsfm.fields.street import street_snippet
+    from erfsfm.fields.survey import survey
+    from erfsfm.inference import choose_device, read_image
+    from erfsfm.networks.presets import PRESETS
+
+    if output.suffix not in (".png", ".pdf", ".svg"):
+        raise ConfigError(f"--output must end in .png, .pdf or .svg; got {output}")
+    if images is None:
+        snippet = street_snippet(5, height, width)
+    else:
+        files = image_files(images)[:5] if images.is_dir() else ()
+        if len(files) < 5:
+            raise DataError(f"--images wants a folder of five consecutive images; {images} has {len(files)}")
+        snippet = [resize_image(read_image(file), height, width) for file in files]
+    torch.manual_seed(seed)
+    learned = None if weights == "none" else (weights, load_model(weights))
+    rows = survey(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    draw_survey(rows, snippet[2], output)
+    summaries = [row.summary() for row in rows]
+    if as_json:
+        typer.echo(json.dumps(summaries, indent=2))
+        return
+    typer.echo(
+        f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"
+    )
+    for row in summaries:
+        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
+        box = f"{row['columns']} x {row['rows']}"
+        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
+        typer.echo(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+    typer.echo(f"picture in {output}")
+
+
+@app.command()
+def convert(
+    files: Annotated[list[Path], typer.Argument(help="a depth checkpoint, a pose checkpoint, or both: .pth.tar")],
+    output: Annotated[Path, typer.Option(help="receives the weights; then what --weights takes")],
+    dilated: Annotated[
+        bool, typer.Option("--dilated", help="the pose network was ERF's dilated one: the file cannot tell")
+    ] = False,
+    width: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 416,
+    height: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 128,
+    trained_on: Annotated[
+        list[str] | None, typer.Option(help="recording seen in training, e.g. kitti_odometry/00; repeat")
+    ] = None,
+) -> None:
+    """Weights of SfMLearner-PyTorch and ERF-SfMLearner into ours; nothing in the files is executed.
+
+    Example: erfsfm convert dispnet_model_best.pth.tar exp_pose_model_best.pth.tar --output weights/old
+    """
+    from erfsfm.convert import convert as run_conversion
+
+    command = shlex.join(["erfsfm", *sys.argv[1:]])
+    for old in run_conversion(files, output, dilated, (height, width), trained_on or (), command):
+        size = sum(value.numel() for value in old.tensors.values())
+        typer.echo(f"{old.kind}: {old.preset}, {size:,} weights from {old.path}")
+    if not trained_on:
+        typer.echo("training data unknown: a leak cannot be noticed (--trained-on names it)", err=True)
+    typer.echo(f"weights in {output}: use them with --weights {output}")
+
+
+@app.command()
+def export(
+    weights: Weights = "default",
+    output: Annotated[Path, typer.Option(help="the depth network; the pose network goes beside it")] = Path(
+        "erfsfm.onnx"
+    ),
+    format_: Annotated[Literal["onnx"], typer.Option("--format", help="of the files")] = "onnx",
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Both networks as ONNX, checked in onnxruntime: --output net.onnx writes net.onnx (depth) and net_pose.onnx.
+
+    Example: erfsfm export --weights default --format onnx --output net.onnx
+    """
+    from erfsfm.checkpoint import load_model
+    from erfsfm.export import export_onnx
+
+    files = export_onnx(load_model(weights), output, seed)
+    if as_json:
+        typer.echo(json.dumps([asdict(file) | {"path": str(file.path)} for file in files], indent=2))
+        return
+    for file in files:
+        typer.echo(f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}")
+
+
 @evaluate_app.command("depth")
 def evaluate_depth(
-    dataset: Annotated[Path, typer.Option(help="a root with true depth: erfsfm-slam simulate --depth")],
+    dataset: Annotated[
+        Path, typer.Option(help="a root with true depth (erfsfm-slam simulate --depth), or KITTI raw with --split")
+    ],
     weights: Weights = "default",
+    split: Annotated[
+        str | None, typer.Option(help="frames of KITTI raw: eigen, or a file of lines 'drive frame' or image paths")
+    ] = None,
+    fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
     device: Device = "auto",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Median-scaled depth errors under 80 m, beside the data's own median depth map as a baseline.
+    """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame beside a median depth map.
 
-    Example: erfsfm evaluate depth --weights sim --dataset worlds/600
+    Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
     """
+    from erfsfm.errors import ConfigError
+    from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.protocols import depth_protocol
     from erfsfm.inference import DepthPosePredictor
 
-    _print_result(depth_protocol(DepthPosePredictor.from_weights(weights, device), dataset, allow_leak), as_json)
+    if fidelity == "paper" and split is None:
+        raise ConfigError("--fidelity paper is about KITTI's LiDAR depth: it needs --split eigen or a file of frames")
+    predictor = DepthPosePredictor.from_weights(weights, device)
+    if split is None:
+        _print_result(depth_protocol(predictor, dataset, allow_leak), as_json)
+    else:
+        _print_result(eigen_protocol(predictor, dataset, split, fidelity, allow_leak), as_json)
 
 
 @evaluate_app.command("pose")

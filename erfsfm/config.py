@@ -29,6 +29,9 @@ class NetworkConfig(Section):
     depth_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the depth network's channels")
     pose_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the pose network's channels")
     normalisation: Literal["none", "batch"] = Field(default="none", description="layer after each convolution")
+    activation: Literal["relu", "leaky"] = Field(
+        default="relu", description="'leaky' lets a narrow decoder learn where all its channels are at rest"
+    )
     sources: Literal[2, 4] = Field(default=4, description="frames around the target: snippets have one more")
     masks: bool = Field(default=False, description="explainability masks, the pose network's second head")
     height: int = Field(default=128, ge=32, description="network input, pixels")
@@ -118,14 +121,25 @@ class TrainingConfig(Section):
     """The optimiser and the loop."""
 
     steps: int = Field(default=200_000, ge=1)
-    batch: int = Field(default=4, ge=1)
+    batch: int = Field(default=4, ge=1, description="snippets a step and device")
+    devices: int = Field(
+        default=1, ge=1, description="GPUs, or processes on a CPU; batch norm is common to them on GPUs alone"
+    )
     learning_rate: float = Field(default=2e-4, gt=0)
-    schedule: Literal["constant", "cosine"] = Field(default="constant", description="of the learning rate")
+    offset_rate: float = Field(
+        default=1.0, gt=0, le=1, description="share of it for what predicts deformable offsets: fast ones run away"
+    )
+    schedule: Literal["constant", "cosine", "step"] = Field(
+        default="constant", description="of the learning rate; step: a tenth in the last quarter"
+    )
     gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: not clipped")
     validate_every: int = Field(default=1000, ge=1, description="steps")
+    patience: int = Field(default=0, ge=0, description="validations without a better one that end the run; 0: none do")
     checkpoint_every: int = Field(default=500, ge=1, description="steps")
     log_every: int = Field(default=50, ge=1, description="steps")
-    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = Field(
+        default="32-true", description="of the networks; a CPU takes bf16-mixed for 16-mixed, and says so"
+    )
     seed: int = Field(default=0, ge=0)
 
 

@@ -19,3 +19,7 @@ class DataError(ErfsfmError):
 
 class TrainingError(ErfsfmError):
     """Training cannot start or go on."""
+
+
+class ExportError(ErfsfmError):
+    """A network cannot be written in another format."""

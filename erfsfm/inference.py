@@ -61,7 +61,6 @@ class DepthPosePredictor:
         """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""
         return overlapping(names, self.record.trained_on)
 
-    @torch.inference_mode()
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Unscaled z-depth of an image.
 
@@ -71,11 +70,14 @@ class DepthPosePredictor:
         Returns:
             ``(H, W)`` float32, positive, at the image's size. Disparity is what is interpolated.
         """
-        disparity = self._depth_net(self._input(image))[0, 0].float().cpu().numpy()
         height, width = image.shape[:2]
-        if disparity.shape != (height, width):
-            disparity = cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(1 / disparity, dtype=np.float32)
+        return depth_at(self.disparity(image), height, width)
+
+    @torch.inference_mode()
+    def disparity(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size."""
+        disparity: NDArray[np.float32] = self._depth_net(self._input(image))[0, 0].float().cpu().numpy()
+        return disparity
 
     @torch.inference_mode()
     def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
@@ -106,6 +108,13 @@ class DepthPosePredictor:
         image = resize_image(image, self.record.network.height, self.record.network.width)
         tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
         return tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
+
+
+def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Depth ``(height, width)`` from disparity ``(h, w)`` at the networks' size, both unscaled."""
+    if disparity.shape != (height, width):
+        disparity = np.asarray(cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    return np.asarray(1 / disparity, dtype=np.float32)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

@@ -6,11 +6,15 @@ from typing import Any
 
 DISTRIBUTION = "erfsfm-slam"
 
-__all__ = ["run_slam"]
+__all__ = ["Slam", "run_slam"]
 
 
 def __getattr__(name: str) -> Any:
     """Load the system when it is asked for: ``import slam`` alone stays light."""
+    if name == "Slam":
+        from slam.incremental import Slam
+
+        return Slam
     if name == "run_slam":
         from slam.run import run_slam
 

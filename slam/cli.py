@@ -14,9 +14,12 @@ import typer
 
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
+from slam.progress import progress_bar
 
 if TYPE_CHECKING:
-    from slam.pipeline import Progress
+    from rich.table import Table
+
+    from slam.run_folder import RunFolder
 
 app = typer.Typer(
     add_completion=False,
@@ -45,6 +48,10 @@ def run(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
     output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="keep the networks' answers there: a second run skips the networks")
+    ] = None,
+    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -55,7 +62,7 @@ def run(
     """
     from slam.run import run_slam
 
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         folder = run_slam(
             dataset,
             sequence,
@@ -69,6 +76,8 @@ def run(
             device,
             progress,
             command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
+            cache=cache,
+            rerun=rerun,
         )
     metrics = folder.metrics()
     if as_json:
@@ -106,13 +115,13 @@ def evaluate(
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="a run folder")],
-    what: Annotated[str, typer.Option(help="mesh, cloud, trajectory or graph")],
-    output: Annotated[Path, typer.Option(help="the file to write")],
-    up: Annotated[str, typer.Option(help="axes of mesh and cloud: y-down (camera axes) or z")] = "y-down",
+    what: Annotated[str, typer.Option(help="mesh, cloud, trajectory, graph or colmap")],
+    output: Annotated[Path, typer.Option(help="the file to write; for colmap a folder")],
+    up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
     seed: Seed = 0,
     device: Device = "auto",
 ) -> None:
-    """The map as PLY, the trajectory as KITTI or TUM, the graph as g2o.
+    """The map as PLY, the trajectory as KITTI or TUM, the graph as g2o, all of it as a COLMAP model.
 
     Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
     """
@@ -122,6 +131,38 @@ def export(
 
     written = export_run(RunFolder.open(run), what, output, up, rotate_ply)
     typer.echo(f"{what} of {run} in {written}")
+
+
+@app.command()
+def localize(
+    images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
+    map: Annotated[Path, typer.Option("--map", help="a run folder")],
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the images, where not that of the run")] = None,
+    output: Annotated[Path | None, typer.Option(help="TUM file of the poses found; stamps are image numbers")] = None,
+    as_json: Json = False,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Poses of new images in an old run's map, in its frame and unit.
+
+    Example: erfsfm-slam localize photos --map results/latest --output photos.tum
+    """
+    from slam.localisation import localise
+    from slam.localisation_tables import localisation_json, localisation_table, write_localisations
+    from slam.run_folder import RunFolder
+
+    run_folder = RunFolder.open(map)
+    with progress_bar() as progress:
+        found = []
+        for localisation in localise(images, run_folder, camera):
+            found.append(localisation)
+            progress("images", len(found), len(found))
+    if as_json:
+        typer.echo(json.dumps(localisation_json(found), indent=2))
+    else:
+        _print_localisations(run_folder, localisation_table(found))
+    if output is not None:
+        write_localisations(output, found)
 
 
 @app.command()
@@ -144,7 +185,7 @@ def simulate(
     from slam.sequences.simulated import SimulatedStreet, parse_options, write_kitti_root
 
     street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards))
-    with _progress_bar() as progress:
+    with progress_bar() as progress:
         write_kitti_root(street, output, depth, lidar, lambda done: progress("frames", done, frames))
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
 
@@ -237,6 +278,8 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     Console(width=_table_width()).print(metrics_table(known, f"{metrics['sequence']['name']}, scale {scale['mode']}"))
     for note in unit_notes(metrics):
         typer.echo(note)
+    for gap in metrics["sequence"]["bridged"]:
+        typer.echo(f"BRIDGED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
     typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
@@ -247,36 +290,19 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     )
 
 
+def _print_localisations(run_folder: RunFolder, table: Table) -> None:
+    from rich.console import Console
+
+    from slam.comparison import unit_notes
+
+    Console(width=_table_width()).print(table)
+    for note in unit_notes(run_folder.metrics()):
+        typer.echo(note)
+
+
 def _table_width() -> int | None:
     """The terminal's width, or one that wraps nothing in a pipe."""
     return None if sys.stdout.isatty() else 200
-
-
-class _progress_bar:  # noqa: N801 - reads as the function it stands for
-    """A progress bar on a terminal, silence in a pipe."""
-
-    def __enter__(self) -> Progress:
-        if not sys.stderr.isatty():
-            return lambda stage, done, total: None
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=Console(stderr=True))
-        self._bar.start()
-        tasks: dict[str, Any] = {}
-
-        def update(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = self._bar.add_task(stage, total=total)
-            self._bar.update(tasks[stage], completed=done)
-
-        return update
-
-    def __exit__(self, *_: object) -> None:
-        bar = getattr(self, "_bar", None)
-        if bar is not None:
-            bar.stop()
 
 
 def main() -> None:

@@ -7,15 +7,15 @@ defaults hold); ``configs/slam/default.yaml`` writes all of them.
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from slam.errors import ConfigError
+from slam.yaml_tree import override, read_tree
 
 ScaleMode = Literal["none", "camera-height", "lidar", "reference"]
 
@@ -29,6 +29,9 @@ class Section(BaseModel):
 class FrontendConfig(Section):
     """Noise of the pose network's direct snippet poses, see ``frontend/network_factors.py``."""
 
+    use: Literal["bridge", "always"] = Field(
+        default="bridge", description="bridge: only over steps that geometry did not measure"
+    )
     rotation_sigma_deg: float = Field(default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step")
     translation_sigma_share: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
     translation_floor_share: float = Field(
@@ -59,9 +62,55 @@ class GeometryConfig(Section):
     )
     min_point_parallax_px: float = Field(default=2.0, gt=0, description="least parallax of a point measuring length")
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
-    rotation_floor_deg: float = Field(default=0.04, gt=0, description="least rotation sigma")
-    direction_floor_deg: float = Field(default=0.5, gt=0, description="least sigma of the translation's direction")
-    length_floor_share: float = Field(default=0.05, gt=0, description="least sigma of the translation's length")
+    rotation_floor_deg: float = Field(default=0.03, gt=0, description="least rotation sigma")
+    direction_floor_deg: float = Field(default=0.6, gt=0, description="least sigma of the translation's direction")
+    length_floor_share: float = Field(default=0.015, gt=0, description="least sigma of the translation's length")
+
+
+class RoadConfig(Section):
+    """Lengths of steps from the road's motion in the image, see ``frontend/road_motion.py``."""
+
+    enabled: bool = Field(default=True, description="measure steps on the road, in camera heights")
+    far_heights: float = Field(default=9.0, gt=0, description="farthest road used, in camera heights")
+    half_width_heights: float = Field(default=1.0, gt=0, description="half the width of the strip, likewise")
+    points: int = Field(default=4000, ge=100, description="about how many pixels to align")
+    min_points: int = Field(default=300, ge=50, description="fewer refuse the measurement")
+    tilt_sigma_deg: float = Field(default=0.1, gt=0, description="tilt to expect against the direction of motion")
+    max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="a plane tilted by more is not the road")
+    min_likeness: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
+    sigma_share: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
+    tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma for a radian of unexpected tilt")
+
+
+class LengthConfig(Section):
+    """Lengths of all steps at once, see ``frontend/step_lengths.py``; sigmas of logarithms."""
+
+    ratio_sigma: float = Field(default=0.003, gt=0, description="least sigma of a step over the one before")
+    ratio_widening: float = Field(default=3.0, gt=0, description="sigmas that points give, widened by this")
+    learned_sigma: float = Field(default=0.1, gt=0, description="of a length by learned depth")
+    unit_walk_sigma: float = Field(default=0.01, gt=0, description="how far learned depth's unit walks in a step")
+    unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
+    outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")
+
+
+class BridgingConfig(Section):
+    """Frames that show nothing usable, see ``frontend/inspection.py`` and ``frontend/bridging.py``."""
+
+    enabled: bool = Field(default=True, description="bridge unusable frames; else they are measured and may end a run")
+    blank_contrast: float = Field(default=3.0, ge=0, description="a standard deviation of grey levels below is blank")
+    noise_contrast: float = Field(default=0.3, ge=0, lt=1, description="share of contrast that survives blurring")
+    min_likeness: float = Field(default=0.2, ge=-1, le=1, description="correlation with the frames before")
+    max_unread_frames: int = Field(default=30, ge=1, description="more unreadable images in a row end the run")
+    rotation_sigma_deg: float = Field(default=2.0, gt=0, le=90, description="rotation sigma of a bridged step")
+    translation_sigma_share: float = Field(default=0.5, gt=0, le=10, description="share of a bridged step's length")
+
+
+class LidarConfig(Section):
+    """What a LiDAR on the same car may do besides being compared with, see ``frontend/lidar_odometry.py``."""
+
+    factors: bool = Field(default=False, description="add kiss-icp's steps to the graph; scale.mode=lidar fits them")
+    rotation_sigma_deg: float = Field(default=0.1, gt=0, description="rotation sigma of a step")
+    translation_sigma_m: float = Field(default=0.03, gt=0, description="translation sigma of a step")
 
 
 class ScaleConfig(Section):
@@ -180,6 +229,10 @@ class SlamConfig(Section):
 
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
+    bridging: BridgingConfig = BridgingConfig()
+    road: RoadConfig = RoadConfig()
+    lengths: LengthConfig = LengthConfig()
+    lidar: LidarConfig = LidarConfig()
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
@@ -197,9 +250,9 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
-    tree = {} if file_or_name is None else _read(_find(file_or_name))
-    for override in overrides:
-        _override(tree, override)
+    tree = {} if file_or_name is None else read_tree(file_or_name)
+    for text in overrides:
+        override(tree, text)
     try:
         return SlamConfig.model_validate(tree)
     except ValidationError as error:
@@ -215,81 +268,6 @@ def dump_yaml(config: SlamConfig) -> str:
             text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
             lines.append(f"  {key}: {text}  # {type(section).model_fields[key].description}")
     return "\n".join(lines) + "\n"
-
-
-class _Loader(yaml.SafeLoader):
-    """Safe YAML where ``1e-4`` is a number and a key may stand once."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As the parent, refusing duplicate keys."""
-        keys = [key.value for key, _ in node.value]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise yaml.MarkedYAMLError(problem=f"key {key!r} stands twice", problem_mark=node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-# PyYAML follows YAML 1.1, where a float needs a dot
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-
-def _find(file_or_name: str | Path) -> Path:
-    path = Path(file_or_name)
-    if path.is_file():
-        return path
-    here = Path(__file__).resolve().parent
-    folders = [here.parent / "configs" / "slam", here / "_configs"]
-    known = {file.stem: file for folder in reversed(folders) for file in sorted(folder.glob("*.yaml"))}
-    if str(file_or_name) in known:
-        return known[str(file_or_name)]
-    if path.is_dir():
-        raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
-    nearest = difflib.get_close_matches(path.stem, known, 1)
-    hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
-    names = ", ".join(sorted(known)) or "none"
-    raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names}){hint}")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        tree = _parse(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {_yaml_problem(error)}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {tree!r:.60}")
-    return tree
-
-
-def _parse(text: str) -> Any:
-    return yaml.load(text, Loader=_Loader)
-
-
-def _override(tree: dict[str, Any], override: str) -> None:
-    dotted, equals, text = override.partition("=")
-    parts = dotted.strip().split(".")
-    if not equals or not all(parts):
-        raise ConfigError(f"an override is written section.key=value; got '{override}'")
-    try:
-        value = _parse(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"the value of '{override}' is not valid YAML: {_yaml_problem(error)}") from error
-    for part in parts[:-1]:
-        tree = tree.setdefault(part, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"'{override}': '{part}' is not a section")
-    tree[parts[-1]] = value
-
-
-def _yaml_problem(error: yaml.YAMLError) -> str:
-    problem = getattr(error, "problem", None) or " ".join(str(error).split())
-    mark = getattr(error, "problem_mark", None)
-    return f"{problem} (line {mark.line + 1})" if mark else str(problem)
 
 
 def _one_line(error: ValidationError) -> str:

@@ -1,4 +1,4 @@
-"""Parts of a run as files for other programs: PLY, KITTI or TUM, g2o."""
+"""Parts of a run as files for other programs: PLY, KITTI or TUM, g2o, COLMAP."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from typing import Protocol
 import numpy as np
 
 from slam import se3
+from slam.colmap import write_colmap
 from slam.errors import RunError
 from slam.files import write_atomically
+from slam.places import PLACES, Places
+from slam.ply import read_ply_points
 from slam.run_folder import RunFolder
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory, write_kitti, write_tum
 
-WHATS = ("mesh", "cloud", "trajectory", "graph")
+WHATS = ("mesh", "cloud", "trajectory", "graph", "colmap")
 UPS = ("y-down", "z")
 # x right, y ahead, z up, from a camera's x right, y down, z ahead
 R_UP_WORLD: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -30,32 +33,30 @@ class RotatePly(Protocol):
 
 
 def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: RotatePly) -> Path:
-    """Write one part of a run as one file, whole or not at all; missing parent folders are made.
+    """Write one part of a run, each file whole or not at all; missing parent folders are made.
 
     Args:
         folder: the run.
         what: ``mesh`` or ``cloud`` (PLY), ``trajectory`` (the optimised one: TUM where ``output`` ends in
-            ``.tum`` or ``.tum.txt``, else KITTI) or ``graph`` (g2o).
-        output: the file.
+            ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o) or ``colmap`` (a model in text form).
+        output: the file; for ``colmap`` the folder.
         up: ``y-down`` as the run has it, or ``z``: x right, y ahead, z up. A trajectory's cameras keep
             their own axes, only the world is turned.
         rotate_ply: turns a PLY (``slam.mapping.rotate_ply``).
 
     Returns:
-        The file written.
+        What was written.
 
     Raises:
         RunError: an unknown ``what`` or ``up``, a part that the run lacks, or a file that cannot be written.
     """
-    if what == "colmap":
-        raise RunError(
-            "--what colmap is not built yet: export --what trajectory and --what cloud, and take fx, fy, cx, cy "
-            "from the camera.yaml or calib.txt of the sequence"
-        )
     if what not in WHATS:
         raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(WHATS)}")
     if up not in UPS:
         raise RunError(f"--up {up!r} is unknown: choose {' or '.join(UPS)}")
+    if what == "colmap":
+        _export_colmap(folder, output, up)
+        return output
     if output.is_dir():
         raise RunError(f"{output} is a folder: give the name of a file to write")
     if what in ("mesh", "cloud"):
@@ -80,6 +81,25 @@ def _export_ply(source: Path, output: Path, up: str, rotate_ply: RotatePly) -> N
 
 
 def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
+    trajectory = _trajectory(folder, up)
+    write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
+    write_atomically(output, lambda path: write(path, trajectory), RunError)
+
+
+def _export_colmap(folder: RunFolder, output: Path, up: str) -> None:
+    """Poses of all frames, the run's camera, and the cloud of the map where there is one."""
+    if output.is_file():
+        raise RunError(f"{output} is a file: a COLMAP model is three files, give the name of a folder")
+    trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
+    cloud = folder.path / "map_cloud.ply"
+    points, colours = read_ply_points(cloud) if cloud.is_file() else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    if up == "z":
+        points = points @ R_UP_WORLD.T
+    write_colmap(output, camera, trajectory.T_world_camera, points, colours)
+
+
+def _trajectory(folder: RunFolder, up: str) -> Trajectory:
+    """The optimised trajectory in the axes asked for."""
     folder.require("trajectory_optimised.tum.txt")
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
@@ -87,5 +107,4 @@ def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
     if up == "z":
         T_up_world = se3.make(R_UP_WORLD, np.zeros(3))
         trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
-    write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
-    write_atomically(output, lambda path: write(path, trajectory), RunError)
+    return trajectory

@@ -21,3 +21,15 @@ def import_open3d() -> ModuleType:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         raise SlamError(f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package") from error
+
+
+def import_rerun() -> ModuleType:
+    """Import the rerun SDK, an optional extra.
+
+    Raises:
+        SlamError: if it is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("rerun")
+    except (ImportError, OSError) as error:
+        raise SlamError(f"--rerun needs rerun ({error}): pip install 'erfsfm-slam[rerun]', or rerun-sdk") from error

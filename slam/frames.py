@@ -6,6 +6,7 @@ The front end, the graph, the map and the evaluation never import each other; th
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -130,3 +131,14 @@ class RelativePose:
     T_from_to: FloatArray
     sigmas: FloatArray
     source: str
+
+
+def runs(frames: Collection[int]) -> list[tuple[int, int]]:
+    """Unbroken runs of frame numbers as (first, last)."""
+    found: list[tuple[int, int]] = []
+    for index in sorted(frames):
+        if found and found[-1][1] == index - 1:
+            found[-1] = found[-1][0], index
+        else:
+            found.append((index, index))
+    return found

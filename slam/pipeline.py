@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
-from slam.frames import DepthMap, Frame, Image, Predictor, RelativePose, SnippetPoses
+from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.geometric_factors import GeometricOdometry
-from slam.frontend.lidar_odometry import LidarPath, lidar_path
-from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors
-from slam.frontend.refusal import Refusal
-from slam.frontend.scale import (
-    RoadPlane,
-    ScaleEstimate,
-    fit_road,
-    rescaled,
-    resolve_mode,
-    scale_from_reference,
-    scale_from_road,
-    scale_track,
-)
+from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
+from slam.frontend.metric_scale import LengthMeasurements, Scale, find_scale
+from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors, without_measured
+from slam.frontend.scale import rescaled, resolve_mode, scale_from_reference
 from slam.loops.closure import LoopClosures, close_loops
-from slam.loops.descriptors import FeatureExtractor, View
+from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
+from slam.observation import Observations, Observer, read_frame
 from slam.pose_graph import PoseGraph
 from slam.se3 import FloatArray, chain, invert
 from slam.timing import Stopwatch
@@ -43,34 +32,14 @@ EXAMPLES = 5
 
 
 @dataclass(frozen=True)
-class Keyframe:
-    """What fusion needs of a frame: a thinned image ``(h, w, 3)`` and unscaled depth ``(h, w)``."""
+class Measurements:
+    """All relative poses with their noise, and the trajectories that they chain to ``(N, 4, 4)``."""
 
-    index: int
-    image: Image
-    depth_unscaled: DepthMap
-
-
-@dataclass
-class Observations:
-    """What one pass over the frames saw, in the networks' unit of length."""
-
-    snippets: list[SnippetPoses] = field(default_factory=list)
-    geometric: list[RelativePose] = field(default_factory=list)
-    refusals: list[tuple[int, int, str]] = field(default_factory=list)
-    roads: list[RoadPlane | Refusal] = field(default_factory=list)
-    views: list[View] = field(default_factory=list)
-    keyframes: list[Keyframe] = field(default_factory=list)
-    examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Scale:
-    """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in the mode's unit."""
-
-    mode: ScaleMode
-    estimate: ScaleEstimate | Refusal
-    per_frame: FloatArray
+    T_network: FloatArray
+    lidar: LidarPath | None
+    scale: Scale
+    factors: list[RelativePose]
+    T_odometry: FloatArray
 
 
 @dataclass(frozen=True)
@@ -117,26 +86,37 @@ class SlamPipeline:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
         mode = self._require_possible()
         observations = self._observe()
-        T_network = chain_raw(observations.snippets, len(self._sequence))
-        scale = self._find_scale(mode, observations, T_network)
-        factors = self._measure(observations, scale)
-        T_odometry = self._dead_reckon(factors, T_network, scale)
-        loops = self._close_loops(observations.views, scale, T_odometry)
-        graph, T_optimised = self._optimise(factors, loops, T_odometry)
+        measured = self.measure(mode, observations)
+        loops = self.close_loops(observations.views, measured)
+        graph, T_optimised = self._optimise(measured.factors, loops, measured.T_odometry)
         return SlamResult(
-            network=self._trajectory(T_network),
-            odometry=self._trajectory(T_odometry),
+            network=self._trajectory(measured.T_network),
+            odometry=self._trajectory(measured.T_odometry),
             optimised=self._trajectory(T_optimised),
-            lidar=self._follow_lidar(),
+            lidar=measured.lidar,
             reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
             observations=observations,
-            scale=scale,
-            factors=factors,
+            scale=measured.scale,
+            factors=measured.factors,
             loops=loops.without(graph.dropped),
             graph=graph,
             map=None,
             stopwatch=self._watch,
         )
+
+    def measure(self, mode: ScaleMode, observations: Observations) -> Measurements:
+        """What the front end makes of the observations: lengths, factors, dead reckoning."""
+        T_network = chain_raw(observations.snippets, len(self._sequence))
+        lidar = self._follow_lidar()
+        scale = self._find_scale(mode, observations, lidar, T_network)
+        factors = self._measure(observations, lidar, scale)
+        return Measurements(T_network, lidar, scale, factors, self._dead_reckon(factors, T_network, scale))
+
+    def close_loops(self, views: Sequence[View], measured: Measurements) -> LoopClosures:
+        """Places seen before, looked for among all views after the last frame."""
+        with self._watch.stage("loops"):
+            scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in views]
+            return close_loops(scaled, measured.T_odometry, self._sequence.intrinsics, self._config.loops)
 
     def fuse(self, estimate: SlamResult) -> TsdfMap | None:
         """Learned depth at the optimised poses, fused into one surface; None where mapping is switched off."""
@@ -162,8 +142,11 @@ class SlamPipeline:
                 "choose a longer range"
             )
         mode = resolve_mode(self._config.scale, sequence.camera_height_m)
-        if mode == "lidar":
-            raise SlamError("scale mode lidar is not built yet: choose camera-height, reference or none")
+        if mode == "lidar" and not has_scans(sequence):
+            raise SlamError(
+                f"scale mode lidar wants LiDAR scans of neighbouring frames and their calibration; {sequence.name} has "
+                "none: choose camera-height, reference or none"
+            )
         if mode == "reference" and sequence.reference is None:
             raise SlamError(
                 f"scale mode reference wants true poses; {sequence.name} has none: choose camera-height or none"
@@ -176,94 +159,57 @@ class SlamPipeline:
         return mode
 
     def _observe(self) -> Observations:
-        """One pass over the frames: depth, road, snippet poses and image geometry, as frames arrive."""
-        seen = Observations()
-        geometry = GeometricOdometry(self._config.geometry, self._sequence.intrinsics)
-        features = FeatureExtractor(self._config.loops, self._sequence.intrinsics)
-        steps = self._config.geometry.steps if self._config.geometry.enabled else ()
-        window: deque[Frame] = deque(maxlen=self._predictor.sources + 1)
-        recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(steps, default=0) + 1)
+        """One pass over the frames, gaps closed at its end."""
         total = len(self._sequence)
-        wanted = set(np.linspace(0, total - 1, EXAMPLES + 2).round().astype(int)[1:-1])
+        examples = np.linspace(0, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
+        observer = Observer(self._predictor, self._sequence.intrinsics, self._config, self._watch, examples)
         for index in range(total):
             with self._watch.stage("read"):
-                frame = self._sequence.frame(index)
-            with self._watch.stage("depth network"):
-                depth = self._predictor.depth(frame)
-            with self._watch.stage("road"):
-                road = fit_road(depth, self._sequence.intrinsics, self._config.scale)
-            seen.roads.append(road)
-            window.append(frame)
-            if len(window) == window.maxlen:
-                with self._watch.stage("pose network"):
-                    seen.snippets.append(self._predictor.snippet(list(window)))
-            height = road.height_unscaled if isinstance(road, RoadPlane) else None
-            recent.append((frame, depth, height))
-            with self._watch.stage("geometry"):
-                self._measure_geometry(geometry, recent, steps, seen)
-            if self._config.loops.enabled and index % self._config.loops.frame_stride == 0:
-                with self._watch.stage("loops"):
-                    seen.views.append(features.view(frame, depth, height))
-            self._keep(frame, depth, index in wanted, seen)
+                frame = read_frame(self._sequence, index)
+            observer.add(index, frame)
             self._progress("frames", index + 1, total)
+        seen = observer.closed()
+        for first, last in runs(seen.bridged):
+            logger.warning("frames %d to %d bridged: %s", first, last, seen.bridged[first])
         return seen
 
-    def _measure_geometry(
-        self,
-        geometry: GeometricOdometry,
-        recent: deque[tuple[Frame, DepthMap, float | None]],
-        steps: Sequence[int],
-        seen: Observations,
-    ) -> None:
-        current = recent[-1][0]
-        for step in steps:
-            if len(recent) <= step:
-                continue
-            previous, depth_previous, height = recent[-1 - step]
-            measured = geometry.relative_pose(previous, current, depth_previous, height)
-            if isinstance(measured, Refusal):
-                seen.refusals.append((previous.index, current.index, measured.reason))
-                logger.info("geometry %d -> %d refused: %s", previous.index, current.index, measured.reason)
-            else:
-                seen.geometric.append(measured)
-
-    def _keep(self, frame: Frame, depth: DepthMap, as_example: bool, seen: Observations) -> None:
-        """Remember thinned frames for the map, and a few whole ones for the report."""
-        mapping = self._config.mapping
-        if as_example:
-            seen.examples.append((frame.index, frame.image, depth))
-        if not mapping.enabled or frame.index % mapping.frame_stride:
-            return
-        height, width = depth.shape
-        thinned = min(mapping.width_px / width, 1.0)
-        size = (max(round(width * thinned), 1), max(round(height * thinned), 1))
-        small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
-        image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-        seen.keyframes.append(Keyframe(frame.index, image, small))
-
-    def _find_scale(self, mode: ScaleMode, seen: Observations, T_network: FloatArray) -> Scale:
-        """The unit of length, as the named mode wants it."""
-        config, sequence = self._config.scale, self._sequence
+    def _find_scale(self, mode: ScaleMode, seen: Observations, lidar: LidarPath | None, T_network: FloatArray) -> Scale:
+        """The unit of length, as the named mode wants it, and the lengths of all steps in it."""
+        config, sequence = self._config, self._sequence
+        steps = {g.from_index for g in seen.geometric if g.to_index == g.from_index + 1}
+        measured = LengthMeasurements(
+            seen.roads,
+            {step: motion for step, motion in seen.motions.items() if step in steps},
+            seen.road_steps,
+            [] if lidar is None else lidar_steps(lidar, config.lidar),
+        )
         with self._watch.stage("scale"):
-            if mode == "reference" and sequence.reference is not None:
-                return self._steady(mode, scale_from_reference(T_network, sequence.reference, config))
-            height = sequence.camera_height_m if mode == "camera-height" else None
-            estimate = scale_from_road(seen.roads, height, config)
-            if isinstance(estimate, Refusal):
-                return self._steady(mode, estimate)
-            return Scale(mode, estimate, scale_track(seen.roads, height, estimate, config))
+            scale = find_scale(mode, sequence.camera_height_m, measured, config.scale, config.lengths, config.lidar)
+            if mode != "reference" or sequence.reference is None:
+                return scale
+            T_odometry = self._dead_reckon(self._measure(seen, None, scale), T_network, scale)
+            return scale.in_unit_of(scale_from_reference(T_odometry, sequence.reference, config.scale))
 
-    def _steady(self, mode: ScaleMode, estimate: ScaleEstimate | Refusal) -> Scale:
-        if isinstance(estimate, Refusal):
-            logger.warning("no scale (%s): lengths stay in the networks' unit", estimate.reason)
-            return Scale(mode, estimate, np.ones(len(self._sequence)))
-        return Scale(mode, estimate, np.full(len(self._sequence), estimate.value))
-
-    def _measure(self, seen: Observations, scale: Scale) -> list[RelativePose]:
+    def _measure(self, seen: Observations, lidar: LidarPath | None, scale: Scale) -> list[RelativePose]:
         """All relative poses with their noise, in the mode's unit."""
-        noise = measured_noise(seen.snippets, seen.geometric, self._config.frontend)
-        factors = network_factors(seen.snippets, noise) + seen.geometric
-        return [rescaled(f, float(scale.per_frame[min(f.from_index, f.to_index)])) for f in factors]
+        geometric = [self._with_length(g, seen, scale) for g in seen.geometric]
+        noise = measured_noise(seen.trusted, seen.geometric, self._config.frontend)
+        networks = network_factors(seen.trusted, noise)
+        if self._config.frontend.use == "bridge":
+            networks = without_measured(networks, seen.geometric)
+        unscaled = [*networks, *seen.bridges]
+        factors = [rescaled(f, float(scale.per_frame[min(f.from_index, f.to_index)])) for f in unscaled]
+        if self._config.lidar.factors and lidar is not None:
+            factors += lidar_steps(lidar, self._config.lidar)
+        return factors + geometric
+
+    def _with_length(self, measured: RelativePose, seen: Observations, scale: Scale) -> RelativePose:
+        """A geometric measurement with its step's length, or by learned depth where the step has none."""
+        step = measured.from_index
+        if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
+            share = self._config.geometry.length_floor_share
+            return seen.motions[step].with_length(float(scale.lengths[step]), share)
+        return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
         """The front end without a graph: of each step the image geometry, else the network, chained."""
@@ -273,12 +219,6 @@ class SlamPipeline:
             if factor.source != NETWORK_SOURCE and factor.to_index - factor.from_index == 1:
                 increments[factor.from_index] = factor.T_from_to
         return chain(increments)
-
-    def _close_loops(self, views: Sequence[View], scale: Scale, T_odometry: FloatArray) -> LoopClosures:
-        """Places seen before, looked for among all views after the last frame."""
-        with self._watch.stage("loops"):
-            scaled = [view.scaled(float(scale.per_frame[view.index])) for view in views]
-            return close_loops(scaled, T_odometry, self._sequence.intrinsics, self._config.loops)
 
     def _optimise(
         self, factors: Sequence[RelativePose], loops: LoopClosures, T_odometry: FloatArray

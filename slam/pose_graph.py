@@ -21,13 +21,17 @@ from scipy.stats import chi2
 
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
-from slam.files import write_atomically
 from slam.frames import LOOP_SOURCE, RelativePose
+from slam.g2o import write_g2o
 from slam.se3 import FloatArray, invert, is_se3
 
 _ANCHOR_SIGMA = 1e-6
 _OUTLYING = 3.0
-_TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
+# iSAM2: a pose that moved by more is linearised anew; it has settled where none moves by more
+_RELINEARISE = 1e-3
+_SETTLED = 1e-4
+_MOST_UPDATES = 20
+_SAME_SHARE = 0.01
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +82,7 @@ class PoseGraph:
         Raises:
             SlamError: if frames are not connected or the system cannot be solved.
         """
-        self._check_connected(len(T_world_camera_initial))
+        _check_connected(self._relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial, tolerance=1e-5):
             raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
         for _ in range(self._config.max_dropped_loops + 1):
@@ -88,7 +92,7 @@ class PoseGraph:
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
                 reason = str(error).strip().partition("\n")[0]
                 self._drop_newest_loop(reason)
-                self._check_connected(len(T_world_camera_initial))
+                _check_connected(self._relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
 
     def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
@@ -114,16 +118,7 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
-        vertices = _g2o_poses(self._solution())
-        T_from_to = np.array([edge.T_from_to for edge in self._relative_poses]).reshape(-1, 4, 4)
-        edges = _g2o_poses(T_from_to)
-        lines = [f"VERTEX_SE3:QUAT {k} {pose}" for k, pose in enumerate(vertices)]
-        lines += [
-            f"EDGE_SE3:QUAT {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.sigmas)}"
-            for edge, pose in zip(self._relative_poses, edges, strict=True)
-        ]
-        text = "\n".join(lines) + "\n"
-        write_atomically(path, lambda file: file.write_text(text, encoding="ascii"))
+        write_g2o(path, self._relative_poses, self._solution())
 
     def _solution(self) -> FloatArray:
         if self._T_world_camera is None:
@@ -147,11 +142,9 @@ class PoseGraph:
 
     def _minimise(self, values: Any, kernel: str) -> Any:
         graph = gtsam.NonlinearFactorGraph()
-        anchor = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA)
-        graph.add(gtsam.PriorFactorPose3(0, values.atPose3(0), anchor))
+        graph.add(_anchor(values.atPose3(0)))
         for edge in self._relative_poses:
-            noise = self._noise(edge.sigmas, kernel)
-            graph.add(gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise))
+            graph.add(_between(edge, kernel, self._config))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self._config.max_iterations)
         parameters.setRelativeErrorTol(self._config.relative_tolerance)
@@ -167,18 +160,6 @@ class PoseGraph:
         )
         return solved
 
-    def _noise(self, sigmas: FloatArray, kernel: str) -> Any:
-        diagonal = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
-        if kernel == "none":
-            return diagonal
-        estimators = gtsam.noiseModel.mEstimator
-        estimator = (
-            estimators.Huber.Create(self._config.huber_k)
-            if kernel == "huber"
-            else estimators.Cauchy.Create(self._config.cauchy_k)
-        )
-        return gtsam.noiseModel.Robust.Create(estimator, diagonal)
-
     def _drop_newest_loop(self, reason: str) -> None:
         loops = [k for k, edge in enumerate(self._relative_poses) if edge.source == LOOP_SOURCE]
         if not loops:
@@ -187,15 +168,86 @@ class PoseGraph:
         self._dropped.append(edge)
         logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
 
-    def _check_connected(self, count: int) -> None:
-        ends = np.array([(e.from_index, e.to_index) for e in self._relative_poses], dtype=int).reshape(-1, 2)
-        if len(ends) and (ends.min() < 0 or ends.max() >= count):
-            raise SlamError(f"a factor links frame {ends.max()}, but the trajectory has {count} frames")
-        links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-        _, component = connected_components(links, directed=False)
-        loose = np.flatnonzero(component != component[0])
-        if len(loose):
-            raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
+
+class IncrementalPoseGraph:
+    """The same factors solved as they arrive, by iSAM2 (Kaess et al. 2012).
+
+    iSAM2 weighs a robust factor anew only where it linearises anew, so it does that often; measurements that later
+    frames taught to read differently are exchanged.
+    """
+
+    def __init__(self, config: PoseGraphConfig) -> None:
+        self._config = config
+        self._kernel = "none" if config.kernel == "none" else "huber"
+        self._start()
+
+    def update(self, relative_poses: Sequence[RelativePose], T_world_camera_initial: FloatArray) -> FloatArray:
+        """Make the graph hold these factors and no others.
+
+        Args:
+            relative_poses: all factors, at most one of a source between two frames in one direction.
+            T_world_camera_initial: dead reckoning ``(N, 4, 4)``; only its steps to new frames are used.
+
+        Returns:
+            ``T_world_camera`` ``(N, 4, 4)``.
+
+        Raises:
+            SlamError: frames are not connected or the system cannot be solved.
+        """
+        _check_connected(relative_poses, len(T_world_camera_initial))
+        wanted = {(edge.from_index, edge.to_index, edge.source): edge for edge in relative_poses}
+        try:
+            self._exchange(wanted, T_world_camera_initial)
+        except RuntimeError as error:  # iSAM2 is not usable after an indeterminate system
+            logger.warning("iSAM2 starts again: %s", str(error).strip().partition("\n")[0])
+            initial = PoseGraph(self._config)
+            initial.add_relative(*relative_poses)
+            T_solved = initial.optimise(T_world_camera_initial)
+            self._start()
+            self._exchange(wanted, T_solved)
+        return self._T_world_camera.copy()
+
+    def _start(self) -> None:
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1
+        parameters.setRelinearizeThreshold(_RELINEARISE)
+        parameters.findUnusedFactorSlots = True
+        self._isam = gtsam.ISAM2(parameters)
+        self._held: dict[tuple[int, int, str], tuple[RelativePose, int]] = {}
+        self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
+
+    def _exchange(self, wanted: dict[tuple[int, int, str], RelativePose], T_world_camera_initial: FloatArray) -> None:
+        gone = [key for key, (edge, _) in self._held.items() if key not in wanted or _differ(edge, wanted[key])]
+        slots = [self._held.pop(key)[1] for key in gone]
+        fresh = [key for key in wanted if key not in self._held]
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for key in fresh:
+            factors.add(_between(wanted[key], self._kernel, self._config))
+        count = len(self._T_world_camera)
+        T_world_last = self._T_world_camera[-1] if count else T_world_camera_initial[0]
+        T_last_start = T_world_last @ invert(T_world_camera_initial[max(count - 1, 0)])
+        for k in range(count, len(T_world_camera_initial)):
+            values.insert(k, _pose3(T_last_start @ T_world_camera_initial[k]))
+        if not count:
+            factors.add(_anchor(values.atPose3(0)))
+        result = self._isam.update(factors, values, slots)
+        self._held |= {
+            key: (wanted[key], slot) for key, slot in zip(fresh, result.getNewFactorsIndices(), strict=False)
+        }
+        T_before = None
+        for _ in range(_MOST_UPDATES):
+            T = np.stack(
+                [p.matrix() for p in map(self._isam.calculateEstimatePose3, range(len(T_world_camera_initial)))]
+            )
+            if T_before is not None and np.abs(T - T_before).max() < _SETTLED:
+                break
+            T_before = T
+            self._isam.update()
+        if not np.isfinite(T).all():
+            raise RuntimeError("the solution is not finite")
+        T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
+        T[0] = T_world_camera_initial[0]
+        self._T_world_camera = T
 
 
 def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
@@ -227,6 +279,37 @@ def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatA
     return {str(level): float((squared <= chi2.ppf(level / 100, 6)).mean()) for level in (50, 90, 95)}
 
 
+def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:
+    ends = np.array([(e.from_index, e.to_index) for e in relative_poses], dtype=int).reshape(-1, 2)
+    if len(ends) and (ends.min() < 0 or ends.max() >= count):
+        raise SlamError(f"a factor links frame {ends.max()}, but the trajectory has {count} frames")
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, component = connected_components(links, directed=False)
+    loose = np.flatnonzero(component != component[0])
+    if len(loose):
+        raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
+
+
+def _differ(old: RelativePose, new: RelativePose) -> bool:
+    """Whether a measurement has changed by more than nothing to speak of."""
+    moved = np.abs(old.T_from_to - new.T_from_to).max()
+    return bool(moved > _SAME_SHARE * new.sigmas.min() or np.abs(old.sigmas / new.sigmas - 1.0).max() > _SAME_SHARE)
+
+
+def _anchor(pose: Any) -> Any:
+    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA))
+
+
+def _between(edge: RelativePose, kernel: str, config: PoseGraphConfig) -> Any:
+    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(edge.sigmas, dtype=np.float64))
+    if kernel != "none":
+        estimators = gtsam.noiseModel.mEstimator
+        huber = kernel == "huber"
+        estimator = estimators.Huber.Create(config.huber_k) if huber else estimators.Cauchy.Create(config.cauchy_k)
+        noise = gtsam.noiseModel.Robust.Create(estimator, noise)
+    return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
+
+
 def _check(edge: RelativePose) -> None:
     name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
     if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
@@ -239,23 +322,3 @@ def _check(edge: RelativePose) -> None:
 
 def _pose3(T_a_b: FloatArray) -> Any:
     return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])
-
-
-def _g2o_poses(T_a_b: FloatArray) -> list[str]:
-    """Translation and quaternion (xyzw) of poses ``(N, 4, 4)``, shortest digits that read back exactly."""
-    if len(T_a_b) == 0:
-        return []
-    quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
-    rows = np.concatenate([T_a_b[:, :3, 3], quaternions_xyzw], axis=1)
-    return [_numbers(row) for row in rows]
-
-
-def _g2o_information(sigmas: FloatArray) -> str:
-    """Upper triangle row by row; g2o puts translation first."""
-    information = np.diag(1.0 / sigmas[_TRANSLATION_FIRST] ** 2)
-    return _numbers(information[np.triu_indices(6)])
-
-
-def _numbers(row: FloatArray) -> str:
-    return " ".join(map(repr, row.tolist()))
-

@@ -47,6 +47,7 @@ _MEANINGS = {
     "reference": "ground truth",
     "graph.g2o": "pose graph",
     "loops.json": "loop candidates and verdicts",
+    "places.npz": "features of places, for localize",
     "map_mesh.ply": "map as a mesh, y down",
     "map_cloud.ply": "map as a coloured cloud, y down",
     "run.log": "log of the run",

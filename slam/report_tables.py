@@ -77,6 +77,7 @@ def what_ran(metrics: Metrics) -> str:
     sha256 = say("provenance", "weights_sha256")
     rows = [
         ("Sequence", f"{say('sequence', 'name')}, {say('sequence', 'frames')} frames"),
+        ("Bridged frames", _bridged(metrics)),
         ("True length", say("sequence", "length_m", unit=" m")),
         ("Frame rate", say("sequence", "fps", unit=" frames/s")),
         ("Scale", f"mode {say('scale', 'mode')}, value {say('scale', 'value', decimals=4)}"),
@@ -243,6 +244,13 @@ def _details(loops_file: Path, verdict: str) -> list[Any]:
         return []
     entries = tree.get(verdict) if isinstance(tree, dict) else None
     return entries if isinstance(entries, list) else []
+
+
+def _bridged(metrics: Metrics) -> str:
+    """Frames that measured nothing, with the reason of each run of them."""
+    found, _ = lookup(metrics, "sequence", "bridged")
+    gaps = [f"{gap['first']} to {gap['last']}: {gap['reason']}" for gap in found or ()]
+    return _shortened(gaps) if gaps else "none"
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> str:

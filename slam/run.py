@@ -22,17 +22,21 @@ from erfsfm.evaluation.pose_metrics import (
     snippets_from_trajectory,
 )
 from erfsfm.inference import DepthPosePredictor, commit
+from slam.cache import CachedNetworks
 from slam.config import dump_yaml, load_config
 from slam.errors import SlamError
 from slam.evaluation import trajectory_metrics
-from slam.frames import Predictor
+from slam.foreign import import_rerun
+from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.refusal import Refusal
 from slam.map_metrics import accuracy_median_m, completeness, pose_similarity, visible_surface
 from slam.networks import NetworkPredictor
 from slam.pipeline import Progress, SlamPipeline, SlamResult
+from slam.places import PLACES, Places
 from slam.pose_graph import coverage
 from slam.report import DepthExample, write_report
+from slam.rerun_file import write_rerun
 from slam.run_folder import RunFolder
 from slam.se3 import apply, umeyama
 from slam.sequences.catalogue import open_sequence
@@ -41,6 +45,7 @@ from slam.summary import (
     SCHEMA,
     Provenance,
     as_json,
+    describe_bridged,
     describe_failure,
     describe_sequence,
     describe_timing,
@@ -65,6 +70,8 @@ def run_slam(
     device: str = "auto",
     progress: Progress | None = None,
     command: str = "slam.run_slam",
+    cache: Path | None = None,
+    rerun: Path | None = None,
 ) -> RunFolder:
     """Run the whole system on one sequence.
 
@@ -82,6 +89,8 @@ def run_slam(
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: told of (stage, done, total).
         command: recorded in the metrics.
+        cache: folder that keeps the networks' answers; None asks them anew.
+        rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
 
     Returns:
         The run folder.
@@ -89,9 +98,12 @@ def run_slam(
     Raises:
         SlamError, ErfsfmError: one line; whatever ends a run, a folder already made holds what there is and says why.
     """
+    if rerun is not None:
+        import_rerun()  # better missed before the run than after it
     settings = load_config(config, overrides)
     recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
     networks = DepthPosePredictor.from_weights(weights, device)
+    predictor = NetworkPredictor(networks if cache is None else _cached(networks, cache))
     provenance = Provenance(
         version=__version__,
         commit=commit(),
@@ -108,8 +120,11 @@ def run_slam(
     folder.write_text("config.yaml", dump_yaml(settings))
     with _logging_to(folder.path / "run.log"):
         try:
-            pipeline = SlamPipeline(recording, _seeded(networks, seed), settings, progress)
-            _run(folder, pipeline, recording, provenance, settings.output.report)
+            _seed(seed)
+            pipeline = SlamPipeline(recording, predictor, settings, progress)
+            result = _run(folder, pipeline, recording, provenance, settings.output.report)
+            if rerun is not None:
+                write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
             return folder
         except BaseException as error:
             _leave_failure(folder, provenance, settings.output.report, error)
@@ -127,27 +142,33 @@ def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, erro
             write_report(folder, [], None, None)
 
 
-def _seeded(networks: DepthPosePredictor, seed: int) -> Predictor:
+def _cached(networks: DepthPosePredictor, folder: Path) -> CachedNetworks:
+    """The networks with a folder of their answers; GPU and CPU answer a little differently and share none."""
+    network = networks.record.network.model_dump_json()
+    return CachedNetworks(networks, f"{networks.sha256} {network} {networks.device.type}", folder)
+
+
+def _seed(seed: int) -> None:
     np.random.seed(seed)
     cv2.setRNGSeed(seed)
-    return NetworkPredictor(networks)
 
 
 def _run(
     folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, report: bool
-) -> None:
+) -> SlamResult:
     estimate = pipeline.estimate()
-    _write_estimate(folder, estimate)
+    _write_estimate(folder, estimate, sequence.intrinsics)
     result = replace(estimate, map=pipeline.fuse(estimate))
     surface = _write_map(folder, result, sequence)
     folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
     if report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, surface.points, surface.colours)
+    return result
 
 
-def _write_estimate(folder: RunFolder, result: SlamResult) -> None:
-    """Trajectories, graph and loops: kept even where the map fails."""
+def _write_estimate(folder: RunFolder, result: SlamResult, intrinsics: Intrinsics) -> None:
+    """Trajectories, graph, loops and places: kept even where the map fails."""
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
@@ -157,6 +178,14 @@ def _write_estimate(folder: RunFolder, result: SlamResult) -> None:
         folder.write_trajectory("trajectory_lidar", lidar)
     folder.write("graph.g2o", result.graph.write_g2o)
     folder.write_text("loops.json", as_json(result.loops.details()))
+    folder.write(PLACES, _places(result, intrinsics).write)
+
+
+def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
+    """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
+    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.observations.views)
+    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
+    return Places(intrinsics, views, T_world_camera)
 
 
 def _lidar_trajectory(result: SlamResult) -> Trajectory | None:
@@ -190,7 +219,8 @@ def _metrics(
             "schema": SCHEMA,
             "status": "ok",
             "provenance": asdict(provenance),
-            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None),
+            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
+            | describe_bridged(result.observations.bridged),
             "timing": describe_timing(result.stopwatch, len(sequence)),
             "scale": _scale(result),
             "trajectories": trajectories,

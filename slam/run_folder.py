@@ -24,6 +24,7 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
     "metrics.json",
     "graph.g2o",
     "loops.json",
+    "places.npz",
     "map_mesh.ply",
     "map_cloud.ply",
     "report.html",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from slam.frames import Sequence
+from slam.frames import Sequence, runs
 from slam.timing import Stopwatch, peak_rss_mb
 
 SCHEMA = 1
@@ -42,6 +43,14 @@ def describe_sequence(sequence: Sequence, length_m: float | None) -> dict[str, A
     summary |= {"length_m": length_m} if length_m is not None else null("length_m", "the sequence has no true poses")
     summary |= {"fps": (frames - 1) / span} if span > 0 else null("fps", "the stamps span no time")
     return summary
+
+
+def describe_bridged(frames: Mapping[int, str]) -> dict[str, Any]:
+    """How many frames measured nothing, and the runs of them with the first one's reason."""
+    return {
+        "bridged_frames": len(frames),
+        "bridged": [{"first": first, "last": last, "reason": frames[first]} for first, last in runs(frames)],
+    }
 
 
 def describe_timing(watch: Stopwatch, frames: int) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 MINIMUM_DEPTH_M = 1e-3
 Crop = Literal["none", "garg"]
 Scaling = Literal["none", "median"]
+Clipping = Literal["after", "before"]
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,18 @@ def depth_errors(
     true_depth: NDArray[np.float32],
     cap_m: float = 80.0,
     crop: Crop = "none",
-    scaling: Scaling = "median",
+    scaling: Scaling | float = "median",
+    clipping: Clipping = "after",
 ) -> DepthErrors | None:
     """Compare one depth map with the truth.
 
     Args:
         predicted: z-depth ``(H, W)``, positive.
         true_depth: z-depth in metres ``(H, W)``, 0 where unknown.
-        cap_m: truth beyond is left out; the scaled prediction is clipped to it.
+        cap_m: truth beyond is left out; the prediction is clipped to it.
         crop: which part of the image counts.
-        scaling: ``median`` multiplies the prediction by the ratio of the medians.
+        scaling: ``median`` multiplies the prediction by the ratio of the medians, a number by itself.
+        clipping: ``after`` scaling is the field's rule; ``before``, and never after, is the paper's code.
 
     Returns:
         The errors, or None where no pixel has truth.
@@ -73,19 +76,30 @@ def depth_errors(
         return None
     truth = true_depth[mask].astype(np.float64)
     guess = predicted[mask].astype(np.float64)
-    scale = float(np.median(truth) / np.median(guess)) if scaling == "median" else 1.0
-    guess = np.clip(guess * scale, MINIMUM_DEPTH_M, cap_m)
-    ratio = np.maximum(truth / guess, guess / truth)
+    if clipping == "before":
+        guess = np.clip(guess, MINIMUM_DEPTH_M, cap_m)
+    scale = _scale(guess, truth, scaling)
+    guess = guess * scale
+    if clipping == "after":
+        guess = np.clip(guess, MINIMUM_DEPTH_M, cap_m)
+    with np.errstate(divide="ignore"):  # a scale of 0 is infinitely wrong in ratios
+        ratio, log_error = np.maximum(truth / guess, guess / truth), np.log(truth) - np.log(guess)
     return DepthErrors(
         abs_rel=float(np.mean(np.abs(truth - guess) / truth)),
         sq_rel=float(np.mean((truth - guess) ** 2 / truth)),
         rmse=float(np.sqrt(np.mean((truth - guess) ** 2))),
-        rmse_log=float(np.sqrt(np.mean((np.log(truth) - np.log(guess)) ** 2))),
+        rmse_log=float(np.sqrt(np.mean(log_error**2))),
         a1=float(np.mean(ratio < 1.25)),
         a2=float(np.mean(ratio < 1.25**2)),
         a3=float(np.mean(ratio < 1.25**3)),
         scale=scale,
     )
+
+
+def _scale(guess: NDArray[np.float64], truth: NDArray[np.float64], scaling: Scaling | float) -> float:
+    if scaling == "median":
+        return float(np.median(truth) / np.median(guess))
+    return 1.0 if scaling == "none" else float(scaling)
 
 
 def mean_errors(errors: list[DepthErrors]) -> DepthErrors:

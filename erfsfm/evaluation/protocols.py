@@ -50,7 +50,7 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
     recordings = [r for r in discover(root) if r.depth is not None]
     if not recordings:
         raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")
-    leak = _refuse_leak(networks, recordings, allow_leak)
+    leak = refuse_leak(networks, [r.frames_name for r in recordings], allow_leak)
     frames = [(r, i) for r in recordings for i in range(0, len(r), every)]
     truths = [r.true_depth(i) for r, i in frames]
     sizes = {t.shape for t in truths if t is not None}
@@ -91,7 +91,7 @@ def pose_protocol(
         T_world_camera = recording.true_poses(fidelity)
         if T_world_camera is None:
             raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
-        leak = _refuse_leak(networks, [recording], allow_leak)
+        leak = refuse_leak(networks, [recording.frames_name], allow_leak)
         rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak)
     return rows
 
@@ -141,11 +141,16 @@ def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, An
     return {"method": name, **mean, "scale_spread": spread, "images": len(errors), "leak": leak}
 
 
-def _refuse_leak(networks: Networks, recordings: list[Recording], allow_leak: bool) -> bool:
-    leaked = networks.leaks([r.frames_name for r in recordings])
+def refuse_leak(networks: Networks, names: Sequence[str], allow_leak: bool) -> bool:
+    """Whether training saw some of the frames named.
+
+    Raises:
+        DataError: it did, and that was not allowed.
+    """
+    leaked = networks.leaks(names)
     if leaked and not allow_leak:
+        some = ", ".join(leaked[:5]) + (f" and {len(leaked) - 5} more" if len(leaked) > 5 else "")
         raise DataError(
-            f"leak: these weights were trained on {', '.join(leaked)}; choose other weights or data, or allow it with "
-            "--allow-leak"
+            f"leak: these weights were trained on {some}; choose other weights or data, or allow it with --allow-leak"
         )
     return bool(leaked)

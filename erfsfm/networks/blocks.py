@@ -10,6 +10,7 @@ from erfsfm.networks.deformable import DeformableConv2d
 
 Fidelity = Literal["default", "paper"]
 Normalisation = Literal["none", "batch"]
+Activation = Literal["relu", "leaky"]
 Variant = Literal["plain", "dilated", "dfc", "dfcv2"]
 
 
@@ -47,6 +48,7 @@ class ConvBlock(nn.Sequential):
             convolution = nn.Conv2d(in_channels, out_channels, layer.kernel, layer.stride, padding, layer.dilation)
         super().__init__(convolution, *_activation(out_channels, normalisation))
         self.layer = layer
+        self.padding = padding
 
 
 class UpBlock(nn.Sequential):
@@ -103,6 +105,16 @@ def scaled(channels: int, width: float) -> int:
 def crop_like(features: Tensor, reference: Tensor) -> Tensor:
     """Cut rows and columns at the bottom and right that `reference` does not have."""
     return features[..., : reference.shape[-2], : reference.shape[-1]]
+
+
+def let_leak(network: nn.Module, slope: float = 0.1) -> None:
+    """Turn every ReLU into a leaky one, as FlowNet and DispNet had them (Mayer et al. 2016).
+
+    A narrow decoder has four channels at full resolution: where all are at rest, only a bias would still learn.
+    """
+    for block in network.modules():
+        if isinstance(block, ConvBlock | UpBlock):
+            block[-1] = nn.LeakyReLU(slope, inplace=True)
 
 
 def initialise(network: nn.Module, fidelity: Fidelity) -> None:

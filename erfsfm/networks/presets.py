@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 
 from erfsfm.errors import ConfigError
-from erfsfm.networks.blocks import Fidelity, Normalisation, Variant
+from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.receptive_field import multiply_adds, theoretical
@@ -63,6 +63,7 @@ def build(
     sources: int = 4,
     normalisation: Normalisation = "none",
     mask_branch: bool = False,
+    activation: Activation = "relu",
 ) -> DepthNet | PoseNet:
     """Build a network with fresh weights.
 
@@ -73,6 +74,7 @@ def build(
         sources: number of source images of a pose network; a depth network ignores it.
         normalisation: batch norm after every convolution but the heads, or none as published.
         mask_branch: explainability masks in a pose network; a depth network ignores it.
+        activation: after every convolution but the heads, as published or leaking a tenth.
 
     Raises:
         ConfigError: if the name or an option is unknown or out of range.
@@ -82,12 +84,18 @@ def build(
     _check_choice("normalisation", normalisation, get_args(Normalisation))
     if not 0 < width <= 8:
         raise ConfigError(f"width must be above 0 and at most 8; got {width}")
+    _check_choice("activation", activation, get_args(Activation))
+    network: DepthNet | PoseNet
     if preset.kind == "depth":
-        return DepthNet(preset.variant, fidelity, width, normalisation)
-    try:
-        return PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+        network = DepthNet(preset.variant, fidelity, width, normalisation)
+    else:
+        try:
+            network = PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    if activation == "leaky":
+        let_leak(network)
+    return network
 
 
 def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:

@@ -4,6 +4,7 @@ The paper compares its networks by the field of one pixel of the last encoder la
 """
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -53,10 +54,45 @@ class MeasuredField:
         """Width of the bounding box, 0 for an empty field."""
         return self.right - self.left + 1
 
+    def share_holding(self, weight: float) -> float:
+        """The smallest share of the image's pixels that holds this share of the gradient, 0 for an empty field."""
+        total = self.gradient.double().flatten().sort(descending=True).values.cumsum(0)
+        if total[-1] == 0:
+            return 0.0
+        return float((total < weight * total[-1]).double().mean()) + 1 / len(total)
 
-def theoretical(network: Network) -> int:
-    """Side of the receptive field after the last encoder layer in pixels; deformable at zero offsets."""
-    return field_after(network.encoder_layers())
+
+def theoretical(network: Network, offsets_px: float = 0.0) -> int:
+    """Side of the receptive field after the last encoder layer in pixels.
+
+    r = r_0 + 2 ceil(o) sum_i j_i        over the deformable layers i, j_i the jump of their input
+
+    Args:
+        network: any depth or pose network.
+        offsets_px: how far deformable taps may be pushed outwards, in pixels of the layer's input; a part
+            of a pixel reads the next one too.
+    """
+    layers = network.encoder_layers()
+    moving = sum(jump for layer, jump in zip(layers, _jumps(layers)) if layer.deformable)
+    return field_after(layers) + 2 * math.ceil(offsets_px) * moving
+
+
+def theoretical_corner(network: Network, pixel: tuple[int, int], offsets_px: float = 0.0) -> tuple[int, int]:
+    """Image row and column of the top-left corner of a field of `theoretical` side; outside the image too.
+
+    Args:
+        network: any depth or pose network.
+        pixel: (row, column) of the observed output in the last encoder layer.
+        offsets_px: as for `theoretical`.
+    """
+    layers = network.encoder_layers()
+    jumps = _jumps(layers)
+    reach = 0
+    for block, jump in zip(network.encoder.blocks(), jumps):
+        reach += jump * block.padding
+    reach += (theoretical(network, offsets_px) - field_after(layers)) // 2
+    step = jumps[-1] * layers[-1].stride
+    return pixel[0] * step - reach, pixel[1] * step - reach
 
 
 def field_after(layers: Sequence[Layer]) -> int:
@@ -64,11 +100,12 @@ def field_after(layers: Sequence[Layer]) -> int:
 
     r += (k - 1) d j;  j *= s        with the jump j of the layer's input in pixels
     """
-    field, jump = 1, 1
-    for layer in layers:
-        field += (layer.kernel - 1) * layer.dilation * jump
-        jump *= layer.stride
-    return field
+    return 1 + sum((layer.kernel - 1) * layer.dilation * jump for layer, jump in zip(layers, _jumps(layers)))
+
+
+def _jumps(layers: Sequence[Layer]) -> list[int]:
+    """Distance in image pixels of neighbouring inputs of each layer."""
+    return [math.prod(before.stride for before in layers[:i]) for i in range(len(layers))]
 
 
 def measured(
@@ -106,7 +143,7 @@ def measured(
 
 
 def effective(network: Network, image: Tensor, pixel: tuple[int, int] | None = None) -> MeasuredField:
-    """Gradient-weighted field of the network as it is, its weights and offsets included.
+    """Gradient-weighted field of the network as it is, its weights and offsets included (Luo et al. 2016).
 
     Args:
         network: any depth or pose network.
@@ -128,7 +165,9 @@ def field_of(
     rounding: float = 0.0,
     stages: int | None = None,
 ) -> MeasuredField:
-    """Field of one pixel of channel 0 of an encoder's output, by input gradients.
+    """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
+
+    All channels, for a single one may be dead behind its ReLU.
 
     Args:
         encoder: the encoder as it is.
@@ -143,7 +182,7 @@ def field_of(
     row, column = pixel or (map_size[0] // 2, map_size[1] // 2)
     if not (0 <= row < map_size[0] and 0 <= column < map_size[1]):
         raise ValueError(f"pixel must lie in the map of size {map_size}; got {(row, column)}")
-    (gradient,) = torch.autograd.grad(output[0, 0, row, column], image)
+    (gradient,) = torch.autograd.grad(output[0, :, row, column].sum(), image)
     gradient = gradient[0].abs().sum(dim=0)  # (H, W)
     seen = gradient > rounding * gradient.max()
     top, bottom = _extent(seen.any(dim=1))

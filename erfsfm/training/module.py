@@ -19,7 +19,12 @@ from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
+from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
+
+# Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
+_CONSTANT = 1e-3
+_CONSTANT_STEPS = 100
 
 
 class SelfSupervision(lightning.LightningModule):
@@ -35,9 +40,14 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_net, self.pose_net = build_networks(config.network)
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
+        self._constant_steps = 0
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """The objective of one batch; stops the run where it is not a number."""
+        """The objective of one batch; stops the run where it is not a number, or the depth stays a constant.
+
+        Raises:
+            TrainingError: so it is.
+        """
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
         snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds)
         outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
@@ -45,13 +55,25 @@ class SelfSupervision(lightning.LightningModule):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
-                "training.gradient_clip, then go on with --resume"
+                "training.gradient_clip, then go on with --resume; the weights so far are in last/"
             )
+        self._refuse_constant(outcome.disparities[0].detach())
         self.log("loss", outcome.total.detach(), prog_bar=True)
         self.log_dict({f"loss/{name}": value.detach() for name, value in outcome.terms.items()})
         if self.global_step % (20 * self.config.training.log_every) == 0:
             self._log_pictures(snippets, outcome.disparities[0], outcome.warped)
         return outcome.total
+
+    def _refuse_constant(self, disparity: Tensor) -> None:
+        """Stop once the disparity ``(B, 1, H, W)`` has been flat in all images for many steps on end."""
+        spread = float((disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).max())
+        self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
+        if self._constant_steps == _CONSTANT_STEPS:
+            raise TrainingError(
+                f"the depth has been one constant for {_CONSTANT_STEPS} steps (spread {spread:.1g} at step "
+                f"{self.global_step}): nothing is learned from it; lower training.learning_rate or "
+                "loss.smoothness_weight and start anew; the weights so far are in last/"
+            )
 
     def _present(self) -> ExperimentConfig:
         """The configuration with the objective of this step."""
@@ -62,11 +84,21 @@ class SelfSupervision(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         """Adam on both networks; the schedule counts steps."""
         training = self.config.training
-        optimiser = torch.optim.Adam(self.parameters(), lr=training.learning_rate, betas=(0.9, 0.999))
-        if training.schedule == "constant":
-            return optimiser
+        offsets = [
+            parameter
+            for layer in self.modules()
+            if isinstance(layer, DeformableConv2d)
+            for branch in (layer.offset, layer.modulator)
+            for parameter in branch.parameters()
+        ]
+        slow = {id(parameter) for parameter in offsets}
+        groups = [
+            {"params": [p for p in self.parameters() if id(p) not in slow]},
+            {"params": offsets, "lr": training.learning_rate * training.offset_rate},
+        ]
+        optimiser = torch.optim.Adam(groups, lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser, lambda step: 0.02 + 0.98 * (1 + math.cos(math.pi * min(step / training.steps, 1))) / 2
+            optimiser, lambda step: learning_rate_factor(training.schedule, min(step / training.steps, 1))
         )
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -119,6 +151,13 @@ class SelfSupervision(lightning.LightningModule):
                 if warped is not None:
                     board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
                 board.add_image("disparity", shown, self.global_step)
+
+
+def learning_rate_factor(schedule: str, progress: float) -> float:
+    """Share of the learning rate at a share of the run; a cosine ends at 2 %."""
+    if schedule == "cosine":
+        return 0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2
+    return 0.1 if schedule == "step" and progress >= 0.75 else 1.0
 
 
 def _reconstruction_error(batch: dict[str, Tensor], disparity: Tensor, T_source_target: Tensor) -> float:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import pickle
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.plugins import TorchCheckpointIO
+from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -28,6 +33,7 @@ from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.inference import choose_device
 from erfsfm.training.module import SelfSupervision
+from erfsfm.training.progress import ProgressLine
 
 logger = logging.getLogger(__name__)
 
@@ -42,9 +48,12 @@ def train(
 ) -> Path:
     """Train, validate, keep the best.
 
+    With several devices, Lightning starts this very program again for each further one; these end here.
+
     Args:
         config: the experiment.
-        output: receives ``config.yaml``, the best weights at its top, the latest under ``last/``,
+        output: receives ``config.yaml``, the best weights at its top (see `decisive`), those with the best
+            poses under ``best_pose/`` where true poses validate, the latest under ``last/``,
             ``checkpoints/last.ckpt`` for ``resume``, and CSV and TensorBoard logs under ``logs/``.
         resume: go on from ``checkpoints/last.ckpt``.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -63,15 +72,19 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     module = SelfSupervision(config)
     batch, workers = config.training.batch, config.data.workers
-    draws = SnippetDraws(training, config, config.training.steps * batch, done_steps * batch)
+    together = batch * config.training.devices
+    rank = int(os.environ.get("LOCAL_RANK", 0)) if config.training.devices > 1 else 0
+    draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank)
     seen = trained_on(draws.recordings)
     if config.initial_weights and not resume:
         seen = merge([*seen, *_start_from(module, config.initial_weights)])
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = DataLoader(draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
-    trainer = _trainer(config, output, device, quiet, keeper, done_steps)
+    trainer = _trainer(config, output, device, quiet or rank > 0, keeper, done_steps)
     _fit(trainer, module, loader, validation_loader, checkpoint if resume else None)
+    if not trainer.is_global_zero:
+        sys.exit()
     keeper.save(module, trainer.global_step)
     return output
 
@@ -105,47 +118,88 @@ def _fit(
 
 
 class WeightKeeper(Callback):
-    """Writes weights that can be used at once: the latest under ``last/``, the best at the top."""
+    """Writes weights that can be used at once: the latest, the best and those with the best poses.
+
+    How long the last improvement is ago follows from the step in the best ones' record, so that a run
+    that is killed and resumed stops where it would have stopped.
+    """
 
     def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
         self._output = output
         self._seen = seen
         self._command = command
         self.validates = validates
-        top = output / "model.yaml"
-        self._best = decisive(read_record(top).metrics) if top.is_file() else math.inf
+        self._best = {output: math.inf, output / "best_pose": math.inf}
+        self._best_step = 0
+        for folder in self._best:
+            if (folder / "model.yaml").is_file():
+                record = read_record(folder / "model.yaml")
+                self._best[folder] = self._measures(record.metrics)[folder]
+                if math.isfinite(self._best[folder]):
+                    self._best_step = max(self._best_step, record.step)
         self._saved_step = -1
 
     def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Keep what was just validated."""
-        if not trainer.sanity_checking and isinstance(module, SelfSupervision):
+        """Keep what was just validated; end the run where the last improvement is too long ago."""
+        if trainer.sanity_checking or not isinstance(module, SelfSupervision):
+            return
+        improved = self._improved(module.validation_metrics)
+        if improved:
+            self._best_step = trainer.global_step
+        if trainer.is_global_zero:
             self.save(module, trainer.global_step)
+        self._best |= improved
+        training = module.config.training
+        if training.patience and trainer.global_step - self._best_step >= training.patience * training.validate_every:
+            trainer.should_stop = True
+            logger.info(
+                "stopped at step %d: no validation since step %d was better", trainer.global_step, self._best_step
+            )
+
+    def on_exception(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
+    ) -> None:
+        """Keep the weights so far, if they are numbers."""
+        numbers = all(torch.isfinite(weights).all() for weights in module.parameters())
+        if isinstance(module, SelfSupervision) and trainer.is_global_zero and trainer.global_step > 0 and numbers:
+            save_model(self._output / "last", self._model(module, trainer.global_step))
 
     def save(self, module: SelfSupervision, step: int) -> None:
-        """Write ``last/``; and the top of the folder, where the decisive measure is the best so far.
+        """Write ``last/``; and the folders whose measure is the best so far.
 
         Without validation the last is the best.
         """
         if step == self._saved_step:
             return
         self._saved_step = step
-        metrics = module.validation_metrics
+        model = self._model(module, step)
+        save_model(self._output / "last", model)
+        folders = set(self._improved(module.validation_metrics))
+        if not self.validates or not (self._output / "model.yaml").is_file():
+            folders.add(self._output)
+        for folder in folders:
+            save_model(folder, model)
+
+    def _model(self, module: SelfSupervision, step: int) -> Model:
         record = ModelRecord(
             network=module.config.network,
             trained_on=self._seen,
             licence=licence_of(self._seen),
             step=step,
-            metrics=metrics,
+            metrics=module.validation_metrics,
             version=erfsfm.__version__,
             commit=commit(),
             command=self._command,
         )
-        model = Model(record, module.depth_net, module.pose_net)
-        save_model(self._output / "last", model)
-        measure = decisive(metrics)
-        if not self.validates or measure < self._best or not (self._output / "model.yaml").is_file():
-            self._best = measure
-            save_model(self._output, model)
+        return Model(record, module.depth_net, module.pose_net)
+
+    def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
+        """What each folder's weights are judged by; less is better."""
+        pose = metrics.get("snippet_ate", math.inf)
+        return {self._output: decisive(metrics), self._output / "best_pose": pose if math.isfinite(pose) else math.inf}
+
+    def _improved(self, metrics: dict[str, float]) -> dict[Path, float]:
+        return {folder: value for folder, value in self._measures(metrics).items() if value < self._best[folder]}
 
     def state_dict(self) -> dict[str, list[str]]:
         """What was seen survives a resume, also with other data."""
@@ -221,6 +275,11 @@ def _trainer(
     config: ExperimentConfig, output: Path, device: str, quiet: bool, keeper: WeightKeeper, done_steps: int
 ) -> lightning.Trainer:
     training = config.training
+    on_cpu = choose_device(device).type == "cpu"
+    precision = training.precision
+    if on_cpu and precision == "16-mixed":
+        logger.warning("training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU")
+        precision = "bf16-mixed"
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",
@@ -232,11 +291,16 @@ def _trainer(
     # Lightning's CSV log starts by deleting an older one of its name
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
-    progress = [] if quiet else [TQDMProgressBar(refresh_rate=5)]
+    progress = [] if quiet else [ProgressLine(training.batch * training.devices)]
+    several = training.devices > 1
     return lightning.Trainer(
-        accelerator="gpu" if choose_device(device).type == "cuda" else "cpu",
-        devices=1,
-        precision=training.precision,
+        accelerator="cpu" if on_cpu else "gpu",
+        devices=training.devices,
+        # a term or a scale that is switched off leaves weights without gradient
+        strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
+        sync_batchnorm=several and not on_cpu,
+        use_distributed_sampler=False,  # the draws are dealt out already, and every process validates everything
+        precision=precision,
         max_steps=training.steps,
         gradient_clip_val=training.gradient_clip or None,
         check_val_every_n_epoch=None,
@@ -245,10 +309,20 @@ def _trainer(
         log_every_n_steps=training.log_every,
         logger=logs,
         callbacks=[latest, keeper, *progress],
-        enable_progress_bar=not quiet,
+        plugins=[AtomicCheckpoints()],
+        enable_progress_bar=False,
         enable_model_summary=False,
         default_root_dir=output,
     )
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """A checkpoint replaces the last one at once, or not at all: Lightning's goes through another file system."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write ``checkpoint`` to ``path``."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(Path(path), lambda part: torch.save(checkpoint, part))
 
 
 @contextmanager

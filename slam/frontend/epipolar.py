@@ -35,6 +35,19 @@ class TwoView:
     inliers: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Structure:
+    """``M`` scene points that a motion triangulated, by the names of their tracks ``(M,)``.
+
+    z-depths ``(M,)`` in both cameras are in units of the motion's length; ``sigma_share`` ``(M,)`` is relative.
+    """
+
+    names: NDArray[np.int64]
+    depth_previous: FloatArray
+    depth_current: FloatArray
+    sigma_share: FloatArray
+
+
 def estimate_two_view(
     rays_previous: FloatArray, rays_current: FloatArray, focal_px: float, inlier_px: float
 ) -> TwoView | None:
@@ -91,8 +104,8 @@ def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, two_
 
     From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
     """
-    across = np.cross(rays_current, rays_previous @ two_view.R_current_previous.T)
-    along = -np.cross(rays_current, two_view.direction)
+    across = _cross(rays_current, rays_previous @ two_view.R_current_previous.T)
+    along = -_cross(rays_current, two_view.direction)
     return np.asarray((across * along).sum(axis=1) / np.maximum((across**2).sum(axis=1), 1e-18))
 
 
@@ -113,7 +126,7 @@ def _refined(
         weights = inliers / (1.0 + (residual / (2.0 * sigma)) ** 2)
         normal = jacobian.T @ (weights[:, None] * jacobian) + 1e-12 * np.eye(5)
         step = -np.linalg.solve(normal, jacobian.T @ (weights * residual))
-        if iteration == _ITERATIONS - 1 or np.abs(step).max() < 1e-9:
+        if iteration == _ITERATIONS - 1 or np.abs(step).max() < 1e-6:
             break
         R = Rotation.from_rotvec(step[:3]).as_matrix() @ R
         direction = direction + tangent @ step[3:]
@@ -132,8 +145,9 @@ def _sampson(
     The gradient's norm is held fixed in the Jacobian, as in reweighted least squares.
     """
     turned = rays_previous @ R.T
-    lines_current = np.cross(direction, turned)  # E x
-    lines_previous = np.cross(rays_current, direction) @ R  # E^T x'
+    lines_current = _cross(direction, turned)  # E x
+    across = _cross(rays_current, direction)
+    lines_previous = across @ R  # E^T x'
     algebraic = (rays_current * lines_current).sum(axis=1)
     gradient = np.sqrt((lines_current[:, :2] ** 2).sum(axis=1) + (lines_previous[:, :2] ** 2).sum(axis=1))
     gradient = np.maximum(gradient, 1e-9)
@@ -141,7 +155,13 @@ def _sampson(
     first = np.cross(direction, axis)
     first = first / np.linalg.norm(first)
     tangent = np.stack([first, np.cross(direction, first)], axis=1)
-    by_rotation = np.cross(turned, np.cross(rays_current, direction))
-    by_direction = np.cross(turned, rays_current) @ tangent
+    by_rotation = _cross(turned, across)
+    by_direction = _cross(turned, rays_current) @ tangent
     jacobian = np.concatenate([by_rotation, by_direction], axis=1) / gradient[:, None]
     return algebraic / gradient, jacobian, tangent
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a x b`` of ``(3,)`` or ``(M, 3)``; NumPy's own spends most of its time on choosing axes."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)

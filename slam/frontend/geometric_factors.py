@@ -6,6 +6,8 @@ ratio of learned to triangulated depth; perspective-n-point against learned dept
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
 from slam.frontend.epipolar import (
+    Structure,
     TwoView,
     estimate_two_view,
     parallax_px,
@@ -29,8 +32,32 @@ STILL_SOURCE = "still"
 _MAD_TO_SIGMA = 1.4826
 _MIN_RATIOS = 20
 _LEARNED_SIGMA_SHARE = 0.1
+_LEARNED_LENGTH_SHARE = 0.05
 # neighbouring corners err together: the covariance of independent ones is widened by this
 _CORRELATION = 2.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A measured ``relative_pose``, its length by learned depth, unscaled.
+
+    Where corners alone gave rotation and direction, ``structure`` holds what they triangulated and
+    ``direction_sigmas`` ``(3,)`` the noise of the direction in the later camera, radians; else both are None.
+    """
+
+    relative_pose: RelativePose
+    structure: Structure | None = None
+    direction_sigmas: FloatArray | None = None
+
+    def with_length(self, length: float, sigma_share: float) -> RelativePose:
+        """The same rotation and direction with a length from elsewhere and its relative sigma."""
+        if self.direction_sigmas is None:
+            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
+        T_previous_current = self.relative_pose.T_from_to.copy()
+        T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
+        rotation_sigmas = self.relative_pose.sigmas[:3]
+        sigmas = _sigmas(T_previous_current, rotation_sigmas, self.direction_sigmas, sigma_share)
+        return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas)
 
 
 class GeometricOdometry:
@@ -41,13 +68,13 @@ class GeometricOdometry:
         self._intrinsics = intrinsics
         self._tracker = CornerTracker(config)
 
-    def relative_pose(
+    def measure(
         self,
         previous: Frame,
         current: Frame,
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
-    ) -> RelativePose | Refusal:
+    ) -> Motion | Refusal:
         """Measure the motion between two frames.
 
         Args:
@@ -61,11 +88,12 @@ class GeometricOdometry:
         if len(tracks.previous) < self._config.min_inliers:
             return Refusal(f"only {len(tracks.previous)} corners could be followed")
         depth = self._trusted(_sample(depth_previous_unscaled, tracks.previous), height_unscaled)
-        measured = self._still(tracks, depth) or self._by_essential(tracks, depth) or self._by_points(tracks, depth)
-        if isinstance(measured, Refusal):
-            return measured
-        T_previous_current, sigmas, source = measured
-        return RelativePose(previous.index, current.index, T_previous_current, sigmas, source)
+        step = (previous.index, current.index)
+        return (
+            self._still(step, tracks, depth)
+            or self._by_essential(step, tracks, depth)
+            or (self._by_points(step, tracks, depth))
+        )
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
@@ -78,7 +106,7 @@ class GeometricOdometry:
         y = (pixels[:, 1] - camera.cy) / camera.fy
         return np.stack([x, y, np.ones_like(x)], axis=1)
 
-    def _still(self, tracks: Tracks, depth: FloatArray) -> _Measured | None:
+    def _still(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
         flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
         if flow >= self._config.still_flow_px or not np.isfinite(depth).any():
             return None
@@ -86,9 +114,9 @@ class GeometricOdometry:
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
         rotation = np.deg2rad(self._config.rotation_floor_deg)
-        return np.eye(4), np.repeat([rotation, translation], 3), STILL_SOURCE
+        return Motion(RelativePose(*step, np.eye(4), np.repeat([rotation, translation], 3), STILL_SOURCE))
 
-    def _by_essential(self, tracks: Tracks, depth: FloatArray) -> _Measured | None:
+    def _by_essential(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         rays_previous, rays_current = self._rays(tracks.previous), self._rays(tracks.current)
         # an essential matrix of a pure rotation invents a translation: only believe one that is needed
@@ -101,26 +129,28 @@ class GeometricOdometry:
             return None
         parallax = parallax_px(rays_previous, rays_current, two_view.R_current_previous, self._intrinsics)
         triangulated = triangulated_depth(rays_previous, rays_current, two_view)
-        measures = two_view.inliers & (triangulated > 0) & np.isfinite(depth)
-        measures &= parallax > self._config.min_point_parallax_px
+        solid = two_view.inliers & (triangulated > 0) & (parallax > self._config.min_point_parallax_px)
+        measures = solid & np.isfinite(depth)
         if measures.sum() < _MIN_RATIOS:
             return None
-        ratios = depth[measures] / triangulated[measures]
-        length, spread = _length(ratios, self._config.inlier_px / parallax[measures])
-        T_current_previous = make(two_view.R_current_previous, length * two_view.direction)
-        sigmas = self._essential_sigmas(two_view, length, max(spread, self._config.length_floor_share))
-        return invert(T_current_previous), sigmas, ESSENTIAL_SOURCE
+        sigma_share = self._config.inlier_px / np.maximum(parallax, 1e-9)
+        length, spread = _length(depth[measures] / triangulated[measures], sigma_share[measures])
+        T_previous_current = invert(make(two_view.R_current_previous, length * two_view.direction))
+        rotation, direction = self._essential_sigmas(two_view)
+        depth_current = triangulated * (rays_previous @ two_view.R_current_previous[2]) + two_view.direction[2]
+        solid &= depth_current > 0
+        structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
+        sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))
+        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction)
 
-    def _essential_sigmas(self, two_view: TwoView, length: float, length_share: float) -> FloatArray:
-        """Sigmas ``(6,)`` in the current camera, where GTSAM perturbs ``T_previous_current``."""
+    def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
+        """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
         widened = _CORRELATION * np.sqrt(np.diag(two_view.covariance))
         rotation = np.hypot(widened[:3], np.deg2rad(self._config.rotation_floor_deg))
         floor = np.deg2rad(self._config.direction_floor_deg)
-        across = np.hypot(widened[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
-        translation = length * np.hypot(across, length_share * two_view.direction)
-        return np.concatenate([rotation, np.maximum(translation, 1e-3 * length)])
+        return rotation, np.hypot(widened[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
 
-    def _by_points(self, tracks: Tracks, depth: FloatArray) -> _Measured | Refusal:
+    def _by_points(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | Refusal:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth)
         if known.sum() < self._config.min_inliers:
@@ -146,7 +176,8 @@ class GeometricOdometry:
         )
         R_current_previous = Rotation.from_rotvec(rotation.ravel()).as_matrix()
         sigmas = self._points_sigmas(points_previous[chosen], pixels[chosen], rotation, translation)
-        return invert(make(R_current_previous, translation.ravel())), sigmas, PNP_SOURCE
+        T_previous_current = invert(make(R_current_previous, translation.ravel()))
+        return Motion(RelativePose(*step, T_previous_current, sigmas, PNP_SOURCE))
 
     def _points_sigmas(
         self, points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray
@@ -158,12 +189,18 @@ class GeometricOdometry:
         J = jacobian[:, :6]
         own = _CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
         length = float(np.linalg.norm(translation))
-        share = max(2.0 * self._config.length_floor_share, _LEARNED_SIGMA_SHARE)
-        floors = np.repeat([np.deg2rad(self._config.rotation_floor_deg), share * length], 3)
+        floors = np.repeat([np.deg2rad(self._config.rotation_floor_deg), _LEARNED_SIGMA_SHARE * length], 3)
         return np.asarray(np.hypot(own, floors))
 
 
-_Measured = tuple[FloatArray, FloatArray, str]
+def _sigmas(
+    T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_share: float
+) -> FloatArray:
+    """Sigmas ``(6,)`` from those of rotation and direction ``(3,)`` and of the length, in the current camera."""
+    along = np.abs(invert(T_previous_current)[:3, 3])
+    length = float(np.linalg.norm(along))
+    translation = np.hypot(length * direction, length_share * along)
+    return np.concatenate([rotation, np.maximum(translation, 1e-3 * length)])
 
 
 def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:

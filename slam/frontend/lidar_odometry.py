@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.config import LidarConfig
 from slam.errors import SlamError
-from slam.frames import Sequence
+from slam.frames import RelativePose, Sequence
 from slam.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
 
 LEAST_SCANS = 2
+LIDAR_SOURCE = "lidar"
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,12 @@ class LidarPath:
 
     frames: NDArray[np.int64]
     T_world_camera: FloatArray
+
+
+def has_scans(sequence: Sequence) -> bool:
+    """Whether two neighbouring frames have a scan each and the LiDAR's place on the car is known."""
+    scanned = [sequence.scan_path(k) is not None for k in range(len(sequence))]
+    return sequence.T_camera_lidar is not None and any(map(all, itertools.pairwise(scanned)))
 
 
 def lidar_path(sequence: Sequence) -> LidarPath | None:
@@ -50,6 +59,18 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
     return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera)
+
+
+def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:
+    """The motion between neighbouring frames that both have a scan, as measurements."""
+    rotation = np.deg2rad(config.rotation_sigma_deg)
+    sigmas = np.repeat([rotation, config.translation_sigma_m], 3)
+    T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
+    return [
+        RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)
+        for first, second, T in zip(path.frames[:-1], path.frames[1:], T_previous_current, strict=True)
+        if second == first + 1
+    ]
 
 
 def _points(sequence: Sequence, frame: int) -> FloatArray:

@@ -40,6 +40,21 @@ def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) ->
     return factors
 
 
+def without_measured(factors: Sequence[RelativePose], geometric: Sequence[RelativePose]) -> list[RelativePose]:
+    """The factors that span at least one step between neighbouring frames that geometry did not measure.
+
+    The network errs alike on neighbouring snippets: beside a geometric factor of the same step, many of its
+    factors would count as many opinions where they are one, and a worse one.
+    """
+    measured = {g.from_index for g in geometric if g.to_index == g.from_index + 1}
+
+    def spans_a_gap(factor: RelativePose) -> bool:
+        first, last = _pair(factor.from_index, factor.to_index)
+        return not measured.issuperset(range(first, last))
+
+    return [factor for factor in factors if spans_a_gap(factor)]
+
+
 def measured_noise(
     snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], config: FrontendConfig
 ) -> FrontendConfig:

@@ -1,6 +1,6 @@
-"""Metric scale of monocular depth, by a named mode: the road below the camera, LiDAR, or a reference.
+"""The unit of learned depth: from the road below the camera, or from a reference.
 
-The camera-height mode fits the road plane in the learned depth of every frame. With the plane
+The road plane is fitted to the learned depth of every frame. With the plane
 ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
 ray, and the ray is free of noise, so the fit is not biased by the depth's errors as a fit of points is.
 """
@@ -88,21 +88,6 @@ def scale_from_road(
     height = 1.0 if camera_height_m is None else camera_height_m
     ratios = [height / road.height_unscaled for road in roads if isinstance(road, RoadPlane)]
     return estimate_scale(np.array(ratios), config)
-
-
-def lidar_ratio(depth_unscaled: DepthMap, points_uvz: FloatArray) -> float | None:
-    """Median ratio of LiDAR depth to learned depth in one image.
-
-    Args:
-        depth_unscaled: learned z-depth ``(H, W)``.
-        points_uvz: LiDAR points in the image ``(P, 3)``: u and v in pixels, z-depth in metres.
-    """
-    height, width = depth_unscaled.shape
-    u, v = np.rint(points_uvz[:, :2]).astype(int).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (points_uvz[:, 2] > 0)
-    learned = depth_unscaled[v[inside], u[inside]].astype(np.float64)
-    ratios = points_uvz[inside, 2][learned > 0] / learned[learned > 0]
-    return float(np.median(ratios)) if len(ratios) >= 20 else None
 
 
 def scale_from_reference(

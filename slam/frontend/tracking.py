@@ -19,31 +19,40 @@ _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 @dataclass(frozen=True)
 class Tracks:
-    """The same ``M`` scene points in two images, pixels ``(M, 2)`` each."""
+    """The same ``M`` scene points in two images, pixels ``(M, 2)`` each, and their names ``(M,)``.
+
+    A corner keeps its name from frame to frame for as long as it can be followed.
+    """
 
     previous: FloatArray
     current: FloatArray
+    names: NDArray[np.int64]
 
 
 class CornerTracker:
-    """Follows corners between the frames of one sequence and remembers the last frames' corners."""
+    """Follows corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
 
     def __init__(self, config: GeometryConfig) -> None:
         self._config = config
         self._seen: OrderedDict[int, _Seen] = OrderedDict()
+        self._named = 0
 
     def track(self, previous: Frame, current: Frame) -> Tracks:
         """Corners of ``previous`` found again in ``current``."""
         first, second = self._see(previous), self._see(current)
         if first.corners is None:
-            first.corners = self._corners(first.grey)
-        forward, found = self._flow(first, second, first.corners)
+            self._fill(first, _no_corners())
+        assert first.corners is not None
+        forward, found = self._flow(first, second, first.corners.pixels)
         backward, found_back = self._flow(second, first, forward)
-        error = np.abs(backward - first.corners).max(axis=1, initial=0.0)
+        error = np.abs(backward - first.corners.pixels).max(axis=1, initial=0.0)
         height, width = second.grey.shape
         inside = (forward >= 0).all(axis=1) & (forward <= [width - 1, height - 1]).all(axis=1)
         kept = found & found_back & inside & (error < self._config.forward_backward_px)
-        return Tracks(first.corners[kept].astype(np.float64), forward[kept].astype(np.float64))
+        names = first.corners.names[kept]
+        if second.corners is None:
+            self._fill(second, _Corners(forward[kept], names))
+        return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
 
     def _see(self, frame: Frame) -> _Seen:
         seen = self._seen.get(frame.index)
@@ -55,12 +64,23 @@ class CornerTracker:
             self._seen.popitem(last=False)
         return seen
 
-    def _corners(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def _fill(self, seen: _Seen, arrived: _Corners) -> None:
+        """Give a frame the corners that arrived and new ones where there is room."""
         config = self._config
-        corners = cv2.goodFeaturesToTrack(
-            grey, config.max_corners, config.corner_quality, config.corner_spacing_px, blockSize=5
-        )
-        return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        pixels, names = arrived.pixels, arrived.names
+        room = config.max_corners - len(pixels)
+        if room > 0:
+            free = np.full(seen.grey.shape, 255, np.uint8)
+            for u, v in np.rint(pixels).astype(int).tolist():
+                cv2.circle(free, (u, v), int(config.corner_spacing_px), 0, -1)
+            corners = cv2.goodFeaturesToTrack(
+                seen.grey, room, config.corner_quality, config.corner_spacing_px, mask=free, blockSize=5
+            )
+            fresh = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+            pixels = np.concatenate([pixels, fresh])
+            names = np.concatenate([names, self._named + np.arange(len(fresh))])
+            self._named += len(fresh)
+        seen.corners = _Corners(pixels, names)
 
     def _flow(
         self, first: _Seen, second: _Seen, points: NDArray[np.float32]
@@ -80,8 +100,18 @@ class CornerTracker:
         return moved.reshape(-1, 2), status.ravel().astype(bool)
 
 
+@dataclass(frozen=True)
+class _Corners:
+    pixels: NDArray[np.float32]
+    names: NDArray[np.int64]
+
+
+def _no_corners() -> _Corners:
+    return _Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
+
+
 @dataclass
 class _Seen:
     image: Image
     grey: NDArray[np.uint8]
-    corners: NDArray[np.float32] | None = None
+    corners: _Corners | None = None

@@ -59,6 +59,26 @@ def find_candidates(views: Sequence[View], path_m: FloatArray, config: LoopsConf
     return found
 
 
+class PlaceIndex:
+    """The views of an old drive, to be asked which of them look like a new one."""
+
+    def __init__(self, views: Sequence[View], config: LoopsConfig) -> None:
+        """Learn the words of the drive; at least one view."""
+        self._words = train_vocabulary(views, config.words)
+        counts = _word_counts(views, self._words)
+        self._inverse_frequency = _inverse_frequency(counts)
+        self._weights = _weighted(counts, self._inverse_frequency)
+
+    def nearest(self, view: View, count: int) -> list[int]:
+        """Rows of at most ``count`` views that share words with this one, the most similar first."""
+        if not len(self._words) or not len(view):
+            return []
+        asked = _weighted(_word_counts([view], self._words), self._inverse_frequency)
+        scores = (self._weights @ asked.T).toarray().ravel()
+        best = np.argsort(-scores, kind="stable")[:count]
+        return [int(row) for row in best if scores[row] > 0]
+
+
 def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
     """Binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of all descriptors."""
     everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
@@ -83,17 +103,33 @@ def nearest_words(descriptors: Descriptors, words: Descriptors) -> np.ndarray[tu
 
 
 def _word_weights(views: Sequence[View], words: Descriptors) -> csr_array:
-    """Unit tf-idf vectors ``(V, K)``, square roots of the counts against bursts of one word."""
+    """Unit tf-idf vectors ``(V, K)``."""
+    counts = _word_counts(views, words)
+    return _weighted(counts, _inverse_frequency(counts))
+
+
+def _word_counts(views: Sequence[View], words: Descriptors) -> csr_array:
     word = np.concatenate([nearest_words(view.descriptors, words) for view in views])
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
     counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), max(len(words), 1)))
     counts.sum_duplicates()
-    seen_in = np.bincount(counts.indices, minlength=counts.shape[1])
-    idf = np.log(len(views) / np.maximum(seen_in, 1))
-    counts.data = np.sqrt(counts.data) * idf[counts.indices]
-    norm = np.sqrt(np.asarray((counts * counts).sum(axis=1)).ravel())
-    counts.data = counts.data / np.repeat(np.maximum(norm, 1e-12), np.diff(counts.indptr))
     return counts
+
+
+def _inverse_frequency(counts: csr_array) -> FloatArray:
+    """Weight ``(K,)`` of each word: the fewer views have it, the more it tells."""
+    seen_in = np.bincount(counts.indices, minlength=counts.shape[1])
+    weight: FloatArray = np.log(counts.shape[0] / np.maximum(seen_in, 1))
+    return weight
+
+
+def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
+    """Unit vectors; square roots of the counts against bursts of one word."""
+    weights = counts.copy()
+    weights.data = np.sqrt(counts.data) * inverse_frequency[counts.indices]
+    norm = np.sqrt(np.asarray((weights * weights).sum(axis=1)).ravel())
+    weights.data = weights.data / np.repeat(np.maximum(norm, 1e-12), np.diff(weights.indptr))
+    return weights
 
 
 def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]], config: LoopsConfig) -> list[int]:

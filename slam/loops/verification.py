@@ -64,10 +64,10 @@ class LoopVerifier:
 
         if len(rows_earlier) < self._config.min_inliers:
             return refused(f"only {len(rows_earlier)} matches")
-        forward = self._resect(earlier.points[rows_earlier], later.pixels[rows_later])
+        forward = self.resect(earlier.points[rows_earlier], later.pixels[rows_later])
         if isinstance(forward, str):
             return refused(forward)
-        backward = self._resect(later.points[rows_later], earlier.pixels[rows_earlier])
+        backward = self.resect(later.points[rows_later], earlier.pixels[rows_earlier])
         T_earlier_later = invert(forward.T_image_points)
         if isinstance(backward, str):
             return refused(f"backwards {backward}", len(forward.inliers), T_earlier_later)
@@ -84,8 +84,11 @@ class LoopVerifier:
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         return Loop(measured, inliers, score)
 
-    def _resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> _Resection | str:
-        """The camera that sees ``points`` at ``pixels``, or why there is none."""
+    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Resection | str:
+        """The camera that sees ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or why there is none.
+
+        Points with NaN are left out.
+        """
         config = self._config
         known = np.isfinite(points).all(axis=1)
         points, pixels = points[known].astype(np.float64), pixels[known].astype(np.float64)
@@ -112,7 +115,7 @@ class LoopVerifier:
             points[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
         )
         T_image_points = make(Rotation.from_rotvec(rotation.ravel()).as_matrix(), translation.ravel())
-        return _Resection(T_image_points, chosen, float(np.median(points[chosen, 2])))
+        return Resection(T_image_points, chosen, float(np.median(points[chosen, 2])))
 
     def _sigmas(self, T_a_b: FloatArray, depth: float, turned: float, moved: float) -> FloatArray:
         """Sigmas ``(6,)``: a floor, a share of the way between the views, and what both directions disagree about."""
@@ -124,7 +127,7 @@ class LoopVerifier:
 
 
 @dataclass(frozen=True)
-class _Resection:
+class Resection:
     """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z."""
 
     T_image_points: FloatArray

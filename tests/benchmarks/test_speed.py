@@ -3,73 +3,70 @@
 Nothing here asserts a time; machines are shared and differ.
 """
 
-import statistics
-import time
+import importlib.util
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
 from erfsfm.losses.photometric import box_mean
+from erfsfm.networks import deformable
 from erfsfm.networks.presets import build
 
 pytestmark = pytest.mark.slow
 SIZE = (4, 3, 128, 416)
+PAIRS = (
+    ("depthnet", "posenet"),
+    ("depthnet", "erf-posenet-dilated"),
+    ("depthnet", "erf-posenet-dfc"),
+    ("depthnet", "erf-posenet-dfcv2"),
+    ("erf-depthnet-dilated", "posenet"),
+    ("erf-depthnet-dfcv2", "posenet"),
+    ("erf-depthnet-dfc", "posenet"),
+)
 
 
-def cpu_ms(work: Callable[[], object], runs: int = 3) -> float:
-    """Median processor time of a call, milliseconds, after one call to warm up."""
-    work()
-    times = []
-    for _ in range(runs):
-        start = time.process_time()
-        work()
-        times.append((time.process_time() - start) * 1e3)
-    return statistics.median(times)
+Clock = Callable[..., list[float]]
 
 
-def test_networks_forward_and_backward() -> None:
-    torch.set_num_threads(1)
+def test_networks_forward_and_backward(cpu_ms: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     image, sources = torch.rand(SIZE) * 2 - 1, [torch.rand(SIZE) * 2 - 1 for _ in range(4)]
+    compiled_kernel = deformable._compiled_kernel
 
-    def pair(depth: str, pose: str) -> float:
-        depth_net, pose_net = build(depth), build(pose)
+    networks = {name: build(name) for pair in PAIRS for name in pair}
 
-        def step() -> None:
-            loss = sum(d.mean() for d in depth_net(image)) + pose_net(image, sources).mean()
+    def step(depth: str, pose: str, compiled: bool) -> Callable[[], None]:
+        def work() -> None:
+            monkeypatch.setattr(deformable, "_compiled_kernel", compiled_kernel if compiled else lambda: None)
+            loss = sum(d.mean() for d in networks[depth](image)) + networks[pose](image, sources).mean()
             loss.backward()
 
-        return cpu_ms(step)
+        return work
 
-    plain = pair("depthnet", "posenet")
-    print(f"\n{'depth + pose, forward + backward, batch 4, 416x128':60}{plain:9.0f} ms   1.00")
-    for depth, pose in (
-        ("depthnet", "erf-posenet-dilated"),
-        ("depthnet", "erf-posenet-dfc"),
-        ("depthnet", "erf-posenet-dfcv2"),
-        ("erf-depthnet-dilated", "posenet"),
-        ("erf-depthnet-dfcv2", "posenet"),
-        ("erf-depthnet-dfc", "posenet"),
-    ):
-        cost = pair(depth, pose)
-        print(f"{depth + ' + ' + pose:60}{cost:9.0f} ms {cost / plain:6.2f}")
-        assert np.isfinite(cost)
+    rows = [(*pair, path) for pair in PAIRS for path in ("Numba", "PyTorch") if path == "PyTorch" or "dfc" in str(pair)]
+    if importlib.util.find_spec("numba") is None:
+        rows = [row for row in rows if row[2] == "PyTorch"]
+    costs = cpu_ms(*(step(depth, pose, path == "Numba") for depth, pose, path in rows))
+    print("\n\n| depth network | pose network | deformable in | CPU ms | ratio |\n|---|---|---|---:|---:|")
+    for (depth, pose, path), cost in zip(rows, costs):
+        path = path if "dfc" in depth + pose else ""
+        print(f"| {depth} | {pose} | {path} | {cost:.0f} | {cost / costs[0]:.2f} |")
 
 
-def test_box_mean_against_pooling() -> None:
-    torch.set_num_threads(1)
+def test_box_mean_against_pooling(cpu_ms: Clock) -> None:
     x = torch.rand(16, 3, 130, 418)
-    ours, pooling = cpu_ms(lambda: box_mean(x), 9), cpu_ms(lambda: F.avg_pool2d(x, 3, 1), 9)
-    print(f"\n3 x 3 mean of 16 x 3 x 130 x 418: ours {ours:.1f} ms, avg_pool2d {pooling:.1f} ms")
+    ours, pooling = cpu_ms(lambda: box_mean(x), lambda: F.avg_pool2d(x, 3, 1), runs=9)
+    print("\n\n| 3 x 3 mean of 16 x 3 x 130 x 418 | CPU ms |\n|---|---:|")
+    print(f"| ours | {ours:.1f} |\n| avg_pool2d | {pooling:.1f} |")
     torch.testing.assert_close(box_mean(x), F.avg_pool2d(x, 3, 1))
 
 
-def test_simulated_street() -> None:
+def test_simulated_street(cpu_ms: Clock) -> None:
     from slam.sequences.simulated import SimulatedStreet, SimulationOptions
 
     street = SimulatedStreet(SimulationOptions(frames=250, seed=700))
-    cost = cpu_ms(lambda: [street.render(k) for k in range(0, 250, 10)]) / 25
-    print(f"\na frame of the simulated street, 416x128: {cost:.1f} ms, {1000 / cost:.0f} frames a second")
+    cost = cpu_ms(lambda: [street.render(k) for k in range(0, 250, 10)])[0] / 25
+    print("\n\n| simulated street, 416x128 | CPU ms a frame | frames a second |\n|---|---:|---:|")
+    print(f"| rendering | {cost:.1f} | {1000 / cost:.0f} |")
     assert street.render(0).image.shape == (128, 416, 3)

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
 from erfsfm.cli import main
@@ -68,7 +69,16 @@ assert not heavy, heavy
 def test_help_of_every_verb_is_light() -> None:
     finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
-    assert {"train", "predict", "networks", "evaluate depth", "evaluate pose"} <= set(finished.stdout.splitlines())
+    assert {
+        "train",
+        "predict",
+        "networks",
+        "receptive-field",
+        "convert",
+        "export",
+        "evaluate depth",
+        "evaluate pose",
+    } <= set(finished.stdout.splitlines())
 
 
 @pytest.mark.parametrize(
@@ -104,11 +114,22 @@ def test_usage(run: Run, arguments: list[str]) -> None:
         (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),
         (["predict", "{empty}", "--weights", "{weights}"], "no png or jpg"),
         (["networks", "--width", "0"], "width"),
+        (["convert", "nowhere.pth.tar", "--output", "new"], "nowhere.pth.tar"),
+        (["convert", "{image}", "--output", "new"], "damaged, no checkpoint"),
+        (["export", "--weights", "{weights}", "--output", "net.pt"], "must end in .onnx"),
+        (["receptive-field", "--network", "resnet"], "unknown network 'resnet'"),
+        (["receptive-field", "--images", "{empty}"], "five consecutive images; {empty} has 0"),
+        (["receptive-field", "--output", "field.txt"], ".png, .pdf or .svg"),
         (["networks", "--sources", "0"], "sources"),
         (["evaluate", "depth", "--dataset", "nowhere", "--weights", "{weights}"], "does not exist"),
         (["evaluate", "pose", "--dataset", "{root}", "--sequence", "44", "--weights", "{weights}"], "found 00"),
         (["evaluate", "pose", "--dataset", "{root}", "--sequence", "00", "--weights", "bad"], "no weights 'bad'"),
         (["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}"], "no true depth"),
+        (["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}", "--split", "eigen"], "is not shipped"),
+        (
+            ["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}", "--fidelity", "paper"],
+            "needs --split",
+        ),
     ],
 )
 def test_errors_are_one_line(
@@ -127,12 +148,13 @@ def test_errors_are_one_line(
     (tmp_path / "empty").mkdir()
     write_root(tmp_path / "root", frames=5)
     places = {"weights": weights, "empty": tmp_path / "empty", "root": tmp_path / "root"}
+    places["image"] = tmp_path / "root/sequences/00/image_2/000000.png"
     code, out, err = run(*(argument.format(**places) for argument in arguments))
     assert code == 1
     assert out == ""
     assert err.startswith("erfsfm: ")
     assert err.count("\n") == 1
-    assert words in err
+    assert words.format(**places) in err
 
 
 def test_an_unwritable_output_is_one_line(run: Run, tmp_path: Path, weights: Path) -> None:
@@ -166,6 +188,48 @@ def test_networks_table(run: Run) -> None:
     assert code == 0
     assert all(name in out for name in PRESETS)
     assert "263 px" in out
+
+
+def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
+    images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
+    picture = tmp_path / "new/field.png"
+    options = ["--network", "posenet", "--network", "erf-posenet-dilated", "--height", "64", "--width", "96"]
+    code, out, err = run("receptive-field", *options, "--weights", weights, "--images", images, "--output", picture)
+    assert (code, err) == (0, "")
+    assert "erf-posenet-dilated (paper)" in out and str(weights) in out and "263 px" in out
+    assert cv2.imread(str(picture)) is not None
+    code, out, err = run("receptive-field", *options, "--output", picture, "--json")
+    assert (code, err) == (0, "")
+    rows = json.loads(out)
+    assert [row["theoretical_px"] for row in rows] == [263, 339, 301]
+    assert {row["weights"] for row in rows} == {"untrained"}
+
+
+def test_convert(run: Run, tmp_path: Path) -> None:
+    old = {"pose_pred.weight": torch.zeros(12, 64, 1, 1), "pose_pred.bias": torch.zeros(12)}
+    planes = [9, 4, 8, 16, 32, 64, 64, 64]
+    for i, (inside, outside, kernel) in enumerate(zip(planes, planes[1:], (7, 5, 3, 3, 3, 3, 3)), start=1):
+        old[f"conv{i}.0.weight"] = torch.randn(outside, inside, kernel, kernel)
+        old[f"conv{i}.0.bias"] = torch.zeros(outside)
+    torch.save({"epoch": 1, "state_dict": old}, tmp_path / "exp_pose_model_best.pth.tar")
+    code, out, err = run("convert", tmp_path / "exp_pose_model_best.pth.tar", "--output", tmp_path / "new", "--dilated")
+    assert code == 0
+    assert "pose: erf-posenet-dilated" in out
+    assert "training data unknown" in err
+    assert "convert" in (tmp_path / "new/model.yaml").read_text()
+    code, _, err = run("predict", tmp_path / "nowhere.png", "--weights", tmp_path / "new")
+    assert (code, err.count("\n")) == (1, 1)
+
+
+def test_export(run: Run, tmp_path: Path, weights: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    code, out, err = run(
+        "export", "--weights", weights, "--format", "onnx", "--output", tmp_path / "new/net.onnx", "--json"
+    )
+    assert (code, err) == (0, "")
+    rows = json.loads(out)
+    assert [row["kind"] for row in rows] == ["depth", "pose"]
+    assert all(Path(row["path"]).is_file() and row["difference"] < 1e-4 for row in rows)
 
 
 @pytest.mark.parametrize("folder", [False, True])

@@ -25,7 +25,7 @@ from slam.trajectory import read_trajectory
 Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
 
-VERBS = {"run", "evaluate", "export", "simulate", "plot", "config", "doctor"}
+VERBS = {"run", "evaluate", "export", "simulate", "plot", "localize", "config", "doctor"}
 QUICK = ("--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false")
 
 
@@ -142,6 +142,13 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
     ]
 
 
+def test_run_says_what_it_bridged(call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path) -> None:
+    root = copy_of_kitti_root()
+    (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
+    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
+    assert code == 0 and re.search(r"^BRIDGED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
+
+
 def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:
     arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6", *QUICK]
     assert "LEAK" in call(*arguments)[1]
@@ -154,10 +161,11 @@ def test_a_run_that_breaks_off_is_one_line_and_a_failed_folder(
     call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
 ) -> None:
     root = copy_of_kitti_root()
-    (root / "sequences" / "sim" / "image_2" / "000009.png").write_bytes(b"no image")
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[4:]:
+        image.write_bytes(b"no image")
     code, out, err = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
     last = err.strip().splitlines()[-1]
-    assert code == 1 and out == "" and last.startswith("erfsfm-slam: ") and "000009.png" in last
+    assert code == 1 and out == "" and last.startswith("erfsfm-slam: ") and "000004.png" in last
     assert "Traceback" not in err
     assert RunFolder.open(Path("run")).metrics()["status"] == "failed"
 
@@ -227,6 +235,17 @@ def test_export_turned_up(call: Call, make_run: MakeRun) -> None:
 
     vertices = np.asarray(import_open3d().io.read_triangle_mesh("up.ply").vertices)
     np.testing.assert_allclose(vertices, [[0, 1, 0], [1, 1, 0], [0, 1, 2]], atol=1e-6)
+
+
+def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
+    run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
+    assert call(*run)[0] == 0
+    images = kitti_root / "sequences" / "sim" / "image_2"
+    code, out, err = call("localize", images, "--map", "run")
+    assert (code, err) == (0, "") and "of 14 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
+    assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
+    assert call("localize", images, "--map", images)[0] == 1
 
 
 def test_plot(call: Call, make_run: MakeRun) -> None:

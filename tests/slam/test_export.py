@@ -10,6 +10,8 @@ import pytest
 
 from slam.errors import RunError
 from slam.export import R_UP_WORLD, export
+from slam.frames import Intrinsics
+from slam.places import PLACES, Places
 from slam.run_folder import RunFolder
 from slam.se3 import FloatArray
 from slam.trajectory import read_trajectory
@@ -70,11 +72,39 @@ def test_graph_is_copied(make_run: MakeRun, tmp_path: Path) -> None:
     assert written.read_bytes() == (folder.path / "graph.g2o").read_bytes()
 
 
+def keep_places(folder: RunFolder) -> None:
+    camera = Intrinsics(416, 128, 230.0, 230.0, 207.0, 63.0)
+    folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
+
+
+@pytest.mark.parametrize("up", ["y-down", "z"])
+def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str) -> None:
+    folder = make_run()
+    keep_places(folder)
+    written = export(folder, "colmap", tmp_path / "new" / "model", up, rotate_ply)
+    assert (written / "cameras.txt").read_text().splitlines()[1] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
+    assert len((written / "images.txt").read_text().splitlines()) == 1 + 2 * 300
+    third = (written / "points3D.txt").read_text().splitlines()[3]
+    assert third == ("3 0 -2 1 128 128 128 0" if up == "y-down" else "3 0 1 2 128 128 128 0")
+    first = [float(word) for word in (written / "images.txt").read_text().splitlines()[1].split()[1:8]]
+    half = np.sqrt(0.5)  # z up: the camera's axes turned by 90 degrees about x
+    expected = [1.0, 0, 0, 0, 0, 0, 0] if up == "y-down" else [half, half, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(first, expected, atol=1e-9)
+
+
+def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -> None:
+    folder = make_run()
+    keep_places(folder)
+    (folder.path / "map_cloud.ply").unlink()
+    written = export(folder, "colmap", tmp_path / "model", "y-down", rotate_ply)
+    assert len((written / "points3D.txt").read_text().splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("what", "name", "up", "why"),
     [
-        ("colmap", "out", "y-down", "not built yet: .*camera.yaml"),
-        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph"),
+        ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
+        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap"),
         ("mesh", "out.obj", "y-down", r"ends in \.ply"),
         ("mesh", "out.ply", "x", "y-down or z"),
         ("graph", "out.g2o", "z", "leave --up out"),
@@ -95,10 +125,16 @@ def test_errors_are_clear_and_leave_nothing(
 
 
 @pytest.mark.parametrize(
-    ("what", "missing"), [("mesh", "map_mesh.ply"), ("trajectory", "trajectory_optimised.tum.txt")]
+    ("what", "missing"),
+    [
+        ("mesh", "map_mesh.ply"),
+        ("trajectory", "trajectory_optimised.tum.txt"),
+        ("colmap", "places.npz"),
+    ],
 )
 def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:
     folder = make_run()
+    keep_places(folder)
     (folder.path / missing).unlink()
     with pytest.raises(RunError, match=f"has no {missing}"):
         export(folder, what, tmp_path / "out.ply", "y-down", rotate_ply)

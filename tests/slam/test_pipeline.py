@@ -28,7 +28,7 @@ CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5
 FACTOR = 0.2  # unscaled lengths per metre
 NO_NOISE = OracleNoise()
-NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false")
+NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false", "bridging.enabled=false")
 
 
 class Drive:
@@ -145,7 +145,7 @@ def test_auto_without_a_height_is_none() -> None:
     ("frames", "mode", "words"),
     [
         (4, "auto", "drive has 4 frames, .* snippet .* has 5"),
-        (30, "lidar", "lidar is not built yet"),
+        (30, "lidar", "wants LiDAR scans of neighbouring frames"),
         (30, "reference", "drive has none"),
         (30, "camera-height", "add camera_height_m to camera.yaml"),
     ],
@@ -247,6 +247,10 @@ def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
     assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
     seen = result.observations
     assert len(seen.geometric) > 15 and len(seen.geometric) + len(seen.refusals) == 24
+    measured = {g.from_index for g in seen.geometric}
+    by_network = [f for f in result.factors if f.source == "network"]
+    assert all(set(range(*sorted((f.from_index, f.to_index)))) - measured for f in by_network)
+    assert len(seen.road_steps) > 10 and np.isfinite(result.scale.lengths).sum() == len(seen.motions)
     assert [index for index, _, _ in seen.examples] == [4, 8, 12, 16, 20]
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000

@@ -142,18 +142,32 @@ def test_a_run_that_fails_says_why_and_keeps_what_it_has(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
 ) -> None:
     root = copy_of_kitti_root()
-    image = root / "sequences" / "sim" / "image_2" / "000007.png"
-    image.write_bytes(image.read_bytes()[:200])
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
+        image.write_bytes(image.read_bytes()[:200])
     output = tmp_path / "failed"
-    with pytest.raises(SlamError, match=r"000007\.png is truncated"):
+    with pytest.raises(SlamError, match=r"no 5 usable frames in a row among 14: .*000003\.png is truncated"):
         run_slam(**reported | {"dataset": root, "frames": None}, output=output)
     metrics = json.loads((output / "metrics.json").read_text())
-    assert metrics["status"] == "failed" and "000007.png is truncated" in metrics["reason"]
+    assert metrics["status"] == "failed" and "000003.png is truncated" in metrics["reason"]
     assert metrics["provenance"]["weights_licence"] == "none, untrained"
     report = (output / "report.html").read_text()
-    assert ">FAILED<" in report and "000007.png is truncated" in report
+    assert ">FAILED<" in report and "000003.png is truncated" in report
     assert "the run failed" in (output / "run.log").read_text()
     assert yaml.safe_load((output / "config.yaml").read_text())["mapping"]["enabled"] is False
+
+
+def test_an_unreadable_image_is_bridged_and_reported(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    image = root / "sequences" / "sim" / "image_2" / "000006.png"
+    image.write_bytes(image.read_bytes()[:200])
+    folder = run_slam(**reported | {"dataset": root, "frames": None})
+    (gap,) = check_run(folder.path)["sequence"]["bridged"]
+    assert (gap["first"], gap["last"]) == (6, 6) and "000006.png is truncated" in gap["reason"]
+    assert folder.metrics()["sequence"]["bridged_frames"] == 1
+    for name in ("report.html", "run.log"):
+        assert "000006.png is truncated" in (folder.path / name).read_text()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")])
@@ -221,3 +235,21 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     Result.optimised.T_world_camera[:] = np.eye(4)
     graph = slam.run._graph(Result)  # type: ignore[arg-type]
     assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
+
+
+def test_a_run_from_the_cache_asks_no_network_and_leaves_the_same_bytes(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(*_: object) -> None:
+        raise AssertionError("a network was asked")
+
+    cache = tmp_path / "cache"
+    plain, first = run_slam(**quick), run_slam(**quick, cache=cache)
+    for name in ("disparity", "poses"):
+        monkeypatch.setattr(slam.run.DepthPosePredictor, name, asked)
+    second = run_slam(**quick, cache=cache)
+    for name in ("trajectory_network.tum.txt", "trajectory_optimised.kitti.txt", "graph.g2o"):
+        contents = {(run.path / name).read_bytes() for run in (plain, first, second)}
+        assert len(contents) == 1, name
+    other = quick | {"overrides": [*quick["overrides"], "pose_graph.kernel=none"]}
+    assert run_slam(**other, cache=cache).metrics()["status"] == "ok"

@@ -31,12 +31,12 @@ from slam.sequences.simulated import SimulatedStreet, SimulationOptions
 FRAMES = 9
 
 
-def experiment(batch: int = 2, sources: int = 2, **data: Any) -> ExperimentConfig:
+def experiment(batch: int = 2, sources: int = 2, devices: int = 1, **data: Any) -> ExperimentConfig:
     return ExperimentConfig.model_validate(
         {
             "network": {"height": 32, "width": 48, "sources": sources},
             "data": {"workers": 0, "cache_mb": 10} | data,
-            "training": {"batch": batch},
+            "training": {"batch": batch, "devices": devices},
         }
     )
 
@@ -116,6 +116,18 @@ def test_resuming_sees_what_it_would_have_seen(coded: Path) -> None:
         tail = batches(coded, workers, first=6)
         assert len(tail) == 2
         assert all(equal(a, b) for a, b in zip(whole[3:], tail))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers: int) -> None:
+    whole = list(DataLoader(SnippetDraws(discover(coded), experiment(batch=4), 16, 4), 4))
+    config = experiment(batch=2, devices=2)
+    parts = [
+        list(DataLoader(SnippetDraws(discover(coded), config, 16, 4, rank), 2, num_workers=workers)) for rank in (0, 1)
+    ]
+    assert len(whole) == len(parts[0]) == len(parts[1]) == 3
+    for batch, *shares in zip(whole, *parts):
+        assert equal(batch, {key: torch.cat([share[key] for share in shares]) for key in batch})
 
 
 def test_a_last_batch_may_be_smaller(coded: Path) -> None:

@@ -1,5 +1,8 @@
 import itertools
+import logging
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -79,10 +82,38 @@ CASES = [
 ]
 
 
+ONE_GROUP = [case for case in CASES if case[5] == case[6] == 1]
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """Sends every case to the compiled path that it knows, and counts how often it went there."""
+    kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
+    monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 0)
+    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 0)
+    calls = []
+    original = kernel.deform_conv2d
+    monkeypatch.setattr(kernel, "deform_conv2d", lambda *arguments: calls.append(1) or original(*arguments))
+    return calls
+
+
 @pytest.mark.parametrize("chunk", [2**20, 50])  # in one piece, and some outputs at a time
 @pytest.mark.parametrize("case", CASES)
 def test_values_and_gradients_equal_the_definition(case, chunk, monkeypatch):
     monkeypatch.setattr(deformable, "_CPU_CHUNK", chunk)
+    check_against_the_definition(case)
+
+
+@pytest.mark.parametrize("chunk, threads", [(2**20, 1), (50, 1), (50, 2)])
+@pytest.mark.parametrize("case", ONE_GROUP)
+def test_compiled_values_and_gradients_equal_the_definition(case, chunk, threads, monkeypatch, compiled):
+    monkeypatch.setattr(sys.modules["erfsfm.networks.deformable_kernel"], "_CHUNK", chunk)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    check_against_the_definition(case)
+    assert compiled
+
+
+def check_against_the_definition(case):
     stride, padding, dilation = case[2:5]
     tensors = make_case(*case)
     ours = deform_conv2d(**tensors, stride=stride, padding=padding, dilation=dilation)
@@ -123,6 +154,109 @@ def test_zero_offsets_and_unit_mask_are_plain_convolution(stride, padding, dilat
     for factors in (None, mask):
         ours = deform_conv2d(features, offset, weight, bias, stride, padding, dilation, factors)
         torch.testing.assert_close(ours, plain, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("case", ONE_GROUP)
+def test_compiled_float32_is_close_to_float64(case, compiled):
+    test_float32_is_close_to_float64(case)
+    assert len(compiled) == 2
+
+
+@pytest.mark.parametrize("stride, padding", [(1, 1), (2, 1), ((2, 1), (0, 3))])
+def test_compiled_neutral_start_is_plain_convolution(stride, padding, compiled):
+    features, weight = torch.randn(2, 4, 37, 101), torch.randn(6, 4, 3, 3)
+    plain = F.conv2d(features, weight, None, stride, padding)
+    ours = deform_conv2d(features, torch.zeros(2, 18, *plain.shape[2:]), weight, None, stride, padding)
+    torch.testing.assert_close(ours, plain, rtol=0, atol=1e-4)
+    assert compiled
+
+
+def test_a_whole_layer_learns_the_same_on_both_paths(compiled, monkeypatch):
+    torch.manual_seed(0)
+    layer = DeformableConv2d(8, 6, kernel=3, stride=2, padding=1).double()
+    initialise(layer, "paper")
+    features = torch.randn(2, 8, 12, 15, dtype=torch.float64, requires_grad=True)
+    wanted = [features, *layer.parameters()]
+    fast = torch.autograd.grad(layer(features).sin().sum(), wanted)
+    assert len(compiled) == 1
+    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**60)
+    plain = torch.autograd.grad(layer(features).sin().sum(), wanted)
+    assert len(compiled) == 1
+    for one, other in zip(fast, plain):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("poisoned", ["input", "offset", "mask"])
+def test_no_number_stays_visible_when_compiled(poisoned, compiled):
+    tensors = {name: tensor.detach() for name, tensor in make_case(*CASES[0]).items()}
+    tensors[poisoned][0, 0, 2, 2] = math.nan
+    if poisoned == "mask":
+        tensors["offset"][0, :2, 2, 2] = 100.0  # far outside, where nothing is read
+    output = deform_conv2d(**tensors, padding=1)
+    assert compiled and output[0].isnan().any() == (poisoned != "offset") and not output[1].isnan().any()
+
+
+@pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning")
+@pytest.mark.parametrize(
+    "why",
+    ["groups", "half precision", "autocast", "mixed precisions", "tracing", "meta", "few channels", "few samples"],
+)
+def test_what_the_compiled_path_leaves_to_pytorch(why, compiled, monkeypatch):
+    tensors = {name: tensor.detach() for name, tensor in make_case(*CASES[1 if why == "groups" else 0]).items()}
+    options = {"stride": 2 if why == "groups" else 1, "padding": 1}
+    if why == "half precision":
+        tensors = {name: tensor.bfloat16() for name, tensor in tensors.items()}
+    elif why == "mixed precisions":
+        tensors["offset"] = tensors["offset"].float()
+    elif why == "meta":
+        tensors = {name: tensor.to("meta") for name, tensor in tensors.items()}
+    elif why == "few channels":
+        monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 5)
+    elif why == "few samples":
+        monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 10**6)
+    if why == "tracing":
+        torch.jit.trace(lambda *given: deform_conv2d(*given[:3], padding=1), list(tensors.values()), check_trace=False)
+    else:
+        with torch.autocast("cpu", enabled=why == "autocast"):
+            deform_conv2d(**tensors, **options)
+    assert not compiled
+
+
+def test_without_numba_plain_pytorch_is_announced_once(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "erfsfm.networks.deformable_kernel", raising=False)
+    monkeypatch.delattr("erfsfm.networks.deformable_kernel", raising=False)
+    monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 0)
+    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 0)
+    deformable._compiled_kernel.cache_clear()
+    try:
+        with caplog.at_level(logging.INFO):
+            check_against_the_definition(CASES[0])
+            check_against_the_definition(CASES[4])
+    finally:
+        deformable._compiled_kernel.cache_clear()
+    assert [record.message.count("erfsfm-slam[fast]") for record in caplog.records] == [1]
+
+
+def test_small_layers_do_not_load_numba():
+    code = (
+        "import sys, torch; from erfsfm.networks.deformable import DeformableConv2d; "
+        "DeformableConv2d(8, 8, 3, 1, 1)(torch.rand(1, 8, 20, 20)).sum().backward(); sys.exit('numba' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_folder_that_cannot_be_written_does_not_matter(monkeypatch):
+    kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
+    njit = kernel.njit
+
+    def no_folder(cache=False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return njit(**options)
+
+    monkeypatch.setattr(kernel, "njit", no_folder)
+    assert kernel._compiled(lambda x: x + 1)(1) == 2
 
 
 def test_integer_offset_reads_the_neighbour():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch import nn
 
 from erfsfm.errors import ConfigError
 from erfsfm.networks.depth_net import DepthNet
@@ -123,3 +124,11 @@ def test_description_follows_width_and_sources():
     summaries = {summary.name: summary for summary in describe(width=0.5, sources=2)}
     assert summaries["posenet"].parameters == count("posenet", width=0.5, sources=2)
     assert summaries["posenet"].receptive_field == 263
+
+
+@pytest.mark.parametrize("name", ["erf-depthnet-dfcv2", "erf-posenet-dfc"])
+def test_leaky_networks_have_the_same_weights_and_no_dead_channels(name: str) -> None:
+    plain, leaky = build(name, width=0.25), build(name, width=0.25, activation="leaky")
+    assert {k: v.shape for k, v in plain.state_dict().items()} == {k: v.shape for k, v in leaky.state_dict().items()}
+    assert not any(isinstance(module, nn.ReLU) for module in leaky.modules())
+    assert any(isinstance(module, nn.ReLU) for module in plain.modules())

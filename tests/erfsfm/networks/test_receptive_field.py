@@ -5,7 +5,14 @@ import torch
 
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.presets import build
-from erfsfm.networks.receptive_field import effective, field_after, measured, multiply_adds, theoretical
+from erfsfm.networks.receptive_field import (
+    effective,
+    field_after,
+    measured,
+    multiply_adds,
+    theoretical,
+    theoretical_corner,
+)
 
 
 def small(name, fidelity="default"):
@@ -30,6 +37,41 @@ def small(name, fidelity="default"):
 )
 def test_theoretical(name, fidelity, wanted):
     assert theoretical(small(name, fidelity)) == wanted
+
+
+@pytest.mark.parametrize(
+    "name, at_rest, a_pixel",
+    [
+        ("posenet", 263, 0),
+        ("erf-posenet-dfc", 263, 248),
+        ("erf-posenet-dfcv2", 263, 30),
+        ("erf-depthnet-dfc", 787, 90),
+        ("erf-depthnet-dfcv2", 787, 720),
+    ],
+)
+def test_theoretical_with_taps_pushed_outwards(name, at_rest, a_pixel):
+    wanted = {0.0: 0, 0.5: 1, 1.0: 1, 1.5: 2, 3.0: 3}
+    assert {r: theoretical(small(name), r) for r in wanted} == {r: at_rest + a_pixel * n for r, n in wanted.items()}
+
+
+@pytest.mark.parametrize(
+    "name, fidelity, offsets_px",
+    [
+        ("posenet", "default", 0.0),
+        ("erf-posenet-dilated", "default", 0.0),
+        ("erf-posenet-dilated", "paper", 0.0),
+        ("erf-posenet-dfc", "default", 1.0),
+        ("erf-posenet-dfcv2", "default", 0.5),
+    ],
+)
+def test_theoretical_corner_is_where_gradients_begin(name, fidelity, offsets_px):
+    """On an image large enough for the whole field."""
+    network = small(name, fidelity)
+    side = theoretical(network, offsets_px)
+    size = 2 * side // 128 * 128
+    field = measured(network, (size, size), offsets_px=offsets_px)
+    assert (field.top, field.left) == theoretical_corner(network, field.pixel, offsets_px)
+    assert (field.rows, field.columns) == (side, side)
 
 
 @pytest.mark.parametrize(
@@ -146,11 +188,25 @@ def test_effective_field_lies_inside_the_measured_one():
     assert network.encoder.training
 
 
+def test_share_that_holds_the_weight():
+    field = measured(small("posenet"))
+    assert field.share_holding(1.0) <= field.coverage
+    assert 0 < field.share_holding(0.5) < field.share_holding(0.95) < field.coverage
+    field.gradient.zero_()[10, 20:30] = 1
+    assert field.share_holding(0.95) == pytest.approx(10 / (128 * 416))
+
+
+def test_a_dead_first_channel_hides_nothing():
+    network = small("posenet")
+    torch.nn.init.zeros_(network.encoder.stages[6][0][0].weight[0])
+    assert effective(network, torch.rand(1, 15, 128, 416)).coverage > 0.5
+
+
 def test_empty_field():
     network = small("posenet")
     torch.nn.init.zeros_(network.encoder.stages[6][0][0].weight)
     field = effective(network, torch.rand(1, 15, 128, 416))
-    assert (field.rows, field.columns, field.coverage) == (0, 0, 0.0)
+    assert (field.rows, field.columns, field.coverage, field.share_holding(0.95)) == (0, 0, 0.0, 0.0)
 
 
 def test_pixel_outside_the_map_is_named():

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import csv
+import logging
+import math
+import multiprocessing
 import os
 import pickle
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,10 +23,10 @@ import torch
 from torch import Tensor
 
 from erfsfm.checkpoint import load_model
-from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.training.module import SelfSupervision
+from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.run import decisive, licence_of, train
 
 Small = dict[str, dict[str, object]]
@@ -174,6 +179,43 @@ def test_resume_ends_with_the_very_same_weights(
     assert (tmp_path / "cut" / "logs" / "csv_from_4" / "metrics.csv").is_file()
 
 
+@pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])
+def test_killed_and_resumed_ends_with_the_very_same_weights(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, moment: str
+) -> None:
+    """``kill -9``: nothing is tidied up, and half a checkpoint may lie on the disk."""
+    config = configure(small, [world, held_out], training={"steps": 6, "learning_rate": 1e-3})
+    train(config, tmp_path / "whole", device="cpu")
+    victim = multiprocessing.get_context("fork").Process(target=die, args=(config, tmp_path / "cut", moment))
+    victim.start()
+    victim.join(120)
+    assert victim.exitcode == -signal.SIGKILL
+    train(config, tmp_path / "cut", resume=True, device="cpu")
+    assert same(tmp_path / "whole" / "last", tmp_path / "cut" / "last")
+    assert same(tmp_path / "whole", tmp_path / "cut")
+
+
+def die(config: ExperimentConfig, output: Path, moment: str) -> None:
+    """Train in this process until it kills itself."""
+    step, save, saved = SelfSupervision.training_step, torch.save, []
+
+    def dying_step(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        if moment == "in a step" and self.global_step == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(self, batch, index)
+
+    def dying_save(content: Any, path: Any, *args: Any, **options: Any) -> None:
+        save(content, path, *args, **options)
+        saved.append(path)
+        if moment == "in the second checkpoint" and len(saved) == 2:
+            os.truncate(path, Path(path).stat().st_size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    SelfSupervision.training_step = dying_step  # type: ignore[method-assign]
+    torch.save = dying_save
+    train(config, output, device="cpu")
+
+
 def test_a_finished_run_can_be_prolonged(small: Small, world: Path, tmp_path: Path) -> None:
     config = configure(small, [world])
     longer = configure(small, [world], training={"steps": 6})
@@ -210,6 +252,65 @@ def test_the_best_stays_on_top(
     assert load_model(output).record.step == 2
     assert load_model(output).record.metrics["abs_rel"] == 0.2
     assert load_model(output / "last").record.step == 4
+
+
+def pretend(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> None:
+    """Let the k-th validation of the run, counted by its steps, measure the k-th value."""
+    original = SelfSupervision.on_validation_epoch_end
+
+    def on_validation_epoch_end(self: SelfSupervision) -> None:
+        original(self)
+        self.validation_metrics[name] = values[self.global_step - 1]
+
+    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", on_validation_epoch_end)
+
+
+def test_best_depth_and_best_pose_are_kept_apart(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4])
+    pretend(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
+    config = configure(small, [world, held_out], training={"validate_every": 1})
+    output = train(config, tmp_path / "run", device="cpu")
+    steps = {name: load_model(output / name).record.step for name in (".", "best_pose", "last")}
+    assert steps == {".": 2, "best_pose": 3, "last": 4}
+
+
+@pytest.mark.parametrize(("patience", "end"), [(0, 8), (1, 3), (2, 6), (4, 8)])
+def test_patience_ends_a_run_also_after_a_resume(
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    patience: int,
+    end: int,
+) -> None:
+    pretend(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.1, 0.4, 0.1, math.nan, 0.2])
+    training = {"steps": 8, "validate_every": 1, "checkpoint_every": 1, "patience": patience}
+    config = configure(small, [world, held_out], training=training)
+    assert load_model(train(config, tmp_path / "whole", device="cpu") / "last").record.step == end
+    interrupted(monkeypatch, config, tmp_path / "cut", 2)
+    assert load_model(train(config, tmp_path / "cut", resume=True, device="cpu") / "last").record.step == end
+    assert same(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize(
+    ("schedule", "factors"),
+    [("constant", (1, 1, 1, 1)), ("step", (1, 1, 0.1, 0.1)), ("cosine", (1, 0.51, 0.163518, 0.02))],
+)
+def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]) -> None:
+    for progress, factor in zip((0, 0.5, 0.75, 1), factors):
+        assert learning_rate_factor(schedule, progress) == pytest.approx(factor, abs=1e-5)
+
+
+def test_pictures_are_logged(small: Small, world: Path, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    output = train(configure(small, [world], training={"steps": 1}), tmp_path / "run", device="cpu")
+    events = EventAccumulator(str(output / "logs" / "tensorboard")).Reload()
+    assert set(events.Tags()["images"]) == {"target", "source warped", "disparity"}
+    assert "loss" in events.Tags()["scalars"]
 
 
 @pytest.mark.parametrize(
@@ -272,8 +373,39 @@ def test_a_loss_that_is_no_number_stops_the_run(
         train(configure(small, [world]), tmp_path / "run", device="cpu")
     assert "\n" not in str(caught.value)
     assert "photometric nan" in str(caught.value)
+    assert load_model(tmp_path / "run" / "last").record.step == 3, "the weights so far"
+    assert all(torch.isfinite(tensor).all() for tensor in weights_of(tmp_path / "run" / "last"))
     monkeypatch.undo()
     train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
+
+
+@pytest.mark.parametrize(("spoilt", "stops"), [((1, 2, 3), True), ((0, 1, 3), False)])
+def test_a_depth_that_stays_constant_stops_the_run(
+    small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: tuple[int, ...], stops: bool
+) -> None:
+    original = SelfSupervision.training_step
+
+    def flat(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        weights = [head.weight for head in self.depth_net.heads]
+        before = [weight.detach().clone() for weight in weights]
+        for weight in weights:
+            weight.data *= self.global_step not in spoilt
+        try:
+            return original(self, batch, index)
+        finally:
+            for weight, values in zip(weights, before):
+                weight.data.copy_(values)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", flat)
+    monkeypatch.setattr("erfsfm.training.module._CONSTANT_STEPS", 3)
+    config = configure(small, [world], training={"steps": 5})
+    if not stops:
+        train(config, tmp_path / "run", device="cpu")
+        return
+    with pytest.raises(TrainingError, match=r"one constant for 3 steps .* at step 3") as caught:
+        train(config, tmp_path / "run", device="cpu")
+    assert "\n" not in str(caught.value)
+    assert load_model(tmp_path / "run" / "last").record.step == 3
 
 
 def test_ctrl_c_is_one_line(small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -446,3 +578,49 @@ def test_mixed_precision_trains(small: Small, world: Path, held_out: Path, tmp_p
     config = configure(small, [world, held_out], training={"precision": precision, "steps": 2})
     output = train(config, tmp_path / "run", device="cpu")
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
+
+
+def test_half_precision_on_a_cpu_is_announced(
+    small: Small, world: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        train(configure(small, [world], training={"precision": "16-mixed", "steps": 1}), tmp_path / "run", device="cpu")
+    assert [r.message for r in caplog.records] == [
+        "training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU"
+    ]
+
+
+@pytest.mark.slow  # each process imports torch and Lightning
+@pytest.mark.parametrize("workers", [0, 1])
+def test_two_processes_are_one_with_twice_the_batch(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, workers: int
+) -> None:
+    """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for the second."""
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
+        "from erfsfm.training.run import train\n"
+        "if __name__ == '__main__':\n"
+        "    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), '--resume' in sys.argv, device='cpu')\n"
+        "    print('trained')\n"
+    )
+
+    def run(name: str, resume: bool = False, **training: Any) -> None:
+        config = configure(small, [world, held_out], training=training, data={"workers": workers})
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(dump_yaml(config))
+        command = [sys.executable, str(script), str(file), str(tmp_path / name), *(["--resume"] if resume else [])]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "trained\n", "by the first process alone"
+
+    run("one", batch=4)
+    run("two", batch=2, devices=2)
+    for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
+    records = [load_model(tmp_path / name / "last").record for name in ("one", "two")]
+    assert records[0].metrics == pytest.approx(records[1].metrics, rel=1e-4)
+    run("two", resume=True, batch=2, devices=2, steps=6)
+    run("one", resume=True, batch=4, steps=6)
+    for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=1e-5)

@@ -8,8 +8,9 @@ from scipy.ndimage import gaussian_filter
 from slam import se3
 from slam.config import GeometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
-from slam.frontend.geometric_factors import GeometricOdometry
+from slam.frontend.geometric_factors import GeometricOdometry, Motion
 from slam.frontend.refusal import Refusal
+from slam.frontend.step_lengths import length_ratio
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = GeometryConfig()
@@ -50,7 +51,12 @@ def measure(T_previous_current, texture, depth_error=lambda depth: depth, config
     previous, depth = render(start, texture, 4)
     current, _ = render(start @ T_previous_current, texture, 5)
     odometry = GeometricOdometry(config, CAMERA)
-    return odometry.relative_pose(previous, current, depth_error(UNIT * depth), 1.65 * UNIT)
+    return odometry.measure(previous, current, depth_error(UNIT * depth), 1.65 * UNIT)
+
+
+def pose_of(motion: Motion | Refusal) -> RelativePose:
+    assert isinstance(motion, Motion)
+    return motion.relative_pose
 
 
 def errors(measured: RelativePose, truth: np.ndarray) -> tuple[float, float, float]:
@@ -74,8 +80,7 @@ def errors(measured: RelativePose, truth: np.ndarray) -> tuple[float, float, flo
 )
 def test_motion_is_recovered(texture, turn_deg, step):
     truth = se3.from_rotation_vector(np.deg2rad(turn_deg), np.array(step))
-    measured = measure(truth, texture)
-    assert isinstance(measured, RelativePose)
+    measured = pose_of(measure(truth, texture))
     assert (measured.from_index, measured.to_index, measured.source) == (4, 5, "essential")
     rotation_deg, direction_deg, length = errors(measured, truth)
     assert rotation_deg < 0.05
@@ -84,7 +89,7 @@ def test_motion_is_recovered(texture, turn_deg, step):
 
 
 def test_sigmas_are_tight_in_rotation_and_direction_and_loose_in_length(texture):
-    measured = measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture)
+    measured = pose_of(measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture))
     rotation_deg, (x, y, z) = np.rad2deg(measured.sigmas[:3]), measured.sigmas[3:] / UNIT
     assert (rotation_deg >= CONFIG.rotation_floor_deg).all()
     assert (rotation_deg < 0.1).all()
@@ -101,7 +106,7 @@ def test_length_withstands_wrong_depth_and_a_driving_car(texture):
         depth[60:130, 250:330] *= 4.0
         return depth
 
-    measured = measure(truth, texture, spoil)
+    measured = pose_of(measure(truth, texture, spoil))
     rotation_deg, _, length = errors(measured, truth)
     assert rotation_deg < 0.05
     assert abs(length) < 0.03
@@ -109,8 +114,7 @@ def test_length_withstands_wrong_depth_and_a_driving_car(texture):
 
 def test_pure_rotation_is_left_to_points(texture):
     truth = se3.from_rotation_vector(np.deg2rad([0.1, 2.0, 0.1]), np.array([0.0, 0.0, 0.01]))
-    measured = measure(truth, texture)
-    assert isinstance(measured, RelativePose)
+    measured = pose_of(measure(truth, texture))
     assert measured.source == "pnp"
     assert errors(measured, truth)[0] < 0.05
     assert np.linalg.norm(measured.T_from_to[:3, 3] - UNIT * truth[:3, 3]) < 0.02 * UNIT
@@ -118,8 +122,7 @@ def test_pure_rotation_is_left_to_points(texture):
 
 
 def test_standing_still_is_the_identity(texture):
-    measured = measure(np.eye(4), texture)
-    assert isinstance(measured, RelativePose)
+    measured = pose_of(measure(np.eye(4), texture))
     assert measured.source == "still"
     np.testing.assert_array_equal(measured.T_from_to, np.eye(4))
     assert (measured.sigmas[3:] < 0.05 * UNIT).all()
@@ -128,7 +131,7 @@ def test_standing_still_is_the_identity(texture):
 
 def test_refusals_carry_a_reason(texture):
     black = Frame(0, 0.0, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
-    refusal = GeometricOdometry(CONFIG, CAMERA).relative_pose(black, black, np.ones(U.shape, np.float32))
+    refusal = GeometricOdometry(CONFIG, CAMERA).measure(black, black, np.ones(U.shape, np.float32))
     assert isinstance(refusal, Refusal)
     assert "0 corners could be followed" in refusal.reason
     rotation = se3.from_rotation_vector(np.deg2rad([0.0, 2.0, 0.0]), np.zeros(3))
@@ -147,23 +150,60 @@ def test_far_depth_is_not_trusted(texture):
 
 def test_the_answer_is_the_same_every_time(texture):
     truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    one, other = measure(truth, texture), measure(truth, texture)
+    one, other = pose_of(measure(truth, texture)), pose_of(measure(truth, texture))
     np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
     np.testing.assert_array_equal(one.sigmas, other.sigmas)
 
 
-def test_a_used_odometry_answers_like_a_new_one(texture):
-    poses = se3.chain(np.tile(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), (5, 1, 1)))
-    frames = [render(T, texture, k) for k, T in enumerate(poses)]
-    used = GeometricOdometry(CONFIG, CAMERA)
-    for k in range(5):
-        for step in (1, 2):
-            if k >= step:
-                arguments = (frames[k - step][0], frames[k][0], frames[k - step][1])
-                measured = used.relative_pose(*arguments)
-                fresh = GeometricOdometry(CONFIG, CAMERA).relative_pose(*arguments)
-                np.testing.assert_array_equal(measured.T_from_to, fresh.T_from_to)
-                assert measured.T_from_to[2, 3] == pytest.approx(step, rel=0.02)
+def drive(texture, turn_deg=(0.0, 0.0, 0.0), steps=(1.0, 1.0, 1.0, 1.0)):
+    """Frames with their true depth, and the poses."""
+    increments = [se3.from_rotation_vector(np.deg2rad(turn_deg), np.array([0.0, 0.0, step])) for step in steps]
+    poses = se3.chain(np.array(increments))
+    return [render(T, texture, k) for k, T in enumerate(poses)], poses
+
+
+def test_frames_two_apart_are_measured_beside_neighbours(texture):
+    frames, _ = drive(texture)
+    answers = []
+    for _ in range(2):
+        odometry = GeometricOdometry(CONFIG, CAMERA)
+        for k in range(5):
+            for step in (1, 2):
+                if k >= step:
+                    measured = pose_of(odometry.measure(frames[k - step][0], frames[k][0], frames[k - step][1]))
+                    assert measured.T_from_to[2, 3] == pytest.approx(step, rel=0.02)
+                    answers.append(measured.T_from_to)
+    np.testing.assert_array_equal(answers[: len(answers) // 2], answers[len(answers) // 2 :])
+
+
+def test_corners_keep_their_names_and_tie_the_lengths_of_neighbouring_steps(texture):
+    """Learned depth that changes its unit between frames does not enter the ratio of lengths."""
+    steps = (1.0, 1.4, 0.7, 0.7)
+    frames, _ = drive(texture, (0.0, 1.0, 0.0), steps)
+    odometry = GeometricOdometry(CONFIG, CAMERA)
+    motions = [
+        odometry.measure(first[0], second[0], first[1] * np.float32(1 + 0.3 * (k % 2)))
+        for k, (first, second) in enumerate(itertools.pairwise(frames))
+    ]
+    for k, (earlier, later) in enumerate(itertools.pairwise(motions)):
+        ratio = length_ratio(earlier.structure, later.structure)
+        assert ratio is not None
+        assert ratio[0] == pytest.approx(np.log(steps[k + 1] / steps[k]), abs=0.01)
+        assert 0 < ratio[1] < 0.01
+
+
+def test_a_length_from_elsewhere_keeps_rotation_and_direction(texture):
+    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 1.0]))
+    motion = measure(truth, texture, lambda depth: 2.0 * depth)
+    assert isinstance(motion, Motion)
+    metric = motion.with_length(float(np.linalg.norm(truth[:3, 3])), 0.03)
+    np.testing.assert_array_equal(metric.T_from_to[:3, :3], motion.relative_pose.T_from_to[:3, :3])
+    np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
+    np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
+    assert 0.03 <= metric.sigmas[5] < 0.035
+    still = measure(np.eye(4), texture)
+    with pytest.raises(ValueError, match="by still has no direction"):
+        still.with_length(1.0, 0.03)
 
 
 @pytest.mark.data
@@ -184,8 +224,7 @@ def test_rotation_on_real_frames(data_root, name):
     constant = np.full((height, width), 10.0, np.float32)
     rotations_deg = []
     for previous, current in itertools.pairwise(frames):
-        measured = odometry.relative_pose(previous, current, constant)
-        assert isinstance(measured, RelativePose)
+        measured = pose_of(odometry.measure(previous, current, constant))
         T_previous_current = se3.invert(T_world_camera[previous.index]) @ T_world_camera[current.index]
         error = T_previous_current[:3, :3].T @ measured.T_from_to[:3, :3]
         rotations_deg.append(np.rad2deg(se3.rotation_angle(error)))

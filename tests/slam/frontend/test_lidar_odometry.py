@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam.config import LidarConfig
 from slam.errors import SlamError
-from slam.frontend.lidar_odometry import lidar_path
+from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulated import SimulatedStreet, SimulationOptions
 
@@ -48,6 +49,23 @@ def test_the_path_of_simulated_scans_is_the_camera_s(street, tmp_path):
 def test_without_scans_there_is_no_path(street):
     assert lidar_path(Scanned(street.T_camera_lidar)) is None
     assert lidar_path(Scanned(None)) is None
+
+
+def test_steps_are_those_between_neighbouring_scanned_frames():
+    T_world_camera = np.tile(np.eye(4), (4, 1, 1))
+    T_world_camera[:, 2, 3] = [0.0, 1.0, 4.0, 5.5]
+    steps = lidar_steps(LidarPath(np.array([3, 4, 7, 8]), T_world_camera), LidarConfig(translation_sigma_m=0.02))
+    assert [(s.from_index, s.to_index, s.source) for s in steps] == [(3, 4, "lidar"), (7, 8, "lidar")]
+    assert [s.T_from_to[2, 3] for s in steps] == [1.0, 1.5]
+    np.testing.assert_array_equal(steps[0].sigmas[3:], 0.02)
+
+
+def test_scans_serve_where_neighbours_have_them_and_the_lidar_s_place_is_known():
+    files = {k: Path(f"{k}.bin") for k in (2, 3)}
+    assert has_scans(Scanned(np.eye(4), files))
+    assert not has_scans(Scanned(None, files))
+    assert not has_scans(Scanned(np.eye(4), {2: Path("2.bin"), 5: Path("5.bin")}))
+    assert not has_scans(Scanned(np.eye(4)))
 
 
 def test_a_scan_cut_short_is_named(street, tmp_path):

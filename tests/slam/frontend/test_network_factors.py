@@ -5,7 +5,7 @@ from slam import se3
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
-from slam.frontend.network_factors import chain_raw, measured_noise, network_factors
+from slam.frontend.network_factors import chain_raw, measured_noise, network_factors, without_measured
 
 CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_sigma_share=0.1, translation_floor_share=0.05)
 
@@ -113,3 +113,15 @@ def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_saw_l
     T = drive(60)
     assert measured_noise(snippets_of(T), geometry_of(T), CONFIG) == CONFIG
     assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3], CONFIG) == CONFIG
+
+
+def test_the_network_bridges_what_geometry_did_not_measure():
+    T = drive(20)
+    factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
+    assert without_measured(factors, geometric) == []
+    assert without_measured(factors, []) == factors
+    gap = without_measured(factors, geometric[:9] + geometric[10:])
+    pairs = {tuple(sorted((f.from_index, f.to_index))) for f in gap}
+    assert pairs == {(9, 10), (8, 10), (9, 11)}
+    over_two = [RelativePose(9, 11, T[0], np.ones(6), "essential")]
+    assert without_measured(factors, geometric[:9] + geometric[10:] + over_two) == gap

@@ -10,7 +10,6 @@ from slam.frontend.scale import (
     RoadPlane,
     estimate_scale,
     fit_road,
-    lidar_ratio,
     rescaled,
     resolve_mode,
     scale_from_reference,
@@ -126,18 +125,6 @@ def test_track_follows_a_breathing_unit_and_bridges_refusals():
     assert track[0] == pytest.approx(2.0)
     assert track[60] == pytest.approx(2.0)
     assert track[-1] == pytest.approx(1 / 0.52)
-
-
-def test_lidar_ratio():
-    depth = road_depth()
-    rng = np.random.default_rng(0)
-    u, v = rng.uniform(0, 415, 500), rng.uniform(80, 127, 500)
-    z = 4.0 * depth[np.rint(v).astype(int), np.rint(u).astype(int)]
-    z[:100] *= 3
-    points = np.stack([u, v, z], axis=1)
-    outside = np.array([[-50.0, 10.0, 5.0], [9000.0, 10.0, 5.0], [10.0, 10.0, -5.0]])
-    assert lidar_ratio(depth, np.concatenate([points, outside])) == pytest.approx(4.0, rel=1e-4)
-    assert lidar_ratio(depth, outside) is None
 
 
 def test_reference_compares_the_first_path_lengths():

@@ -1,0 +1,247 @@
+"""Old checkpoints into ours: SfMLearner-PyTorch's and ERF-SfMLearner's ``.pth.tar`` files.
+
+One file holds one network: DispNetS or PoseExpNet. Nothing in it is executed. The names of plain layers are
+those of the published code; deformable layers are known by their structure, so that names do not matter there.
+Plain and dilated networks have the same weights: whoever converts must say which it was.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor
+
+import erfsfm
+from erfsfm.checkpoint import Absent, Model, ModelRecord, build_networks, commit, fill_network, save_model
+from erfsfm.config import NetworkConfig
+from erfsfm.errors import CheckpointError
+from erfsfm.networks.presets import NetworkKind
+
+_DEFORMABLE: dict[NetworkKind, dict[tuple[int, ...], str]] = {  # stages with offsets -> preset
+    "depth": {(): "depthnet", (1, 2, 3, 4): "erf-depthnet-dfc", (4, 5, 6, 7): "erf-depthnet-dfcv2"},
+    "pose": {(): "posenet", (3, 4, 5, 6, 7): "erf-posenet-dfc", (1, 2, 3, 4): "erf-posenet-dfcv2"},
+}
+_FIRST_CHANNELS: dict[NetworkKind, int] = {"depth": 32, "pose": 16}  # of conv1 at full width
+_MARK: dict[NetworkKind, str] = {"depth": "predict_disp1.0.weight", "pose": "pose_pred.weight"}
+_ENCODER = re.compile(r"conv(?P<stage>[1-7])\.(?P<place>\d+)\.(?P<rest>.+)")
+_DECODER = re.compile(r"(?P<block>upconv|iconv|predict_disp|predict_mask)(?P<level>[1-7])\.(?P<rest>.+)")
+# what a damaged or hostile file makes torch.load raise
+_UNREADABLE = (
+    pickle.UnpicklingError,
+    RuntimeError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    IndexError,
+)
+
+
+@dataclass(frozen=True)
+class OldNetwork:
+    """One converted network: its preset, its tensors under our names, and what they tell of its shape."""
+
+    path: Path
+    kind: NetworkKind
+    preset: str
+    width: float
+    sources: int
+    masks: bool
+    tensors: dict[str, Tensor]
+
+
+def convert(
+    files: Sequence[Path],
+    output: Path,
+    dilated: bool = False,
+    size: tuple[int, int] = (128, 416),
+    trained_on: Sequence[str] = (),
+    command: str = "",
+) -> list[OldNetwork]:
+    """Write old checkpoints as one folder that ``--weights`` takes.
+
+    Args:
+        files: a depth checkpoint, a pose checkpoint, or one of each in any order.
+        output: made if absent; must not hold weights yet.
+        dilated: the pose network was the dilated one.
+        size: (height, width) of the images that the networks were trained on; the files do not say.
+        trained_on: recordings seen in training; the files do not say.
+        command: for the record.
+
+    Raises:
+        CheckpointError: unreadable, of another kind, or two of one kind; one line.
+    """
+    if (output / "model.yaml").exists():
+        raise CheckpointError(
+            f"{output} holds weights already: name both checkpoints in one command, or another folder"
+        )
+    networks: dict[NetworkKind, OldNetwork] = {}
+    for file in files:
+        network = read_old(file, dilated)
+        if network.kind in networks:
+            raise CheckpointError(f"{networks[network.kind].path} and {file} both hold a {network.kind} network")
+        networks[network.kind] = network
+    if dilated and "pose" not in networks:
+        raise CheckpointError(
+            "dilated was asked for, but no pose network was given; the reference's dilated DispNetS cannot run"
+        )
+    record = ModelRecord(
+        network=_config(networks, size),
+        networks="both" if len(networks) == 2 else next(iter(networks)),
+        trained_on=list(trained_on) or ["unknown"],
+        licence="unknown: ask those who trained them",
+        version=erfsfm.__version__,
+        commit=commit(),
+        command=command,
+    )
+    depth_net, pose_net = build_networks(record.network)
+    for kind, net in (("depth", depth_net), ("pose", pose_net)):
+        if kind in networks:
+            old = networks[kind]
+            fill_network(net, old.tensors, old.path, f"the reference's network with the layers of '{old.preset}'")
+    save_model(
+        output,
+        Model(
+            record,
+            depth_net if "depth" in networks else Absent("depth", output),
+            pose_net if "pose" in networks else Absent("pose", output),
+        ),
+    )
+    return list(networks.values())
+
+
+def read_old(path: Path, dilated: bool = False) -> OldNetwork:
+    """Read one ``.pth.tar`` without executing anything in it.
+
+    Raises:
+        CheckpointError: damaged, needs code to be executed, or neither DispNetS nor PoseExpNet.
+    """
+    tensors = _tensors(path)
+    kinds = [kind for kind, mark in _MARK.items() if mark in tensors]
+    if not kinds or not any(name.startswith("conv1.0.") for name in tensors):
+        some, marks = ", ".join(sorted(tensors)[:3]) or "nothing", " or ".join(_MARK.values())
+        raise CheckpointError(f"{path} holds neither DispNetS nor PoseExpNet: wanted conv1.0 and {marks}; found {some}")
+    kind = kinds[0]
+    renamed, stages = _rename(path, kind, tensors)
+    preset = _DEFORMABLE[kind].get(stages)
+    if preset is None:
+        raise CheckpointError(f"{path} has deformable layers in conv {stages}; no network of the paper has just these")
+    if dilated and kind == "pose":
+        if stages:
+            raise CheckpointError(f"{path} is deformable, not dilated: leave out --dilated")
+        preset = "erf-posenet-dilated"
+    first = next(value for name, value in renamed.items() if name.startswith("encoder.stages.0.") and _is_kernel(name))
+    head = renamed.get("pose_head.weight")
+    return OldNetwork(
+        path=path,
+        kind=kind,
+        preset=preset,
+        width=first.shape[0] / _FIRST_CHANNELS[kind],
+        sources=len(head) // 6 if head is not None else 4,
+        masks=any(name.startswith("mask_decoder.") for name in renamed),
+        tensors=renamed,
+    )
+
+
+def _tensors(path: Path) -> dict[str, Tensor]:
+    try:
+        loaded: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"{path} is damaged, no checkpoint, or would execute code when read: refused; get it from its authors again"
+        ) from error
+    except _UNREADABLE as error:
+        raise CheckpointError(f"{path} is damaged or no checkpoint ({type(error).__name__}); copy it again") from error
+    state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
+    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(f"{path} holds no state_dict of tensors: it is no SfMLearner checkpoint")
+    return {str(name).removeprefix("module."): value for name, value in state.items()}
+
+
+def _rename(path: Path, kind: NetworkKind, tensors: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], tuple[int, ...]]:
+    """Tensors under our names, and the encoder stages with deformable layers."""
+    renamed: dict[str, Tensor] = {}
+    layers: dict[tuple[int, int], dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        encoder, decoder = _ENCODER.fullmatch(name), _DECODER.fullmatch(name)
+        if encoder:
+            layers.setdefault((int(encoder["stage"]), int(encoder["place"])), {})[encoder["rest"]] = value
+        elif decoder:
+            renamed[_decoder_name(kind, decoder["block"], int(decoder["level"]), decoder["rest"])] = value
+        elif name.startswith("pose_pred."):
+            renamed[name.replace("pose_pred.", "pose_head.", 1)] = value
+        else:
+            raise CheckpointError(f"{path} has a tensor '{name}', which DispNetS and PoseExpNet do not have")
+    stages = set()
+    for (stage, place), parts in layers.items():
+        prefix = f"encoder.stages.{stage - 1}.{place // 2}.0"  # a ReLU stands between the convolutions of a stage
+        if parts.keys() <= {"weight", "bias"}:
+            ours = parts
+        else:
+            stages.add(stage)
+            ours = _deformable(f"{path}: conv{stage}.{place}", parts)
+        renamed |= {f"{prefix}.{rest}": value for rest, value in ours.items()}
+    return renamed, tuple(sorted(stages))
+
+
+def _decoder_name(kind: NetworkKind, block: str, level: int, rest: str) -> str:
+    """Our lists run from the coarsest level to the finest; the old names count from the finest."""
+    if block == "predict_disp":
+        return f"heads.{4 - level}.{rest.removeprefix('0.')}"
+    if block == "predict_mask":
+        return f"mask_decoder.heads.{4 - level}.{rest}"
+    return f"{block}s.{7 - level}.{rest}" if kind == "depth" else f"mask_decoder.upconvs.{5 - level}.{rest}"
+
+
+def _deformable(where: str, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The three convolutions of a deformable layer by their structure.
+
+    Of a k x k kernel the offsets have 2 k^2 channels, the modulator k^2, both with bias; the kernel itself has none.
+    """
+    found: dict[str, Tensor] = {}
+    for name in sorted({name.rsplit(".", 1)[0] for name in parts}):
+        weight, bias = parts.get(f"{name}.weight"), parts.get(f"{name}.bias")
+        if weight is None or weight.dim() != 4:
+            raise CheckpointError(f"{where}.{name} has no convolution weight")
+        taps = weight.shape[2] * weight.shape[3]
+        part: Literal["kernel", "offset", "modulator"]
+        if bias is None:
+            part = "kernel"
+        elif weight.shape[0] in (taps, 2 * taps):
+            part = "modulator" if weight.shape[0] == taps else "offset"
+        else:
+            raise CheckpointError(f"{where}.{name} fits no part of a modulated deformable layer: {tuple(weight.shape)}")
+        found[f"{part}.weight"] = weight
+        if bias is not None:
+            found[f"{part}.bias"] = bias
+    if len(found) != 5:
+        raise CheckpointError(f"{where} must hold offsets, modulator and kernel; found {', '.join(sorted(parts))}")
+    return found
+
+
+def _is_kernel(name: str) -> bool:
+    return name.endswith(".0.0.weight") or name.endswith(".kernel.weight")
+
+
+def _config(networks: Mapping[NetworkKind, OldNetwork], size: tuple[int, int]) -> NetworkConfig:
+    settings: dict[str, Any] = {"fidelity": "paper", "height": size[0], "width": size[1]}
+    for kind, network in networks.items():
+        settings |= {kind: network.preset, f"{kind}_width": network.width}
+    if "pose" in networks:
+        settings |= {"sources": networks["pose"].sources, "masks": networks["pose"].masks}
+    try:
+        return NetworkConfig.model_validate(settings)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where, files = ".".join(map(str, first["loc"])), ", ".join(str(network.path) for network in networks.values())
+        raise CheckpointError(
+            f"{files}: no network of ours has {where} {first['input']}: {first['msg'].lower()}"
+        ) from error

@@ -1,0 +1,158 @@
+"""Depth on single frames of KITTI raw drives against LiDAR (Eigen et al. 2014), with both scales of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import zoom
+
+from erfsfm.checkpoint import ModelRecord
+from erfsfm.config import Fidelity
+from erfsfm.data.recordings import resize_image
+from erfsfm.errors import DataError
+from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
+from erfsfm.evaluation.protocols import CAP_M, Networks, refuse_leak
+from erfsfm.evaluation.raw_drives import RawFrame, displacements, lidar_depth
+
+EIGEN_FRAMES, EIGEN_DRIVES = 697, 28
+EIGEN_FILE = "test_files_eigen.txt"
+_STILL_M = 0.1
+
+
+class RawNetworks(Networks, Protocol):
+    """What this protocol asks for beside the others: the size of the networks' images."""
+
+    record: ModelRecord
+
+
+def read_split(split: str, root: Path) -> list[RawFrame]:
+    """The frames of ``eigen`` or of a file, one a line.
+
+    Raises:
+        DataError: the file is missing, empty, malformed, or called ``eigen`` without being that list.
+    """
+    base = _root_of_dates(root)
+    path = base / EIGEN_FILE if split == "eigen" else Path(split)
+    if not path.is_file():
+        hint = (
+            f"the list of {EIGEN_FRAMES} frames is not shipped: put it there ({EIGEN_FILE} of SfMLearner), or name any "
+            "list with --split FILE"
+        )
+        raise DataError(f"no split at {path}" + (f"; {hint}" if split == "eigen" else ""))
+    frames = [RawFrame.parse(line, base) for line in path.read_text().splitlines() if line.strip()]
+    if not frames:
+        raise DataError(f"{path} names no frames")
+    drives = len({frame.drive for frame in frames})
+    if split == "eigen" and (len(frames), drives) != (EIGEN_FRAMES, EIGEN_DRIVES):
+        raise DataError(
+            f"{path} is not the Eigen list: wanted {EIGEN_FRAMES} frames of {EIGEN_DRIVES} drives; it has "
+            f"{len(frames)} of {drives}; use --split {path} for another list"
+        )
+    return frames
+
+
+def eigen_protocol(
+    networks: RawNetworks, root: Path, split: str, fidelity: Fidelity, allow_leak: bool
+) -> list[dict[str, Any]]:
+    """Errors under 80 m in the crop of Garg et al., scaled by the medians and by the car's own speed.
+
+    ============  ================================  ====================================
+    .             paper                             default
+    ============  ================================  ====================================
+    to full size  cubic on depth                    bilinear on disparity
+    clipping      before scaling, never after       after scaling
+    still car     counts, its scale is near 0       left out of the row ``pose``
+    ============  ================================  ====================================
+
+    Returns:
+        Rows ``gt-median`` and ``pose``; ``pose`` multiplies depth by the mean over a window's sources of true
+        over predicted distance.
+
+    Raises:
+        DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
+    """
+    frames = read_split(split, root)
+    leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)
+    errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
+    for frame in frames:
+        image = _read(frame.image_path())
+        truth = lidar_depth(frame, image.shape[:2], fidelity)
+        guess = _depth(networks, image, fidelity)
+        found = _compare(guess, truth, "median", fidelity)
+        if found is None:
+            raise DataError(
+                f"the LiDAR of {frame.drive} frame {frame.index} hits nothing under {CAP_M:g} m in the crop"
+            )
+        errors["gt-median"].append(found)
+        scale = _scale_of_motion(networks, frame, fidelity)
+        by_motion = _compare(guess, truth, scale, fidelity) if scale is not None else None
+        if by_motion is not None:
+            errors["pose"].append(by_motion)
+    return [_row(scaling, found, len(frames), leak) for scaling, found in errors.items()]
+
+
+def _root_of_dates(root: Path) -> Path:
+    """The folder of the dates, given it, a date or a drive."""
+    if not root.is_dir():
+        raise DataError(f"no data set at {root}: wanted the folder that holds KITTI's dates (2011_09_26, ...)")
+    root = root.resolve()
+    if root.name.endswith("_sync"):
+        return root.parents[1]
+    return root.parent if (root / "calib_cam_to_cam.txt").is_file() else root
+
+
+def _depth(networks: RawNetworks, image: NDArray[np.uint8], fidelity: Fidelity) -> NDArray[np.float32]:
+    """Unscaled depth at the image's size."""
+    if fidelity == "default":
+        return networks.depth(image)
+    network = networks.record.network
+    depth = networks.depth(resize_image(image, network.height, network.width))
+    height, width = image.shape[:2]
+    return np.asarray(zoom(depth, (height / depth.shape[0], width / depth.shape[1]), order=3), dtype=np.float32)
+
+
+def _compare(
+    guess: NDArray[np.float32], truth: NDArray[np.float32], scaling: float | Any, fidelity: Fidelity
+) -> DepthErrors | None:
+    clipping: Any = "before" if fidelity == "paper" else "after"
+    return depth_errors(guess, truth, CAP_M, crop="garg", scaling=scaling, clipping=clipping)
+
+
+def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity) -> float | None:
+    """Mean of true over predicted distance to the sources; None where the car stands, but in paper fidelity."""
+    window = frame.window(networks.sources)
+    true = displacements(frame, window)
+    if fidelity == "default" and true.max() < _STILL_M:
+        return None
+    T_source_target = networks.poses([_read(frame.image_path(index)) for index in window])
+    predicted = np.linalg.norm(T_source_target[:, :3, 3], axis=1)
+    return float(np.mean(true / np.maximum(predicted, 1e-12)))
+
+
+def _row(scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool) -> dict[str, Any]:
+    row: dict[str, Any] = {"method": "networks", "scaling": scaling}
+    if not errors:
+        return row | {
+            "abs_rel": None,
+            "abs_rel_reason": "the car stands still in every frame",
+            "images": 0,
+            "leak": leak,
+        }
+    mean = mean_errors(list(errors)).as_dict()
+    row |= {key: value if np.isfinite(value) else None for key, value in mean.items()}
+    row |= {f"{key}_reason": "an image has no scale" for key, value in mean.items() if not np.isfinite(value)}
+    scales = np.array([error.scale for error in errors])
+    row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
+    return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DataError(f"{path} is not a readable image; copy it again")
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

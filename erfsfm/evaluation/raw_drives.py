@@ -1,0 +1,227 @@
+"""Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
+
+Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
+of the date. Images may be smaller than the original: the calibration follows them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.config import Fidelity
+from erfsfm.errors import DataError
+
+FloatArray = NDArray[np.float64]
+
+_FRAME = re.compile(
+    r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
+    r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
+)
+_ASPECT_TOLERANCE = 0.01
+_VELOCITY = [6, 7, 10]  # north, east, up in m/s (oxts/dataformat.txt)
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One frame of a colour camera.
+
+    Attributes:
+        root: folder of the dates.
+        drive: ``2011_09_26_drive_0013``.
+        index: frame.
+        camera: 2 is the left colour camera, 3 the right one.
+    """
+
+    root: Path
+    drive: str
+    index: int
+    camera: int = 2
+
+    @staticmethod
+    def parse(line: str, root: Path) -> RawFrame:
+        """Read a line of a split: an image's path, or ``drive frame`` with an optional ``l`` or ``r``.
+
+        Raises:
+            DataError: neither.
+        """
+        match = _FRAME.fullmatch(line.strip())
+        if match is None:
+            raise DataError(
+                f"'{line.strip()}' names no frame: wanted 2011_09_26/2011_09_26_drive_0013_sync/image_02/data/"
+                "0000000005.png, or 2011_09_26_drive_0013 5"
+            )
+        camera = int(match["camera"] or (3 if match["side"] == "r" else 2))
+        return RawFrame(root, match["drive"], int(match["file"] or match["frame"]), camera)
+
+    @property
+    def name(self) -> str:
+        """As the leak record writes it: ``kitti_raw/2011_09_26_drive_0013[5:6]``."""
+        return f"kitti_raw/{self.drive}[{self.index}:{self.index + 1}]"
+
+    @property
+    def folder(self) -> Path:
+        """Of the drive."""
+        return self.root / self.drive[:10] / f"{self.drive}_sync"
+
+    def image_path(self, index: int | None = None) -> Path:
+        """The image of a frame of this drive, its own if None: png or jpg, whichever there is.
+
+        Raises:
+            DataError: neither is there.
+        """
+        stem = self.folder / f"image_0{self.camera}" / "data" / f"{self.index if index is None else index:010d}"
+        for suffix in (".png", ".jpg"):
+            if stem.with_suffix(suffix).is_file():
+                return stem.with_suffix(suffix)
+        raise DataError(f"{stem}.png (or .jpg) is missing: download the drive, or take the frame out of the split")
+
+    def window(self, sources: int) -> list[int]:
+        """The frame with ``sources`` others around it, shifted where the drive begins or ends.
+
+        Raises:
+            DataError: the drive is shorter.
+        """
+        folder = self.folder / f"image_0{self.camera}" / "data"
+        count = sum(1 for path in folder.iterdir() if path.suffix in (".png", ".jpg")) if folder.is_dir() else 0
+        half = sources // 2
+        if count < sources + 1:
+            raise DataError(f"{self.drive} has {count} images; its poses need windows of {sources + 1}")
+        middle = min(max(self.index, half), count - half - 1)
+        return list(range(middle - half, middle + half + 1))
+
+
+def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "default") -> NDArray[np.float32]:
+    """z-depth of the LiDAR's points in the image of a frame, the nearest where several fall on one pixel.
+
+    z [u v 1]^T = P_rect R_rect_00 T_cam_velo X; the pixel is round(u) - 1, the benchmark's counting from one
+
+    Args:
+        frame: which.
+        size: (height, width) of its image as stored.
+        fidelity: ``paper`` also takes the nearest of the last pixel of a row and the first of the next, which the
+            reference's numbering confuses.
+
+    Returns:
+        Metres ``(H, W)``, 0 where there is no point.
+
+    Raises:
+        DataError: scan or calibration is missing or malformed, or the image has another shape than the camera.
+    """
+    height, width = size
+    to_pixels = _projection(frame, size)  # (3, 4)
+    path = frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
+    if not path.is_file():
+        raise DataError(f"{path} is missing: the true depth of the split's frames comes from the LiDAR")
+    numbers = np.fromfile(path, dtype=np.float32)
+    if numbers.size % 4:
+        raise DataError(f"{path} must hold four numbers a point; it is damaged")
+    points = numbers.reshape(-1, 4).astype(np.float64)
+    points = points[points[:, 0] >= 0]
+    points[:, 3] = 1
+    projected = points @ to_pixels.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = np.round(projected[:, :2] / projected[:, 2:]) - 1
+    z = projected[:, 2]
+    inside = (places >= 0).all(axis=1) & (places[:, 0] < width) & (places[:, 1] < height)
+    columns, rows = places[inside].astype(np.int64).T
+    depth = _nearest(rows, columns, z[inside], size, fidelity)
+    return np.maximum(depth, 0).astype(np.float32)
+
+
+def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
+    """Distance in metres from a window's middle frame to each of the others, by the velocity of its GPS/IMU.
+
+    Trapezoids over (north, east, up) velocities, as the reference does.
+
+    Args:
+        frame: of the drive.
+        window: consecutive frame numbers.
+
+    Returns:
+        ``(N,)`` in time order, the middle left out.
+
+    Raises:
+        DataError: a file is missing or malformed.
+    """
+    folder = frame.folder / "oxts"
+    try:
+        stamps = (folder / "timestamps.txt").read_text().split("\n")
+        seconds = np.array([_seconds(stamps[i]) for i in window])
+        velocity = np.stack([np.loadtxt(folder / "data" / f"{i:010d}.txt")[_VELOCITY] for i in window])
+    except (OSError, ValueError, IndexError) as error:
+        what = " ".join(str(error).split())
+        raise DataError(f"{folder} must hold timestamps.txt and a file of data a frame: {what}") from error
+    steps = 0.5 * (velocity[:-1] + velocity[1:]) * np.diff(seconds)[:, None]
+    places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    middle = len(window) // 2
+    distances: FloatArray = np.linalg.norm(places - places[middle], axis=1)
+    return np.delete(distances, middle)
+
+
+def _nearest(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], z: FloatArray, size: tuple[int, int], fidelity: Fidelity
+) -> FloatArray:
+    if fidelity == "default":
+        depth = np.full(size, np.inf)
+        np.minimum.at(depth, (rows, columns), z)
+        return np.where(np.isfinite(depth), depth, 0)
+    depth = np.zeros(size)
+    depth[rows, columns] = z
+    # the reference numbers pixels row by row with one too few a row; of each number the first place gets the nearest
+    _, first, group, counts = np.unique(
+        rows * (size[1] - 1) + columns, return_index=True, return_inverse=True, return_counts=True
+    )
+    nearest = np.full(len(first), np.inf)
+    np.minimum.at(nearest, group, z)
+    shared = first[counts > 1]
+    depth[rows[shared], columns[shared]] = nearest[counts > 1]
+    return depth
+
+
+def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
+    """LiDAR points to pixels that count from one, ``(3, 4)``, at the image's size."""
+    date = frame.folder.parent
+    camera = _calibration(date / "calib_cam_to_cam.txt")
+    velodyne = _calibration(date / "calib_velo_to_cam.txt")
+    try:
+        full_width, full_height = camera[f"S_rect_0{frame.camera}"]
+        P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)
+        R_rect, T_cam_velo = np.eye(4), np.eye(4)
+        R_rect[:3, :3] = camera["R_rect_00"].reshape(3, 3)
+        T_cam_velo[:3, :3] = velodyne["R"].reshape(3, 3)
+        T_cam_velo[:3, 3] = velodyne["T"]
+    except (KeyError, ValueError) as error:
+        raise DataError(f"the calibration in {date} is incomplete: {error}") from error
+    scale_y, scale_x = size[0] / full_height, size[1] / full_width
+    if abs(scale_x / scale_y - 1) > _ASPECT_TOLERANCE:
+        raise DataError(
+            f"{frame.image_path()} is {size[1]} x {size[0]}, but the camera in {date} is {full_width:g} x "
+            f"{full_height:g}: the images were cropped or are of another camera"
+        )
+    # half a pixel stays half a pixel when pixels grow: u' = (u - 1/2) s + 1/2, counting from one
+    resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
+    projection: FloatArray = resize @ P_rect @ R_rect @ T_cam_velo
+    return projection
+
+
+def _calibration(path: Path) -> dict[str, FloatArray]:
+    if not path.is_file():
+        raise DataError(f"{path} is missing: KITTI's calibration lies in the folder of the date")
+    rows = {}
+    for key, _, text in (line.partition(":") for line in path.read_text().splitlines()):
+        try:
+            rows[key] = np.array([float(word) for word in text.split()])
+        except ValueError:
+            continue  # the time of calibration
+    return rows
+
+
+def _seconds(stamp: str) -> float:
+    """``2011-09-26 13:10:51.175862102``; nanoseconds are cut to microseconds."""
+    return datetime.strptime(stamp.strip()[:26], "%Y-%m-%d %H:%M:%S.%f").timestamp()

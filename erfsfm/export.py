@@ -1,0 +1,195 @@
+"""Networks as ONNX files, deformable layers as plain operators (GridSample), each checked against PyTorch.
+
+The graphs are fixed to one image at the size of the weights: the maps of a deformable layer are part of the graph.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from erfsfm.checkpoint import Absent, Model, write_atomically
+from erfsfm.config import NetworkConfig
+from erfsfm.errors import ExportError
+from erfsfm.networks.presets import NetworkKind
+
+OPSET = 17
+# of the largest output; a thousand roundings of float32
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Exported:
+    """One written file, and how far onnxruntime's answers are from PyTorch's, as a share of the largest."""
+
+    path: Path
+    kind: NetworkKind
+    preset: str
+    difference: float
+
+
+class DepthGraph(nn.Module):
+    """``image`` ``(1, 3, H, W)`` to ``disparity`` ``(1, 1, H, W)``."""
+
+    inputs, output = ("image",), "disparity"
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+        self.eval()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Finest disparity, unscaled."""
+        disparity: Tensor = self.network(image)
+        return disparity
+
+
+class PoseGraph(nn.Module):
+    """``target`` ``(1, 3, H, W)`` and ``sources`` ``(1, N, 3, H, W)`` to ``T_source_target`` ``(1, N, 6)``."""
+
+    inputs, output = ("target", "sources"), "T_source_target"
+
+    def __init__(self, network: nn.Module, sources: int) -> None:
+        super().__init__()
+        self.network = network
+        self.sources = sources
+        self.eval()
+
+    def forward(self, target: Tensor, sources: Tensor) -> Tensor:
+        """Translation (unscaled) and XYZ Euler angles (radians) of each source, in time order."""
+        vectors: Tensor = self.network(target, [sources[:, k] for k in range(self.sources)])
+        return vectors
+
+
+def pose_path(path: Path) -> Path:
+    """Where the pose network goes if the depth network goes to ``path``: ``net_pose.onnx`` beside ``net.onnx``."""
+    return path.with_name(f"{path.stem}_pose{path.suffix}")
+
+
+def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
+    """Write the depth network to ``path`` and the pose network to `pose_path`, if onnxruntime agrees with PyTorch.
+
+    Args:
+        model: of which a network that is absent is left out.
+        path: must end in ``.onnx``.
+        seed: of the images that both are compared on.
+
+    Raises:
+        ExportError: onnx or onnxruntime is not installed, another ending, or answers that differ.
+        ConfigError: the paper's dilated depth network, which cannot run.
+    """
+    if path.suffix != ".onnx":
+        raise ExportError(f"--output must end in .onnx; got {path}")
+    _require_onnx()
+    config, generator = model.record.network, torch.Generator().manual_seed(seed)
+    files = []
+    if not isinstance(model.depth_net, Absent):
+        graph = DepthGraph(model.depth_net)
+        files.append(_export(graph, _images(config, generator, ()), path, "depth", config.depth, model))
+    if not isinstance(model.pose_net, Absent):
+        examples = [
+            a + b for a, b in zip(_images(config, generator, ()), _images(config, generator, (config.sources,)))
+        ]
+        graph_of_pose = PoseGraph(model.pose_net, config.sources)
+        files.append(_export(graph_of_pose, examples, pose_path(path), "pose", config.pose, model))
+    return files
+
+
+def _export(
+    graph: DepthGraph | PoseGraph,
+    examples: Sequence[tuple[Tensor, ...]],
+    path: Path,
+    kind: NetworkKind,
+    preset: str,
+    model: Model,
+) -> Exported:
+    content = _with_metadata(_traced(graph, examples[0]), kind, preset, model)
+    difference = max(_difference(graph, content, example) for example in examples)
+    if not difference <= TOLERANCE:
+        raise ExportError(
+            f"{path} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output of "
+            f"{preset}, more than {TOLERANCE:.0e}; tell the authors the versions of torch, onnx and onnxruntime"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
+    return Exported(path, kind, preset, difference)
+
+
+def _require_onnx() -> None:
+    try:
+        import onnx
+        import onnxruntime
+    except ImportError as error:
+        raise ExportError(
+            f"ONNX export needs onnx and onnxruntime ({error}): pip install 'erfsfm-slam[onnx]'"
+        ) from error
+    del onnx, onnxruntime
+
+
+def _images(config: NetworkConfig, generator: torch.Generator, lead: tuple[int, ...]) -> list[tuple[Tensor, ...]]:
+    """A smooth and a noisy example, each a one-tuple ``(1, *lead, 3, H, W)`` in [-1, 1]."""
+    count = int(np.prod(lead, dtype=int))
+    coarse = torch.rand(count, 3, 4, 8, generator=generator)
+    smooth = nn.functional.interpolate(coarse, size=(config.height, config.width), mode="bilinear")
+    noisy = torch.rand(count, 3, config.height, config.width, generator=generator)
+    return [(2 * image.reshape(1, *lead, *image.shape[1:]) - 1,) for image in (smooth, noisy)]
+
+
+def _traced(graph: DepthGraph | PoseGraph, example: tuple[Tensor, ...]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad(), warnings.catch_warnings():
+        path = Path(folder) / "graph.onnx"
+        warnings.simplefilter("ignore")  # shapes become constants: that is meant
+        torch.onnx.export(
+            graph,
+            example,
+            path,
+            input_names=list(graph.inputs),
+            output_names=[graph.output],
+            opset_version=OPSET,
+            dynamo=False,  # the newer exporter needs onnxscript, and writes the same graph
+        )
+        return path.read_bytes()
+
+
+def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model) -> bytes:
+    """The checked graph with what its user must know, written into it."""
+    import onnx
+
+    graph = onnx.load_model_from_string(content)
+    onnx.checker.check_model(graph)
+    record = model.record
+    notes = {
+        "network": preset,
+        "kind": kind,
+        "fidelity": record.network.fidelity,
+        "input": "RGB in [-1, 1]",
+        "licence": record.licence,
+        "trained_on": json.dumps(record.trained_on),
+        "erfsfm_version": record.version,
+    }
+    onnx.helper.set_model_props(graph, notes)
+    serialised: bytes = graph.SerializeToString()
+    return serialised
+
+
+def _difference(graph: nn.Module, content: bytes, example: tuple[Tensor, ...]) -> float:
+    """Largest difference of the two answers, as a share of the largest output."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    names = [entry.name for entry in session.get_inputs()]
+    (answer,) = session.run(None, {name: tensor.numpy() for name, tensor in zip(names, example)})
+    with torch.no_grad():
+        wanted: NDArray[np.float32] = graph(*example).numpy()
+    if answer.shape != wanted.shape:
+        return float("inf")
+    return float(np.abs(answer - wanted).max() / max(np.abs(wanted).max(), 1e-30))

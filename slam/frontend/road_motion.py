@@ -1,0 +1,180 @@
+"""The length of a step in camera heights, from how the road before the car moves through the image.
+
+A plane ``n . X = h`` of the current camera moves by the homography ``R + t n^T / h`` to the previous one
+(Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
+``m = |t| n / h`` is what aligns both images of the road, and its norm is the length sought. Learned depth
+plays no part, so this length neither shares the networks' bias nor drifts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import RoadConfig
+from slam.frames import Frame, Image, Intrinsics
+from slam.frontend.refusal import Refusal
+from slam.se3 import FloatArray
+
+_LEVEL = np.array([0.0, 1.0, 0.0])
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32)  # where the search begins; refinement reaches the next
+_CLIPPED_GREY = 8.0
+_ITERATIONS = 6
+_REMEMBERED = 100
+_MAD_TO_SIGMA = 1.4826
+
+_Layer = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class RoadStep:
+    """``length_heights`` of a step with its relative sigma, and the road's ``normal`` ``(3,)``, down, unit."""
+
+    length_heights: float
+    sigma_share: float
+    normal: FloatArray
+
+
+class RoadAligner:
+    """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it."""
+
+    def __init__(self, config: RoadConfig, intrinsics: Intrinsics) -> None:
+        self._config = config
+        self._intrinsics = intrinsics
+        self._top_row, self._rows, self._columns, self._rays = _region(intrinsics, config)
+        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
+
+    def measure(self, previous: Frame, current: Frame, T_previous_current: FloatArray) -> RoadStep | Refusal:
+        """Measure the length of a step whose rotation and direction are known.
+
+        Args:
+            previous: the earlier frame, at the size of the intrinsics.
+            current: the next frame.
+            T_previous_current: its pose in the earlier camera, of any length but zero.
+        """
+        if len(self._rays) < self._config.min_points:
+            return Refusal("the image shows too little of the road")
+        T_unit = T_previous_current.copy()
+        T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
+        self._directions.append(T_unit[:3, 3])
+        before, now = self._layers(previous), self._layers(current)
+        expected, tilt = self._expected(), float(np.deg2rad(self._config.tilt_sigma_deg))
+        plane = self._search(before[0], now[0], T_unit, expected)
+        for layer_before, layer_now in zip(before, now, strict=True):
+            plane, likeness = self._refine(layer_before, layer_now, T_unit, plane, expected, tilt)
+        length = float(np.linalg.norm(plane))
+        normal = plane / length
+        deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
+        if not np.isfinite(length) or deviation > np.deg2rad(self._config.max_tilt_deg):
+            return Refusal(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
+        if likeness < self._config.min_likeness:
+            return Refusal(f"the road looks different in both images (correlation {likeness:.2f})")
+        sigma_share = float(np.hypot(self._config.sigma_share, self._config.tilt_gain * deviation))
+        return RoadStep(length, sigma_share, normal)
+
+    def _expected(self) -> FloatArray:
+        """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.
+
+        The images hardly tell pitch from length, and the direction of motion tells it well.
+        """
+        direction = np.median(self._directions, axis=0)
+        along = direction / max(float(np.linalg.norm(direction)), 1e-9)
+        normal = _LEVEL - (_LEVEL @ along) * along
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    def _layers(self, frame: Frame) -> list[_Layer]:
+        """Coarse and fine image ``(H', W, 3)`` below the horizon, freed of slow shading, each with its slopes."""
+        for image, layers in self._seen:
+            if image is frame.image:
+                return layers
+        grey = cv2.cvtColor(frame.image[self._top_row :], cv2.COLOR_RGB2GRAY).astype(np.float32)
+        fine = grey - cv2.GaussianBlur(grey, (0, 0), max(0.01 * self._intrinsics.fx, 1.5))
+        coarse = cv2.GaussianBlur(fine, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
+        layers = [_with_slopes(layer) for layer in (coarse, fine)]
+        self._seen.append((frame.image, layers))
+        return layers
+
+    def _sampled(self, layer: _Layer, points_previous: FloatArray) -> FloatArray:
+        """Grey value and slopes ``(P, 3)`` of the earlier image where points ``(P, 3)`` of its camera fall."""
+        camera = self._intrinsics
+        u = camera.fx * points_previous[:, 0] / points_previous[:, 2] + camera.cx
+        v = camera.fy * points_previous[:, 1] / points_previous[:, 2] + camera.cy - self._top_row
+        return np.asarray(
+            cv2.remap(layer, u.astype(np.float32)[:, None], v.astype(np.float32)[:, None], cv2.INTER_LINEAR)
+        ).reshape(len(u), 3)
+
+    def _search(self, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
+        """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
+        rays = self._rays[::3]
+        seen = now[self._rows[::3], self._columns[::3], 0]
+        turned, shift = rays @ T_unit[:3, :3].T, np.outer(rays @ normal, T_unit[:3, 3])
+        costs = []
+        for length in _LENGTHS_HEIGHTS:
+            difference = self._sampled(before, _ahead(turned + length * shift))[:, 0] - seen
+            costs.append(np.minimum(np.abs(difference), _CLIPPED_GREY).mean())
+        return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
+
+    def _refine(
+        self,
+        before: _Layer,
+        now: _Layer,
+        T_unit: FloatArray,
+        plane: FloatArray,
+        expected: FloatArray,
+        tilt: float,
+    ) -> tuple[FloatArray, float]:
+        """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
+        camera, t = self._intrinsics, T_unit[:3, 3]
+        turned = self._rays @ T_unit[:3, :3].T
+        seen = now[self._rows, self._columns, 0]
+        across = np.eye(3) - np.outer(expected, expected)
+        for _ in range(_ITERATIONS):
+            points = _ahead(turned + np.outer(self._rays @ plane, t))
+            values = self._sampled(before, points)
+            residual = values[:, 0] - seen
+            depth = points[:, 2]
+            slope_u = camera.fx * (t[0] - points[:, 0] / depth * t[2]) / depth
+            slope_v = camera.fy * (t[1] - points[:, 1] / depth * t[2]) / depth
+            jacobian = (values[:, 1] * slope_u + values[:, 2] * slope_v)[:, None] * self._rays
+            sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 0.3)
+            weighted = jacobian / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2))[:, None]
+            prior = across / (tilt * float(np.linalg.norm(plane))) ** 2
+            information = weighted.T @ jacobian + prior + 1e-9 * np.eye(3)
+            step = -np.linalg.solve(information, weighted.T @ residual + prior @ plane)
+            plane = plane + step
+            if np.abs(step).max() < 1e-4 * np.linalg.norm(plane):
+                break
+        return plane, _correlation(values[:, 0], seen)
+
+
+def _region(intrinsics: Intrinsics, config: RoadConfig) -> tuple[int, NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """First row used, then rows, columns ``(P,)`` from there and rays ``(P, 3)`` of a strip of a level road."""
+    top = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
+    v, u = np.mgrid[top : intrinsics.height, : intrinsics.width]
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    depth_heights = 1.0 / np.maximum(y, 1e-6)
+    strip = (depth_heights < config.far_heights) & (np.abs(x * depth_heights) < config.half_width_heights)
+    step = max(round(float(np.sqrt(strip.sum() / config.points))), 1)
+    rows, columns = np.nonzero(strip & (v % step == 0) & (u % step == 0))
+    rays = np.stack([x[rows, columns], y[rows, columns], np.ones(len(rows))], axis=1)
+    return top, rows, columns, rays
+
+
+def _ahead(points: FloatArray) -> FloatArray:
+    """Points ``(P, 3)`` with depths kept off zero, where a plane that is far from true would put them."""
+    points[:, 2] = np.maximum(points[:, 2], 1e-3)
+    return points
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
+
+
+def _with_slopes(layer: _Layer) -> _Layer:
+    slopes = [cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
+    return np.asarray(cv2.merge([layer, *slopes]))

@@ -1,0 +1,163 @@
+"""The lengths of all steps at once, from everything that measures them, with the networks' drifting unit as a state.
+
+A monocular step has a direction and no length. Three things measure it: points triangulated on both sides
+of a frame fix it relative to the step before; the road gives it in camera heights; learned depth gives it in
+a unit that wanders. In logarithms all of them are linear in the lengths ``x`` and the unit's deviation ``b``:
+
+    x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
+
+so that one robust sparse least squares holds the whole drive (``docs/design/0006-lengths-before-the-graph.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.linalg import spsolve
+
+from slam.config import LengthConfig
+from slam.frontend.epipolar import Structure
+from slam.frontend.geometric_factors import Motion
+from slam.se3 import FloatArray
+
+_LEAST_COMMON = 12
+_MAD_TO_SIGMA = 1.4826
+_ITERATIONS = 20
+_HUBER_ITERATIONS = 5
+_HUBER_K = 1.345
+
+
+@dataclass(frozen=True)
+class StepEvidence:
+    """What was measured of S steps, logarithms and their sigmas ``(S,)`` each, NaN where nothing was.
+
+    ``ratio`` is the length over that of the step before; ``absolute`` the length in the unit wanted; ``learned``
+    the length by learned depth, already in the unit that the networks are believed to have.
+    """
+
+    ratio: FloatArray
+    ratio_sigma: FloatArray
+    absolute: FloatArray
+    absolute_sigma: FloatArray
+    learned: FloatArray
+
+    @classmethod
+    def empty(cls, steps: int) -> StepEvidence:
+        """Nothing measured yet."""
+        return cls(*(np.full(steps, np.nan) for _ in range(5)))
+
+
+@dataclass(frozen=True)
+class StepLengths:
+    """``length`` ``(S,)`` of each step, NaN where nothing measured it, and the factor ``unit_correction`` ``(S,)``.
+
+    The correction times the believed unit of learned depth is its unit near that step.
+    """
+
+    length: FloatArray
+    unit_correction: FloatArray
+
+
+def gather_evidence(
+    motions: Mapping[int, Motion], absolute: Mapping[int, tuple[float, float]], believed_unit: FloatArray
+) -> StepEvidence:
+    """All evidence on the lengths of the steps ``k -> k + 1`` of a drive.
+
+    Args:
+        motions: what corners measured of step k.
+        absolute: length of step k in the unit wanted, and its relative sigma.
+        believed_unit: that unit per unscaled length near each frame ``(N,)``.
+    """
+    evidence = StepEvidence.empty(len(believed_unit) - 1)
+    structures: dict[int, Structure] = {}
+    for step, motion in motions.items():
+        if motion.structure is None:
+            continue
+        structures[step] = motion.structure
+        unscaled = float(np.linalg.norm(motion.relative_pose.T_from_to[:3, 3]))
+        evidence.learned[step] = np.log(unscaled * believed_unit[step])
+        if step in absolute:
+            length, evidence.absolute_sigma[step] = absolute[step]
+            evidence.absolute[step] = np.log(length)
+    for step in structures:
+        ratio = length_ratio(structures[step - 1], structures[step]) if step - 1 in structures else None
+        if ratio is not None:
+            evidence.ratio[step], evidence.ratio_sigma[step] = ratio
+    return evidence
+
+
+def length_ratio(earlier: Structure, later: Structure) -> tuple[float, float] | None:
+    """Log of the later step's length over the earlier's, with its sigma, from points that both triangulated.
+
+    In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
+    """
+    _, first, second = np.intersect1d(earlier.names, later.names, assume_unique=True, return_indices=True)
+    if len(first) < _LEAST_COMMON:
+        return None
+    logarithms = np.log(earlier.depth_current[first] / later.depth_previous[second])
+    weights = 1.0 / (earlier.sigma_share[first] ** 2 + later.sigma_share[second] ** 2)
+    order = np.argsort(logarithms)
+    cumulative = np.cumsum(weights[order])
+    middle = float(logarithms[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    deviation = _MAD_TO_SIGMA * float(np.median(np.abs(logarithms - middle)))
+    return middle, deviation / float(np.sqrt(len(first)))
+
+
+def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
+    """The lengths that explain all evidence best: Huber first, then Cauchy weights against what is wrong."""
+    steps = len(evidence.learned)
+    lengths, units = np.arange(steps), steps + np.arange(steps)
+    ratio_sigma = np.hypot(config.ratio_widening * evidence.ratio_sigma, config.ratio_sigma)
+    ones = np.ones(steps)
+    rows = [
+        _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
+        _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
+        _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
+        _Rows(units[1:], units[:-1], 0.0 * ones[1:], config.unit_walk_sigma * ones[1:]),
+        # one belief about the whole drive, spread over its steps
+        _Rows(units, None, 0.0 * ones, config.unit_sigma * np.sqrt(steps) * ones),
+    ]
+    A, target = _whitened(rows, 2 * steps)
+    measured = np.zeros(steps, dtype=bool)
+    for row in rows[:3]:
+        measured[row.plus[np.isfinite(row.value)]] = True
+    idle = csr_array((np.where(np.concatenate([measured, ones > 0]), 0.0, 1.0), (range(2 * steps),) * 2))
+    state, weights = np.zeros(2 * steps), np.ones(len(target))
+    for iteration in range(_ITERATIONS):
+        weighted = A.multiply(weights[:, None]).T.tocsr()
+        state = np.atleast_1d(spsolve((weighted @ A + idle).tocsc(), weighted @ target))
+        residual = np.abs(A @ state - target)
+        robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
+        weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
+    return StepLengths(np.where(measured, np.exp(state[:steps]), np.nan), np.exp(state[steps:]))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Equations ``state[plus] - state[minus] = value``, each with its sigma; NaN values say nothing."""
+
+    plus: np.ndarray[tuple[int], np.dtype[np.int64]]
+    minus: np.ndarray[tuple[int], np.dtype[np.int64]] | None
+    value: FloatArray
+    sigma: FloatArray
+
+
+def _whitened(rows: list[_Rows], states: int) -> tuple[csr_array, FloatArray]:
+    """Matrix and right side of all equations divided by their sigmas."""
+    columns, entries, places, values = [], [], [], []
+    count = 0
+    for row in rows:
+        known = np.isfinite(row.value) & np.isfinite(row.sigma)
+        place = count + np.arange(int(known.sum()))
+        count += len(place)
+        for side, sign in ((row.plus, 1.0), (row.minus, -1.0)):
+            if side is not None:
+                places.append(place)
+                columns.append(side[known])
+                entries.append(sign / row.sigma[known])
+        values.append(row.value[known] / row.sigma[known])
+    A = coo_array((np.concatenate(entries), (np.concatenate(places), np.concatenate(columns))), shape=(count, states))
+    return A.tocsr(), np.concatenate(values)

@@ -1,0 +1,215 @@
+"""One pass over the frames as they arrive: depth, road, snippet poses, image geometry, features."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+import cv2
+
+from slam.config import SlamConfig
+from slam.errors import SequenceError
+from slam.frames import DepthMap, Frame, Image, Intrinsics, Predictor, RelativePose, SnippetPoses
+from slam.frames import Sequence as FrameSequence
+from slam.frontend.bridging import bridge
+from slam.frontend.geometric_factors import GeometricOdometry, Motion
+from slam.frontend.inspection import FrameGate
+from slam.frontend.refusal import Refusal
+from slam.frontend.road_motion import RoadAligner, RoadStep
+from slam.frontend.scale import RoadPlane, fit_road
+from slam.loops.descriptors import FeatureExtractor, View
+from slam.timing import Stopwatch
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What fusion needs of a frame: a thinned image ``(h, w, 3)`` and unscaled depth ``(h, w)``."""
+
+    index: int
+    image: Image
+    depth_unscaled: DepthMap
+
+
+@dataclass
+class Observations:
+    """What one pass over the frames saw, in the networks' unit of length.
+
+    ``motions`` and ``road_steps`` hold what geometry and the road measured of the step from a frame to the next.
+    """
+
+    snippets: list[SnippetPoses] = field(default_factory=list)
+    geometric: list[RelativePose] = field(default_factory=list)
+    motions: dict[int, Motion] = field(default_factory=dict)
+    road_steps: dict[int, RoadStep] = field(default_factory=dict)
+    refusals: list[tuple[int, int, str]] = field(default_factory=list)
+    roads: list[RoadPlane | Refusal] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
+    examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
+    unusable: dict[int, str] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
+    trusted: list[SnippetPoses] = field(default_factory=list)
+    bridges: list[RelativePose] = field(default_factory=list)
+    bridged: dict[int, str] = field(default_factory=dict)
+
+
+def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
+    """A frame, or why its image cannot be read."""
+    try:
+        return sequence.frame(index)
+    except SequenceError as error:
+        return error
+
+
+class Observer:
+    """Watches the frames of one sequence in time order."""
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        intrinsics: Intrinsics,
+        config: SlamConfig,
+        watch: Stopwatch,
+        examples: Collection[int] = (),
+    ) -> None:
+        """Prepare for the first frame.
+
+        Args:
+            predictor: depth and snippet poses.
+            intrinsics: of all images.
+            config: of all parts.
+            watch: told where the time goes.
+            examples: frames to keep whole for the report.
+        """
+        self.seen = Observations()
+        self._predictor = predictor
+        self._intrinsics = intrinsics
+        self._config = config
+        self._watch = watch
+        self._examples = frozenset(examples)
+        self._gate = FrameGate(config.bridging)
+        self._geometry = GeometricOdometry(config.geometry, intrinsics)
+        self._aligner = RoadAligner(config.road, intrinsics)
+        self._features = FeatureExtractor(config.loops, intrinsics)
+        self._steps = config.geometry.steps if config.geometry.enabled else ()
+        self._window: deque[Frame] = deque(maxlen=predictor.sources + 1)
+        self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=0) + 1)
+        self._unread = 0
+
+    def add(self, index: int, frame: Frame | SequenceError) -> None:
+        """Watch the next frame, or learn that there is no image of it.
+
+        Raises:
+            SequenceError: the frame's own, where too many in a row could not be read.
+        """
+        if isinstance(frame, SequenceError):
+            self._unread += 1
+            if not self._config.bridging.enabled or self._unread > self._config.bridging.max_unread_frames:
+                raise frame
+            self._leave_out(index, str(frame))
+            return
+        self._unread = 0
+        if self._config.bridging.enabled:
+            with self._watch.stage("read"):
+                verdict = self._gate.check(frame.image)
+            if isinstance(verdict, Refusal):
+                self._leave_out(index, verdict.reason)
+                return
+            if verdict == "repeated":
+                self.seen.repeated.append(index)
+        self._observe(frame)
+
+    def closed(self) -> Observations:
+        """Everything seen so far with its gaps bridged; more frames may follow.
+
+        Raises:
+            SlamError: no snippet of usable frames.
+        """
+        seen = self.seen
+        closed = bridge(
+            len(seen.roads),
+            self._predictor.sources,
+            seen.snippets,
+            seen.geometric,
+            seen.unusable,
+            seen.repeated,
+            self._config.bridging,
+        )
+        return replace(
+            seen,
+            snippets=closed.snippets,
+            trusted=closed.trusted,
+            geometric=closed.geometric,
+            bridges=closed.bridges,
+            bridged=closed.frames,
+            views=[view for view in seen.views if view.index not in closed.frames],
+            keyframes=[keyframe for keyframe in seen.keyframes if keyframe.index not in closed.frames],
+        )
+
+    def _leave_out(self, index: int, reason: str) -> None:
+        self.seen.unusable[index] = reason
+        self.seen.roads.append(Refusal(reason))
+        self._window.clear()
+
+    def _observe(self, frame: Frame) -> None:
+        seen = self.seen
+        with self._watch.stage("depth network"):
+            depth = self._predictor.depth(frame)
+        with self._watch.stage("road"):
+            road = fit_road(depth, self._intrinsics, self._config.scale)
+        seen.roads.append(road)
+        self._window.append(frame)
+        if len(self._window) == self._window.maxlen:
+            with self._watch.stage("pose network"):
+                seen.snippets.append(self._predictor.snippet(list(self._window)))
+        height = road.height_unscaled if isinstance(road, RoadPlane) else None
+        self._recent.append((frame, depth, height))
+        with self._watch.stage("geometry"):
+            self._measure_geometry()
+        if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
+            with self._watch.stage("loops"):
+                seen.views.append(self._features.view(frame, depth, height))
+        self._keep(frame, depth)
+
+    def _measure_geometry(self) -> None:
+        current = self._recent[-1][0]
+        for step in self._steps:
+            if len(self._recent) <= step:
+                continue
+            previous, depth_previous, height = self._recent[-1 - step]
+            measured = self._geometry.measure(previous, current, depth_previous, height)
+            if isinstance(measured, Refusal):
+                self.seen.refusals.append((previous.index, current.index, measured.reason))
+                logger.info("geometry %d -> %d refused: %s", previous.index, current.index, measured.reason)
+                continue
+            self.seen.geometric.append(measured.relative_pose)
+            if measured.structure is not None and current.index == previous.index + 1:
+                self.seen.motions[previous.index] = measured
+                self._measure_road(previous, current, measured)
+
+    def _measure_road(self, previous: Frame, current: Frame, motion: Motion) -> None:
+        if not self._config.road.enabled:
+            return
+        road_step = self._aligner.measure(previous, current, motion.relative_pose.T_from_to)
+        if isinstance(road_step, Refusal):
+            logger.info("road %d -> %d refused: %s", previous.index, current.index, road_step.reason)
+        else:
+            self.seen.road_steps[previous.index] = road_step
+
+    def _keep(self, frame: Frame, depth: DepthMap) -> None:
+        """Remember thinned frames for the map, and a few whole ones for the report."""
+        mapping = self._config.mapping
+        if frame.index in self._examples:
+            self.seen.examples.append((frame.index, frame.image, depth))
+        if not mapping.enabled or frame.index % mapping.frame_stride:
+            return
+        height, width = depth.shape
+        thinned = min(mapping.width_px / width, 1.0)
+        size = (max(round(width * thinned), 1), max(round(height * thinned), 1))
+        small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        self.seen.keyframes.append(Keyframe(frame.index, image, small))

@@ -1,0 +1,162 @@
+"""The Eigen protocol with networks that know the answer, its two scales and its fidelities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from erfsfm.checkpoint import ModelRecord
+from erfsfm.config import NetworkConfig
+from erfsfm.data.splits import overlapping
+from erfsfm.errors import DataError
+from erfsfm.evaluation.depth_metrics import depth_errors
+from erfsfm.evaluation.eigen import EIGEN_FILE, eigen_protocol, read_split
+from erfsfm.inference import DepthPosePredictor
+
+DRIVE = "2011_09_26_drive_0099"
+Write = Callable[..., Path]
+
+
+class Oracle:
+    """Sees the wall of ``write_drive`` at 20 m and its 1 m a frame, in units of ``unit`` metres."""
+
+    sources = 4
+
+    def __init__(self, unit: float = 2.0, depth_m: float = 20.0, seen: Sequence[str] = ()) -> None:
+        self.unit, self.depth_m, self.seen = unit, depth_m, seen
+        self.record = ModelRecord(network=NetworkConfig(height=32, width=64), trained_on=list(seen))
+        self.asked: list[tuple[int, ...]] = []
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        self.asked.append(image.shape)
+        return np.full(image.shape[:2], self.depth_m / self.unit, np.float32)
+
+    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+        assert [int(image[0, 0, 0]) for image in images] == sorted(int(image[0, 0, 0]) for image in images)
+        assert len(images) == 5
+        T_source_target = np.tile(np.eye(4), (4, 1, 1))
+        T_source_target[:, 2, 3] = np.array([2, 1, -1, -2]) / self.unit
+        return T_source_target
+
+    def leaks(self, names: Sequence[str]) -> list[str]:
+        return overlapping(names, self.seen)
+
+
+@pytest.fixture
+def split(tmp_path: Path) -> str:
+    path = tmp_path / "split.txt"
+    path.write_text(f"{DRIVE} 0\n2011_09_26/{DRIVE}_sync/image_02/data/0000000004.png\n\n{DRIVE}_sync 8 l\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("fidelity", ["default", "paper"])
+def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: str) -> None:
+    root = write_drive(tmp_path / "raw")
+    oracle = Oracle()
+    median, pose = eigen_protocol(oracle, root, split, fidelity, allow_leak=False)
+    assert (median["scaling"], pose["scaling"]) == ("gt-median", "pose")
+    for row in (median, pose):
+        assert row["scale"] == pytest.approx(2, rel=1e-5)
+        assert row["abs_rel"] == pytest.approx(0, abs=1e-5)
+        assert (row["images"], row["left_out"], row["leak"]) == (3, 0, False)
+    assert set(oracle.asked) == {(32, 64, 3) if fidelity == "paper" else (64, 96, 3)}
+
+
+def test_a_wrong_unit_of_motion_is_seen_in_one_row_alone(tmp_path: Path, write_drive: Write, split: str) -> None:
+    root = write_drive(tmp_path / "raw", speed=12.0)
+    median, pose = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
+    assert median["abs_rel"] == pytest.approx(0, abs=1e-5)
+    assert pose["abs_rel"] == pytest.approx(0.2, abs=1e-5)
+
+
+def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, split: str) -> None:
+    """200 units are clipped to 80 before scaling (paper), or 20 m after it (default)."""
+    root = write_drive(tmp_path / "raw")
+    far = Oracle(unit=0.1)
+    assert eigen_protocol(far, root, split, "default", False)[1]["abs_rel"] == pytest.approx(0, abs=1e-5)
+    assert eigen_protocol(far, root, split, "paper", False)[1]["abs_rel"] == pytest.approx(1 - 80 * 0.1 / 20, abs=1e-5)
+
+
+def test_a_car_that_stands(tmp_path: Path, write_drive: Write, split: str) -> None:
+    root = write_drive(tmp_path / "raw", speed=0.0)
+    median, pose = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
+    assert (median["images"], pose["images"], pose["abs_rel"]) == (3, 0, None)
+    assert "stands still" in pose["abs_rel_reason"]
+    pose = eigen_protocol(Oracle(), root, split, "paper", allow_leak=False)[1]
+    assert (pose["images"], pose["abs_rel"], pose["rmse_log"]) == (3, pytest.approx(1), None)
+    assert pose["rmse_log_reason"] == "an image has no scale"
+    assert pose["scale_spread"] is None
+
+
+def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: str) -> None:
+    root = write_drive(tmp_path / "raw")
+    seen = Oracle(seen=[f"kitti_raw/{DRIVE}[4:5]"])
+    with pytest.raises(DataError, match=rf"leak: .*{DRIVE}\[4:5\]"):
+        eigen_protocol(seen, root, split, "default", allow_leak=False)
+    assert eigen_protocol(seen, root, split, "default", allow_leak=True)[0]["leak"] is True
+    eigen_protocol(Oracle(seen=[f"kitti_raw/{DRIVE}[5:8]"]), root, split, "default", allow_leak=False)
+
+
+@pytest.mark.parametrize("place", ["", "2011_09_26", f"2011_09_26/{DRIVE}_sync"])
+def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_drive: Write, split: str, place: str) -> None:
+    root = write_drive(tmp_path / "raw")
+    assert read_split(split, root / place)[0].root == root.resolve()
+
+
+def test_the_eigen_list(tmp_path: Path, write_drive: Write) -> None:
+    root = write_drive(tmp_path / "raw")
+    with pytest.raises(DataError, match="697 frames is not shipped: put it there"):
+        read_split("eigen", root)
+    (root / EIGEN_FILE).write_text(f"{DRIVE} 1\n")
+    with pytest.raises(DataError, match="wanted 697 frames of 28 drives; it has 1 of 1"):
+        read_split("eigen", root)
+    lines = [f"2011_09_26_drive_{1000 + i % 28} {i}" for i in range(697)]
+    (root / EIGEN_FILE).write_text("\n".join(lines))
+    assert len(read_split("eigen", root)) == 697
+
+
+def test_splits_that_are_none(tmp_path: Path, write_drive: Write) -> None:
+    root = write_drive(tmp_path / "raw")
+    (tmp_path / "empty.txt").write_text("\n")
+    (tmp_path / "words.txt").write_text("one two\n")
+    for name, words in [
+        ("empty.txt", "names no frames"),
+        ("words.txt", "'one two' names no frame"),
+        ("no", "no split at"),
+    ]:
+        with pytest.raises(DataError, match=words):
+            read_split(str(tmp_path / name), root)
+    with pytest.raises(DataError, match="no data set at"):
+        read_split("eigen", tmp_path / "nowhere")
+
+
+def test_a_scan_that_hits_nothing(tmp_path: Path, write_drive: Write, split: str) -> None:
+    root = write_drive(tmp_path / "raw", points=np.zeros((0, 4), np.float32))
+    with pytest.raises(DataError, match="frame 0 hits nothing under 80 m"):
+        eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
+
+
+def test_a_given_scale_and_clipping_by_hand() -> None:
+    truth, guess = np.array([[10.0, 60.0]], np.float32), np.array([[3.0, 100.0]], np.float32)
+    before = depth_errors(guess, truth, scaling=2.0, clipping="before")
+    after = depth_errors(guess, truth, scaling=2.0)
+    assert before is not None
+    assert after is not None
+    assert before.abs_rel == pytest.approx((0.4 + 100 / 60) / 2), "80 doubled, and not clipped again"
+    assert after.abs_rel == pytest.approx((0.4 + 20 / 60) / 2)
+
+
+@pytest.mark.data
+def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path) -> None:
+    """Never seen in training: better than a guess, and both fidelities agree where clipping does not matter."""
+    (tmp_path / "split.txt").write_text("".join(f"2011_09_26_drive_0013 {i}\n" for i in (5, 25, 45)))
+    predictor = DepthPosePredictor.from_weights("default")
+    root, split = data_root / "kitti_raw", str(tmp_path / "split.txt")
+    rows = {f: eigen_protocol(predictor, root, split, f, allow_leak=False) for f in ("default", "paper")}
+    assert rows["default"][0]["abs_rel"] < 0.4
+    assert rows["paper"][0]["abs_rel"] == pytest.approx(rows["default"][0]["abs_rel"], rel=0.02)
+    assert 5 < rows["default"][1]["scale"] < 200

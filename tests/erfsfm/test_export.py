@@ -1,0 +1,125 @@
+"""Every network says the same in onnxruntime as in PyTorch, and a wrong graph is never written."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import erfsfm.export
+from erfsfm.checkpoint import Absent, Model, ModelRecord, build_networks
+from erfsfm.config import NetworkConfig
+from erfsfm.errors import ConfigError, ExportError
+from erfsfm.export import export_onnx, pose_path
+from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.presets import PRESETS
+
+onnxruntime = pytest.importorskip("onnxruntime")
+onnx = pytest.importorskip("onnx")
+
+DEPTH = [name for name, preset in PRESETS.items() if preset.kind == "depth"]
+POSE = [name for name, preset in PRESETS.items() if preset.kind == "pose"]
+
+
+def fresh(**settings: Any) -> Model:
+    """Small networks whose deformable taps really move."""
+    config = NetworkConfig.model_validate({"depth_width": 0.1, "pose_width": 0.2, "height": 64, "width": 96} | settings)
+    nets = build_networks(config)
+    for module in (m for net in nets for m in net.modules()):
+        if isinstance(module, DeformableConv2d):
+            nn.init.normal_(module.offset.weight, std=0.3)
+            nn.init.normal_(module.offset.bias, std=2.0)
+            nn.init.normal_(module.modulator.weight, std=0.3)
+        if isinstance(module, nn.BatchNorm2d):
+            module.running_mean.uniform_(-0.1, 0.1)
+            module.running_var.uniform_(0.5, 2.0)
+    return Model(ModelRecord(network=config, trained_on=["simulated/0-9"]), *nets)
+
+
+def answer(path: Path, **inputs: torch.Tensor) -> np.ndarray:
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    assert {entry.name for entry in session.get_inputs()} == set(inputs)
+    return session.run(None, {name: value.numpy() for name, value in inputs.items()})[0]
+
+
+@pytest.mark.parametrize(("depth", "pose"), zip(DEPTH, POSE), ids=DEPTH)
+@pytest.mark.parametrize("settings", [{}, {"normalisation": "batch", "sources": 2, "height": 47, "width": 78}], ids=str)
+def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:
+    model = fresh(depth=depth, pose=pose, **settings)
+    written = export_onnx(model, tmp_path / "net.onnx")
+    assert [(file.path.name, file.preset) for file in written] == [("net.onnx", depth), ("net_pose.onnx", pose)]
+    assert all(file.difference < 1e-4 for file in written)
+    config = model.record.network
+    images = torch.rand(1 + config.sources, 1, 3, config.height, config.width) * 2 - 1
+    with torch.no_grad():
+        disparity, vectors = model.depth_net(images[0]), model.pose_net(images[0], list(images[1:]))
+    np.testing.assert_allclose(answer(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
+    found = answer(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
+    np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
+
+
+@pytest.mark.parametrize("pose", POSE)
+def test_paper_fidelity(tmp_path: Path, pose: str) -> None:
+    model = fresh(pose=pose, fidelity="paper", width=160, height=128)
+    export_onnx(Model(model.record, Absent("depth", tmp_path), model.pose_net), tmp_path / "net.onnx")
+    assert pose_path(tmp_path / "net.onnx").is_file()
+
+
+def test_plain_operators_and_notes(tmp_path: Path) -> None:
+    export_onnx(fresh(depth="erf-depthnet-dfc"), tmp_path / "net.onnx")
+    graph = onnx.load(tmp_path / "net.onnx")
+    assert {node.domain for node in graph.graph.node} <= {"", "ai.onnx"}, "no operator of our own"
+    assert "GridSample" in {node.op_type for node in graph.graph.node}
+    notes = {entry.key: entry.value for entry in graph.metadata_props}
+    assert (notes["network"], notes["trained_on"]) == ("erf-depthnet-dfc", '["simulated/0-9"]')
+
+
+def test_the_network_that_cannot_run(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot run in paper fidelity"):
+        export_onnx(fresh(depth="erf-depthnet-dilated", fidelity="paper"), tmp_path / "net.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_network_alone(tmp_path: Path) -> None:
+    model = fresh()
+    (file,) = export_onnx(Model(model.record, Absent("depth", tmp_path), model.pose_net), tmp_path / "net.onnx")
+    assert file.path == tmp_path / "net_pose.onnx"
+
+
+def test_a_graph_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = fresh()
+    traced = erfsfm.export._traced
+
+    def wrong(graph: Any, example: Any) -> bytes:
+        content = traced(graph, example)
+        with torch.no_grad():
+            model.depth_net.heads[-1].bias.add_(0.01)
+        return content
+
+    monkeypatch.setattr(erfsfm.export, "_traced", wrong)
+    with pytest.raises(ExportError, match="was not written: onnxruntime differs"):
+        export_onnx(model, tmp_path / "net.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name == "onnxruntime":
+            raise ImportError("No module named 'onnxruntime'")
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ExportError, match=r"pip install 'erfsfm-slam\[onnx\]'"):
+        export_onnx(fresh(), tmp_path / "net.onnx")
+
+
+def test_other_endings(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"must end in \.onnx"):
+        export_onnx(fresh(), tmp_path / "net.pt")

@@ -1,0 +1,63 @@
+"""One complete experiment for each row of the paper's Tables 1 to 3, at the paper's resolutions."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from erfsfm.checkpoint import build_networks
+from erfsfm.config import load_experiment
+from erfsfm.networks.receptive_field import multiply_adds
+
+FILES = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("table*.yaml"))
+ALL = ("248x75", "310x94", "416x128", "620x188", "1241x376")
+MIDDLE = ("416x128", "620x188")
+ROWS = {
+    *(f"table1-posenet-{size}" for size in ALL),
+    *(f"table1-erf-posenet-{variant}-{size}" for variant in ("dilated", "dfc", "dfcv2") for size in MIDDLE),
+    *(f"table2-erf-depthnet-{row}" for row in ("dfc-416x128", "dfcv2-416x128", "dfc-620x188")),
+    *(f"table3-depthnet-posenet-{size}" for size in ALL),
+    *(f"table3-depthnet-erf-posenet-{variant}-{size}" for variant in ("dilated", "dfc") for size in MIDDLE),
+    "table3-depthnet-erf-posenet-dfcv2-416x128",
+    "table3-erf-depthnet-dfc-erf-posenet-dfc-620x188",
+}
+
+
+def test_every_row_has_its_file() -> None:
+    assert {path.stem for path in FILES} == ROWS
+
+
+def test_the_guide_names_them_all() -> None:
+    guide = (FILES[0].parents[2] / "docs" / "reproduction.md").read_text()
+    assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == ROWS
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_is_what_its_name_says(path: Path) -> None:
+    experiment = load_experiment(path)
+    network = experiment.network
+    networks, size = re.fullmatch(r"table[123]-(.*?)-(\d+x\d+)", path.stem).groups()  # type: ignore[union-attr]
+    assert f"{network.width}x{network.height}" == size
+    said = networks if "depthnet" in networks else f"depthnet-{networks}"
+    said = said if "posenet" in said else f"{said}-posenet"
+    assert f"{network.depth}-{network.pose}" == said
+    assert (network.fidelity, network.sources, network.normalisation, network.masks) == ("paper", 4, "none", False)
+    assert (network.depth_width, network.pose_width) == (1.0, 1.0)
+    loss, training, data = experiment.loss, experiment.training, experiment.data
+    assert (loss.smoothness, loss.smoothness_weight) == ("depth-second-order", 0.2)
+    assert (loss.ssim_weight, loss.reduction, loss.auto_mask, loss.mask_weight) == (0, "mean", False, 0)
+    assert (training.batch, training.learning_rate, training.schedule, training.steps) == (4, 2e-4, "constant", 200_000)
+    assert (data.flip, data.zoom, data.colour_jitter) == (0.5, 1.15, 0)
+    assert {"kitti_odometry/09", "kitti_odometry/10"} == set(data.exclude)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_its_networks_are_built_and_fit_the_size(path: Path) -> None:
+    network = load_experiment(path).network
+    with torch.device("meta"):
+        nets = build_networks(network)
+    for net in nets:
+        assert multiply_adds(net, network.height, network.width) > 1e7

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+
+from slam.config import LengthConfig
+from slam.frontend.epipolar import Structure
+from slam.frontend.step_lengths import StepEvidence, length_ratio, solve_lengths
+
+CONFIG = LengthConfig()
+STEPS = 200
+TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
+
+
+def evidence(**measured: np.ndarray) -> StepEvidence:
+    empty = {name: np.full(STEPS, np.nan) for name in ("ratio", "ratio_sigma", "absolute", "absolute_sigma", "learned")}
+    return StepEvidence(**(empty | measured))
+
+
+def ratios(noise: float = 0.0) -> dict[str, np.ndarray]:
+    values = np.full(STEPS, np.nan)
+    values[1:] = np.diff(np.log(TRUE)) + noise * np.random.default_rng(0).normal(size=STEPS - 1)
+    return {"ratio": values, "ratio_sigma": np.where(np.isfinite(values), 0.001, np.nan)}
+
+
+def noisy(sigma: float, seed: int = 1) -> np.ndarray:
+    return np.log(TRUE) + sigma * np.random.default_rng(seed).normal(size=STEPS)
+
+
+def test_triangulation_carries_a_rare_road_through_the_drive():
+    """Where the road is seen in one step of forty and learned depth is twice too long, lengths are still right."""
+    road = np.where(np.arange(STEPS) % 40 == 20, np.log(TRUE), np.nan)
+    measured = evidence(
+        absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.05) + np.log(2.0), **ratios(0.003)
+    )
+    solved = solve_lengths(measured, CONFIG)
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
+    np.testing.assert_allclose(solved.unit_correction, 0.5, rtol=0.1)
+
+
+def test_a_noisy_road_is_better_with_triangulation_than_without():
+    absolute = {"absolute": noisy(0.05), "absolute_sigma": np.full(STEPS, 0.06)}
+    alone = solve_lengths(evidence(**absolute), CONFIG).length
+    together = solve_lengths(evidence(**absolute, **ratios(0.003)), CONFIG).length
+    errors = [np.sqrt(np.mean(np.log(lengths / TRUE) ** 2)) for lengths in (alone, together)]
+    assert errors[0] > 0.03
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_a_quarter_of_wrong_roads_does_not_matter():
+    road = noisy(0.03)
+    road[::4] += np.log(1.6)
+    measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), **ratios(0.003))
+    np.testing.assert_allclose(solve_lengths(measured, CONFIG).length, TRUE, rtol=0.05)
+
+
+def test_learned_depth_bridges_a_gap_in_the_unit_that_it_was_seen_to_have():
+    """Steps 80 to 119 have neither road nor ratio, and learned lengths are 30 % short all along."""
+    gap = (np.arange(STEPS) >= 80) & (np.arange(STEPS) < 120)
+    tied = ratios()
+    tied["ratio"] = np.where(gap | np.roll(gap, 1), np.nan, tied["ratio"])
+    road = np.where(gap, np.nan, np.log(TRUE))
+    learned = np.log(0.7 * TRUE)
+    solved = solve_lengths(
+        evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied), CONFIG
+    )
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
+    believed = solve_lengths(evidence(learned=learned), CONFIG)
+    np.testing.assert_allclose(believed.length, 0.7 * TRUE, rtol=1e-6)
+    np.testing.assert_allclose(believed.unit_correction, 1.0, atol=1e-6)
+
+
+def test_steps_that_nothing_measured_have_no_length():
+    learned = np.where(np.arange(STEPS) < 50, np.nan, np.log(TRUE))
+    solved = solve_lengths(evidence(learned=learned), CONFIG)
+    assert np.isnan(solved.length[:50]).all() and np.isfinite(solved.length[50:]).all()
+    nothing = solve_lengths(StepEvidence.empty(5), CONFIG)
+    assert np.isnan(nothing.length).all()
+    np.testing.assert_array_equal(nothing.unit_correction, 1.0)
+
+
+def structure(names: np.ndarray, previous: np.ndarray, current: np.ndarray) -> Structure:
+    return Structure(names, previous, current, np.full(len(names), 0.02))
+
+
+def test_ratio_of_lengths_from_common_points():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(4.0, 20.0, 60)  # metres, in the camera between
+    names = np.arange(60)
+    earlier = structure(names, depth + 2.0, depth / 2.0)  # a step of 2 m
+    wrong = np.where(names < 10, 3.0, 1.0)
+    later = structure(names[::-1] + 5, depth[::-1] / 1.5, depth[::-1])
+    assert length_ratio(earlier, structure(names + 100, depth, depth)) is None
+    shifted = structure(names, wrong * depth / 1.5, depth)  # a step of 1.5 m, ten points on a car
+    ratio = length_ratio(earlier, shifted)
+    assert ratio is not None
+    assert ratio[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
+    again = length_ratio(structure(names + 5, depth + 2.0, depth / 2.0), later)
+    assert again is not None and again[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)

@@ -1,0 +1,52 @@
+import cv2
+import numpy as np
+import pytest
+
+from slam.config import GeometryConfig
+from slam.frames import Frame
+from slam.frontend.tracking import CornerTracker
+
+CONFIG = GeometryConfig(max_corners=300)
+SHIFT_PX = 4
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    """A wide picture that slides to the left by whole pixels."""
+    noise = np.random.default_rng(0).integers(0, 255, (120, 300), np.uint8)
+    wide = np.repeat(cv2.GaussianBlur(noise, (0, 0), 1.5)[..., None], 3, axis=2)
+    return [Frame(k, 0.1 * k, np.ascontiguousarray(wide[:, SHIFT_PX * k :][:, :200])) for k in range(6)]
+
+
+def test_tracks_move_with_the_picture_and_keep_their_names(frames):
+    tracker = CornerTracker(CONFIG)
+    first, second = tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])
+    for tracks in (first, second):
+        assert len(tracks.names) == len(set(tracks.names.tolist())) > 50
+        error = np.abs(tracks.previous - tracks.current - [SHIFT_PX, 0]).max(axis=1)
+        assert np.median(error) < 0.01 and error.max() < 0.5
+    common, one, other = np.intersect1d(first.names, second.names, return_indices=True)
+    assert len(common) > 0.8 * len(first.names)
+    np.testing.assert_array_equal(first.current[one], second.previous[other])
+
+
+def test_new_corners_fill_what_slides_into_view(frames):
+    tracker = CornerTracker(CONFIG)
+    for k in range(5):
+        tracks = tracker.track(frames[k], frames[k + 1])
+    fresh = tracks.previous[tracks.names > np.median(tracks.names)]
+    assert len(tracks.names) > 50
+    assert fresh[:, 0].max() > 200 - 3 * SHIFT_PX
+    assert len(tracks.names) <= CONFIG.max_corners
+
+
+def test_an_empty_image_gives_no_tracks(frames):
+    black = Frame(9, 0.9, np.zeros_like(frames[0].image))
+    assert len(CornerTracker(CONFIG).track(black, frames[0]).names) == 0
+    assert len(CornerTracker(CONFIG).track(frames[0], black).names) == 0
+
+
+def test_two_trackers_agree(frames):
+    one, other = (CornerTracker(CONFIG).track(frames[0], frames[2]) for _ in range(2))
+    np.testing.assert_array_equal(one.current, other.current)
+    np.testing.assert_array_equal(one.names, other.names)

@@ -1,0 +1,114 @@
+"""Ten frames in the middle of a drive show nothing: the run goes on, and says so."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.config import load_config
+from slam.errors import SequenceError
+from slam.evaluation import trajectory_metrics
+from slam.frames import Frame
+from slam.frontend.bridging import BRIDGE_SOURCE
+from slam.oracle import OracleNoise, OraclePredictor
+from slam.pipeline import SlamPipeline, SlamResult
+from slam.sequences.simulated import SimulationOptions
+from slam.sequences.simulated_sequence import SimulatedSequence
+
+FRAMES = 60
+BAD = range(25, 35)
+FACTOR = 0.2
+
+Damage = Callable[[SimulatedSequence, int], Frame]
+
+
+def black(sequence: SimulatedSequence, index: int) -> Frame:
+    return Frame(index, float(sequence.stamps[index]), np.zeros((64, 208, 3), np.uint8))
+
+
+def noise(sequence: SimulatedSequence, index: int) -> Frame:
+    image = np.random.default_rng(index).integers(0, 255, (64, 208, 3), np.uint8)
+    return Frame(index, float(sequence.stamps[index]), image)
+
+
+def repeated(sequence: SimulatedSequence, index: int) -> Frame:
+    return Frame(index, float(sequence.stamps[index]), sequence.frame(BAD[0] - 1).image)
+
+
+def unreadable(sequence: SimulatedSequence, index: int) -> Frame:
+    raise SequenceError(f"image {index}.png is truncated")
+
+
+class Damaged:
+    """A drive some of whose frames are damaged."""
+
+    def __init__(self, sequence: SimulatedSequence, damage: Damage, bad: range) -> None:
+        self._sequence, self._damage, self._bad = sequence, damage, bad
+        self.name, self.intrinsics, self.stamps = sequence.name, sequence.intrinsics, sequence.stamps
+        self.reference, self.camera_height_m = sequence.reference, sequence.camera_height_m
+        self.T_camera_lidar = None
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def frame(self, index: int) -> Frame:
+        return (self._damage if index in self._bad else SimulatedSequence.frame)(self._sequence, index)
+
+    def scan_path(self, index: int) -> Path | None:
+        return None
+
+    def provenance(self) -> tuple[str, ...]:
+        return ()
+
+
+@functools.cache
+def street() -> SimulatedSequence:
+    return SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
+
+
+def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> SlamResult:
+    sequence = Damaged(street(), damage, bad)
+
+    def depth_of(index: int) -> np.ndarray:
+        depth = street().street.render(index).depth
+        return np.where(depth > 0, depth, 200.0)
+
+    oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR)
+    options = ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", "mapping.width_px=104", *overrides]
+    return SlamPipeline(sequence, oracle, load_config(None, options)).run()
+
+
+@pytest.mark.parametrize("damage", [black, noise, repeated, unreadable], ids=lambda damage: damage.__name__)
+def test_ten_frames_are_bridged_and_reported(damage: Damage, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        result = run(damage)
+    for each in (result.network, result.odometry, result.optimised):
+        assert len(each) == FRAMES and np.isfinite(each.T_world_camera).all()
+        np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
+    seen = result.observations
+    assert set(seen.bridged) == set(BAD)
+    assert "frames 25 to 34 bridged: " in caplog.text
+    bridges = [factor for factor in result.factors if factor.source == BRIDGE_SOURCE]
+    assert [factor.from_index for factor in bridges] == list(range(24, 35))
+    assert min(factor.sigmas[0] for factor in bridges) > 5 * np.deg2rad(0.3)
+    # nothing was measured on ten metres: an error of a metre there is an honest one
+    errors = trajectory_metrics(result.optimised, result.reference)["align"]["6dof"]
+    assert errors["ate_rmse_m"] < 1.0
+    assert result.map is not None and not {k.index for k in seen.keyframes} & set(BAD)
+    assert not {view.index for view in seen.views} & set(BAD)
+
+
+def test_a_drive_in_order_is_left_alone() -> None:
+    assert run(bad=range(0)).observations.bridged == {}
+
+
+def test_too_many_unreadable_images_are_the_error_they_are() -> None:
+    with pytest.raises(SequenceError, match=r"image 28\.png is truncated"):
+        run(unreadable, BAD, "bridging.max_unread_frames=3")
+    with pytest.raises(SequenceError, match=r"image 25\.png is truncated"):
+        run(unreadable, BAD, "bridging.enabled=false")

@@ -1,0 +1,113 @@
+"""How good and how fast: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
+
+accuracy measures simulated worlds and KITTI sequences, ablation turns off one part at a time, speed measures time and
+memory. Every run is a process and a folder of its own under --output. One that ended well is not repeated as long as
+sources, weights and options stay the same; one that failed is a row that says why. --jobs and --scheduler want Dask:
+pip install 'erfsfm-slam[benchmark]'. A scheduler's workers see the same files at the same paths.
+
+Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarking.page import section, with_section
+from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Job, excerpts, plan, recordings, worlds
+from benchmarking.quantities import rows
+from benchmarking.work import ROOT, measured, workers
+
+from slam.errors import SlamError
+from slam.files import write_atomically
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Plan, run what is missing, write tables."""
+    options = _parser().parse_args(words)
+    at_a_time = getattr(options, "jobs", 1)
+    scheduler = getattr(options, "scheduler", None)
+    try:
+        jobs = _jobs(options)
+    except SlamError as error:
+        raise SystemExit(str(error)) from error
+    if not jobs:
+        raise SystemExit("nothing to measure: give --routes or --kitti")
+    with workers(at_a_time, scheduler) as spread:
+        outcomes = measured(jobs, spread)
+    table_of_runs = rows(outcomes)
+    with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table_of_runs[0])
+        writer.writeheader()
+        writer.writerows(table_of_runs)
+    text = section(options.mode, _command(options), outcomes, "several" if scheduler else str(at_a_time))
+    for path, name in ((options.output, "OUTPUT"), (options.kitti, "KITTI"), (ROOT, ".")):
+        text = text.replace(str(path.resolve()), name) if path else text
+    page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
+    write_atomically(options.report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
+    print(f"{options.report}: {len(outcomes)} runs, {sum(bool(o.reason) for o in outcomes)} failed")
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    folder = options.output.resolve() / options.mode
+    simulated = options.output.resolve() / "worlds"
+    drives = worlds(simulated, options.routes, options.worlds, options.frames)
+    if options.kitti is not None:
+        drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
+    configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED}[options.mode]
+    rest = options.weights, options.seeds, options.set, options.device
+    jobs = plan(folder, drives, configurations, *rest)
+    if options.mode == "speed" and options.growth:
+        (grid,) = worlds(simulated, ["grid"], options.worlds[:1], max(options.growth))
+        jobs += plan(folder, excerpts(grid, options.growth), [GROWTH], *rest)
+    return jobs
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The command with its defaults, without the paths and hosts of one machine."""
+    words = ["python", "tools/benchmark.py", options.mode]
+    words += ["--kitti", "KITTI"] if options.kitti else []
+    for name in ("weights", "routes", "worlds", "frames", "sequences", "excerpt", "seeds", "growth", "device", "set"):
+        value = getattr(options, name, None)
+        if value not in (None, []):
+            words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join(words)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    modes = parser.add_subparsers(dest="mode", required=True, metavar="accuracy|ablation|speed")
+    for mode, what in (
+        ("accuracy", "errors of network, odometry and optimised trajectory on every sequence"),
+        ("ablation", "the same with one part turned off at a time"),
+        ("speed", "time of every stage, memory, growth with the number of frames; one run after another"),
+    ):
+        add = modes.add_parser(
+            mode, help=what, description=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+        ).add_argument
+        fast = mode == "speed"
+        add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
+        add("--sequences", nargs="+", default=[], metavar="NAME", help="of that root; all of them without it")
+        add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
+        add("--routes", nargs="*", default=["loop"] if fast else ["loop", "straight"], help="of simulated worlds")
+        add("--worlds", nargs="+", type=int, default=[610, 611] if mode == "accuracy" else [610], help="their seeds")
+        add("--frames", type=int, default=300, help="their length")
+        add("--weights", nargs="+", default=["default"] if fast else ["default", "sim"], help="names or folders")
+        add("--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the runs")
+        add("--set", nargs="+", default=[], metavar="KEY=VALUE", help="changes to every configuration")
+        add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
+        add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
+        add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
+        if fast:
+            add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
+        else:
+            add("--jobs", type=int, default=1, help="runs at a time; more than one wants Dask")
+            add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,236 @@
+"""Tables of outcomes in Markdown, and the page that holds them."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import fmean, stdev
+
+from benchmarking.plan import EVERYTHING, GROWTH
+from benchmarking.quantities import (
+    ATE_6,
+    ATE_7,
+    COMMAND,
+    COMPLETENESS,
+    COVERAGE,
+    CPU,
+    ERRORS,
+    FRAMES,
+    LENGTH,
+    LOAD,
+    LOOPS,
+    MEMORY,
+    R_REL,
+    RATE,
+    SCALE,
+    TIME,
+    Quantity,
+    stages,
+)
+from benchmarking.work import Outcome
+
+from slam.comparison import MISSING, lookup, written
+
+Label = Callable[[Outcome], str]
+Cell = Callable[[Sequence[Outcome]], str]
+
+
+PAGE = """# Benchmarks
+
+Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
+measured with. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale*
+is the factor that the optimised trajectory still needs.
+"""
+
+
+def accuracy_tables(outcomes: Sequence[Outcome]) -> str:
+    """One row for each sequence and weights."""
+    quantities = (FRAMES, LENGTH, *ERRORS, R_REL, SCALE, LOOPS, COVERAGE, RATE, MEMORY)
+    columns = {q.title: over_seeds(q) for q in quantities}
+    return table({"sequence": _drive, "weights": _weights}, columns, outcomes) + notes(outcomes, quantities)
+
+
+def ablation_tables(outcomes: Sequence[Outcome]) -> str:
+    """What each part brings: errors over those of everything on, then the errors themselves."""
+    errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, COMPLETENESS, MEMORY)
+    columns = {f"{q.title}: ratio (worst)": against_everything(q, outcomes) for q in errors}
+    columns |= {q.title: average(q) for q in others}
+    drives = grouped(outcomes, _drive, _weights)
+    by_drive = {", ".join(label): average(ATE_7, drive) for label, drive in drives.items()}
+    rows = {"configuration": _configuration}
+    return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
+above 1, the part helps. The rest are means.
+
+{table(rows, columns, outcomes)}
+
+{ATE_7.title}, metres:
+
+{table(rows, by_drive, outcomes)}{notes(outcomes, (*errors, *others))}"""
+
+
+def speed_tables(outcomes: Sequence[Outcome]) -> str:
+    """Frames a second, shares of the stages, growth with the number of frames."""
+    growth = [o for o in outcomes if o.job.configuration.name == GROWTH.name]
+    whole = [o for o in outcomes if o not in growth]
+    rows = {"sequence": _drive, "weights": _weights, "configuration": _configuration}
+    costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
+    shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
+    by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
+    return f"""Everything on. Frames a second count all from the first image to the evaluation; the whole command also
+start and report.
+
+{table(rows, {q.title: over_seeds(q) for q in costs}, whole)}
+
+Share of every stage, %:
+
+{table(rows, shares, whole)}
+
+Growth with the number of frames, without fusion; stages in ms / frame:
+
+{table({"sequence": _drive, "weights": _weights}, by_stage, growth)}{notes(outcomes, (*costs, *grown))}"""
+
+
+TABLES: dict[str, Callable[[Sequence[Outcome]], str]] = {
+    "accuracy": accuracy_tables,
+    "ablation": ablation_tables,
+    "speed": speed_tables,
+}
+
+
+def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], outcomes: Sequence[Outcome]) -> str:
+    """Markdown: one row for each group of outcomes that share their labels."""
+    lines = ["| " + " | ".join([*rows, *columns]) + " |", "|" + "---|" * len(rows) + "---:|" * len(columns)]
+    for label, group in grouped(outcomes, *rows.values()).items():
+        lines.append("| " + " | ".join([*label, *(cell(group) for cell in columns.values())]) + " |")
+    return "\n".join(lines)
+
+
+def grouped(outcomes: Sequence[Outcome], *labels: Label) -> dict[tuple[str, ...], list[Outcome]]:
+    """Outcomes by what they share, in order of appearance."""
+    groups: dict[tuple[str, ...], list[Outcome]] = {}
+    for o in outcomes:
+        groups.setdefault(tuple(label(o) for label in labels), []).append(o)
+    return groups
+
+
+def over_seeds(quantity: Quantity) -> Cell:
+    """Mean and, where seeds differ, sample standard deviation."""
+
+    def cell(group: Sequence[Outcome]) -> str:
+        values = _values(group, *quantity.path)
+        deviation = stdev(values) if len(set(values)) > 1 else 0.0
+        spread = f" ± {written(deviation, quantity.decimals)}" if deviation else ""
+        return _mean(values, quantity.decimals) + spread
+
+    return cell
+
+
+def average(quantity: Quantity, among: Sequence[Outcome] | None = None) -> Cell:
+    """Mean over a group, or over those of it that are among others too."""
+    return lambda group: _mean(
+        _values([o for o in group if among is None or o in among], *quantity.path), quantity.decimals
+    )
+
+
+def against_everything(quantity: Quantity, outcomes: Sequence[Outcome]) -> Cell:
+    """Geometric mean and worst of the ratios to the runs with everything on."""
+
+    def key(o: Outcome) -> tuple[str, str, int]:
+        return o.job.drive.name, o.job.weights, o.job.seed
+
+    base = {key(o): _values([o], *quantity.path) for o in outcomes if o.job.configuration.name == EVERYTHING.name}
+
+    def cell(group: Sequence[Outcome]) -> str:
+        pairs = [(value, *base.get(key(o), [])) for o in group for value in _values([o], *quantity.path)]
+        ratios = [pair[0] / pair[1] for pair in pairs if len(pair) == 2 and min(pair) > 0]
+        return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else MISSING
+
+    return cell
+
+
+def stage_share(stage: str) -> Cell:
+    """Per cent of the time of a run."""
+    return lambda group: _mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
+
+
+def rest_share(group: Sequence[Outcome]) -> str:
+    """Per cent outside of every stage."""
+    shares = [100 - 100 * sum(_stage(o, s) for s in stages([o])) / _seconds(o) for o in group if not o.reason]
+    return _mean(shares, 1)
+
+
+def stage_ms(stage: str) -> Cell:
+    """Milliseconds a frame."""
+    return lambda group: _mean(
+        [1e3 * _stage(o, stage) / o.metrics["sequence"]["frames"] for o in group if not o.reason], 2
+    )
+
+
+def notes(outcomes: Sequence[Outcome], quantities: Iterable[Quantity]) -> str:
+    """What a reader must know about the numbers, why some are missing and runs failed; a line each."""
+    lines: dict[str, None] = {}
+    for o in (o for o in outcomes if not o.reason):
+        if lookup(o.metrics, "provenance", "leak")[0]:
+            lines[f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."] = None
+        for quantity in quantities:
+            value, reason = lookup(o.metrics, *quantity.path)
+            if value is None:
+                lines[f"{MISSING} {quantity.title}, {o.job.drive.name}: {reason}."] = None
+    lines |= {f"Failed: {o.job.title}: {o.reason}": None for o in outcomes if o.reason}
+    return "\n" + "".join(f"\n- {line}" for line in lines)
+
+
+def section(mode: str, command: str, outcomes: Sequence[Outcome], at_a_time: str) -> str:
+    """A section of the page: what was done, then its tables."""
+    commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in outcomes))
+    seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in outcomes))
+    failed = sum(bool(o.reason) for o in outcomes)
+    return f"""## {mode.capitalize()}
+
+    {command}
+
+Commit {commits}; seeds {seeds}; {len(outcomes)} runs, {failed} failed; {at_a_time} at a time on {os.cpu_count()} cores
+({platform.machine()}).
+
+{TABLES[mode](outcomes)}
+"""
+
+
+def with_section(page: str, new: str) -> str:
+    """The page with a section in place of the one of the same title, sections in the order of ``TABLES``."""
+    _, *old = re.split(r"(?m)^(?=## )", page)
+    sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
+    order = [f"## {mode.capitalize()}" for mode in TABLES]
+    return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=order.index))])
+
+
+def _drive(o: Outcome) -> str:
+    return o.job.drive.name
+
+
+def _weights(o: Outcome) -> str:
+    return o.job.weights
+
+
+def _configuration(o: Outcome) -> str:
+    return o.job.configuration.name
+
+
+def _values(outcomes: Sequence[Outcome], *path: str) -> list[float]:
+    found = (lookup(o.metrics, *path)[0] for o in outcomes)
+    return [value for value in found if value is not None]
+
+
+def _mean(values: Sequence[float], decimals: int) -> str:
+    return written(fmean(values), decimals) if values else MISSING
+
+
+def _stage(o: Outcome, stage: str) -> float:
+    return float(o.metrics["timing"]["stages"].get(stage, 0.0))
+
+
+def _seconds(o: Outcome) -> float:
+    return float(o.metrics["timing"]["seconds_total"])

@@ -1,0 +1,138 @@
+"""What is to be measured: recordings, configurations and the runs that combine them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options."""
+
+    name: str
+    root: Path
+    sequence: str = "sim"
+    frames: str | None = None
+    simulate: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What a run is told; ``fill`` empties the cache of the networks' answers first, ``full`` wants it there."""
+
+    name: str
+    overrides: tuple[str, ...] = ()
+    cache: Literal["none", "keep", "fill", "full"] = "none"
+
+
+QUIET = ("output.report=false",)
+ACCURACY = (Configuration("default", QUIET),)
+EVERYTHING = Configuration("everything on", QUIET, "keep")
+ABLATION = (
+    EVERYTHING,
+    *(
+        Configuration(name, (*QUIET, override), "keep")
+        for name, override in {
+            "no loops": "loops.enabled=false",
+            "no image geometry": "geometry.enabled=false",
+            "no lengths from the road's motion": "road.enabled=false",
+            "no bridging": "bridging.enabled=false",
+            "no robust noise": "pose_graph.kernel=none",
+            "no fusion": "mapping.enabled=false",
+            "network factors on every step": "frontend.use=always",
+        }.items()
+    ),
+)
+SPEED = (
+    Configuration("networks asked"),
+    Configuration("cache filled", cache="fill"),
+    Configuration("from the cache", cache="full"),
+)
+GROWTH = Configuration("no fusion", (*QUIET, "mapping.enabled=false"))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of ``erfsfm-slam run``; ``folder`` holds the benchmark's runs and cache."""
+
+    folder: Path
+    drive: Drive
+    weights: str
+    configuration: Configuration
+    seed: int
+    device: str = "cpu"
+
+    @property
+    def title(self) -> str:
+        """For a reader."""
+        return f"{self.drive.name}, {self.weights}, {self.configuration.name}, seed {self.seed}"
+
+    @property
+    def place(self) -> Path:
+        """Of this run alone."""
+        return self.folder / slug(self.title)
+
+    @property
+    def cache(self) -> Path:
+        """Shared by the configurations of one drive."""
+        return self.folder / "cache" / slug(f"{self.drive.name}_{self.weights}")
+
+    @property
+    def arguments(self) -> list[str]:
+        """Of ``erfsfm-slam``."""
+        drive, configuration = self.drive, self.configuration
+        words = ["run", "--dataset", str(drive.root), "--sequence", drive.sequence, "--weights", self.weights]
+        words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
+        words += ["--frames", drive.frames] if drive.frames else []
+        words += ["--cache", str(self.cache)] if configuration.cache != "none" else []
+        return words + [word for override in configuration.overrides for word in ("--set", override)]
+
+
+def plan(
+    folder: Path,
+    drives: Sequence[Drive],
+    configurations: Sequence[Configuration],
+    weights: Sequence[str],
+    seeds: Sequence[int],
+    changes: Sequence[str] = (),
+    device: str = "cpu",
+) -> list[Job]:
+    """Every combination, configuration by configuration, so that the first one fills the caches for the others."""
+    changed = [replace(c, overrides=(*c.overrides, *changes)) for c in configurations]
+    return [Job(folder, d, w, c, s, device) for c in changed for s in seeds for w in weights for d in drives]
+
+
+def worlds(folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int) -> list[Drive]:
+    """Simulated drives, in folders that name everything that decides them."""
+    from slam.sequences.simulated import VERSION
+
+    return [
+        Drive(
+            name=f"{route} {seed}",
+            root=folder / f"{route}-{seed}-{frames}-v{VERSION}",
+            simulate=("--route", route, "--seed", str(seed), "--frames", str(frames)),
+        )
+        for route in routes
+        for seed in seeds
+    ]
+
+
+def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[Drive]:
+    """The sequences of a KITTI odometry root, all of them or those named."""
+    from slam.sequences.catalogue import sequence_names
+
+    return [Drive(f"KITTI {name}", kitti, name, frames) for name in names or sequence_names(kitti)]
+
+
+def excerpts(drive: Drive, counts: Sequence[int]) -> list[Drive]:
+    """The first frames of a drive."""
+    return [Drive(f"{drive.name}, {n} frames", drive.root, frames=f"0:{n}", simulate=drive.simulate) for n in counts]
+
+
+def slug(text: str) -> str:
+    """A name for files and columns."""
+    return re.sub(r"[^\w.]+", "-", text).strip("-")

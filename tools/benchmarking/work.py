@@ -1,0 +1,172 @@
+"""Runs, each in a process of its own, one after another or through Dask, and what they leave."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarking import plan
+from benchmarking.plan import Drive, Job
+
+from slam.comparison import failure
+from slam.files import write_atomically
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = ("erfsfm", "slam", "configs")  # what decides the numbers
+
+Spread = Callable[[Callable[[Any], None], Sequence[Any]], Iterable[None]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job: ``metrics.json`` with a few numbers more, or the reason of its failure."""
+
+    job: Job
+    metrics: Mapping[str, Any]
+    commit: str
+    reason: str = ""
+
+
+def simulate(drive: Drive) -> None:
+    """Make a world where it is missing; what becomes of it is seen by looking for it."""
+    if not drive.root.exists():
+        subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)
+
+
+def perform(job: Job) -> None:
+    """Run a job and leave ``record.json`` in its place, unless the same job ended well before."""
+    identity = {"arguments": job.arguments, "sources": fingerprint(job.weights)}
+    kept = _read(job.place / "record.json")
+    if kept.get("identity") == identity and not _read_outcome(job, kept).reason:
+        return
+    shutil.rmtree(job.place, ignore_errors=True)
+    job.place.mkdir(parents=True)
+    if job.configuration.cache == "fill":
+        shutil.rmtree(job.cache, ignore_errors=True)
+    record = {"identity": identity, "commit": revision(), "load": os.getloadavg()[0]}
+    if job.configuration.cache == "full" and not job.cache.is_dir():
+        record["reason"] = f"there is no cache in {job.cache}"
+    else:
+        start = time.perf_counter()
+        finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
+        record |= {"seconds": time.perf_counter() - start, "reason": _reason(finished)}
+    write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
+
+
+def outcome(job: Job) -> Outcome:
+    """What a job left."""
+    return _read_outcome(job, _read(job.place / "record.json"))
+
+
+def _read_outcome(job: Job, record: Mapping[str, Any]) -> Outcome:
+    metrics = _read(job.place / "run" / "metrics.json")
+    reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was broken off")
+    commit = record.get("commit", "")
+    if reason:
+        return Outcome(job, {}, commit, reason)
+    timing, frames = metrics["timing"], metrics["sequence"]["frames"]
+    process = {
+        "seconds": record["seconds"],
+        "load": record["load"],
+        "ms_per_frame": 1e3 * timing["seconds_total"] / frames,
+        "cpu_ms_per_frame": 1e3 * timing["cpu_seconds"] / frames,
+    }
+    return Outcome(job, metrics | {"process": process}, commit)
+
+
+def _slam(*arguments: str) -> list[str]:
+    """``erfsfm-slam`` of this interpreter, whatever lies in the working directory."""
+    return [sys.executable, "-P", "-m", "slam", *arguments]
+
+
+def _reason(finished: subprocess.CompletedProcess[str]) -> str:
+    """Why a process failed, in one line; empty where it did not."""
+    if finished.returncode == 0:
+        return ""
+    if finished.returncode < 0:
+        return f"killed by {signal.Signals(-finished.returncode).name}"
+    return (finished.stderr.strip().splitlines() or [f"exit code {finished.returncode}"])[-1]
+
+
+def fingerprint(weights: str) -> str:
+    """Of sources and weights: what has another one is measured again."""
+    digest = hashlib.sha256()
+    for root in (*(ROOT / name for name in SOURCES), Path(weights)):
+        for path in sorted(root.rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def revision() -> str:
+    """The commit, with ``-dirty`` where sources were changed since; empty outside a checkout."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        return ""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True).stdout
+
+    changed = git("status", "--porcelain", "--", *SOURCES)
+    return git("rev-parse", "--short=12", "HEAD").strip() + ("-dirty" if changed else "")
+
+
+@contextmanager
+def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
+    """A way to do one thing to many: one after another, or through Dask."""
+    if count == 1 and scheduler is None:
+        yield map
+        return
+    try:
+        import cloudpickle
+        from dask.distributed import Client, as_completed
+    except ImportError as error:
+        raise SystemExit("--jobs and --scheduler want Dask: pip install 'erfsfm-slam[benchmark]'") from error
+    for module in (plan, sys.modules[__name__]):  # workers elsewhere do not have them
+        cloudpickle.register_pickle_by_value(module)
+    local: dict[str, Any] = {
+        "n_workers": count,
+        "threads_per_worker": 1,
+        "memory_limit": None,
+        "dashboard_address": None,
+    }
+    with Client(scheduler) if scheduler else Client(**local) as client:
+
+        def spread(work: Callable[[Any], None], items: Sequence[Any]) -> Iterator[None]:
+            for future in as_completed(client.map(work, items, pure=False)):
+                yield future.result()
+
+        yield spread
+
+
+def measured(jobs: Sequence[Job], spread: Spread) -> list[Outcome]:
+    """Make the worlds that are missing, run what was not run before.
+
+    Raises:
+        SystemExit: a world could not be made.
+    """
+    drives = {job.drive.root: job.drive for job in jobs if job.drive.simulate}
+    for _ in spread(simulate, list(drives.values())):
+        pass
+    missing = [drive.name for drive in drives.values() if not drive.root.is_dir()]
+    if missing:
+        raise SystemExit(f"could not be simulated: {', '.join(missing)}")
+    for done, _ in enumerate(spread(perform, jobs), 1):
+        print(f"{done} of {len(jobs)} runs", file=sys.stderr)
+    return [outcome(job) for job in jobs]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object; an empty one where there is no file."""
+    tree: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return tree

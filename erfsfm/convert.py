@@ -32,17 +32,8 @@ _FIRST_CHANNELS: dict[NetworkKind, int] = {"depth": 32, "pose": 16}  # of conv1 
 _MARK: dict[NetworkKind, str] = {"depth": "predict_disp1.0.weight", "pose": "pose_pred.weight"}
 _ENCODER = re.compile(r"conv(?P<stage>[1-7])\.(?P<place>\d+)\.(?P<rest>.+)")
 _DECODER = re.compile(r"(?P<block>upconv|iconv|predict_disp|predict_mask)(?P<level>[1-7])\.(?P<rest>.+)")
-# what a damaged or hostile file makes torch.load raise
-_UNREADABLE = (
-    pickle.UnpicklingError,
-    RuntimeError,
-    EOFError,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    IndexError,
-)
+# what a damaged file makes torch.load raise
+_DAMAGED = (RuntimeError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError)
 
 
 @dataclass(frozen=True)
@@ -158,7 +149,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
         raise CheckpointError(
             f"{path} is damaged, no checkpoint, or would execute code when read: refused; get it from its authors again"
         ) from error
-    except _UNREADABLE as error:
+    except _DAMAGED as error:
         raise CheckpointError(f"{path} is damaged or no checkpoint ({type(error).__name__}); copy it again") from error
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):

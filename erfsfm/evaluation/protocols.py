@@ -47,6 +47,8 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
     Raises:
         DataError: no true depth under the root, or a leak that was not allowed.
     """
+    if any(root.glob("????_??_??/*_sync")):
+        raise DataError(f"{root} holds KITTI raw drives: name their frames with --split eigen or --split FILE")
     recordings = [r for r in discover(root) if r.depth is not None]
     if not recordings:
         raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")

@@ -92,7 +92,7 @@ class SelfSupervision(lightning.LightningModule):
             for parameter in branch.parameters()
         ]
         slow = {id(parameter) for parameter in offsets}
-        groups = [
+        groups: list[dict[str, Any]] = [
             {"params": [p for p in self.parameters() if id(p) not in slow]},
             {"params": offsets, "lr": training.learning_rate * training.offset_rate},
         ]

@@ -6,6 +6,7 @@ import os
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from erfsfm.checkpoint import load_model
 from erfsfm.convert import convert, read_old
 from erfsfm.errors import CheckpointError
+from erfsfm.inference import DepthPosePredictor
 from erfsfm.networks.deformable import deform_conv2d
 
 QUARTER = 0.25
@@ -227,9 +229,13 @@ def test_one_network_alone(tmp_path: Path, depth_file: Path) -> None:
     convert([depth_file], tmp_path / "new")
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == ["depth.safetensors", "model.yaml"]
     model = load_model(tmp_path / "new")
-    model.depth_net(torch.zeros(1, 3, 64, 128))
     with pytest.raises(CheckpointError, match="holds no pose network"):
-        model.pose_net(torch.zeros(1, 3, 64, 128), [torch.zeros(1, 3, 64, 128)] * 4)
+        model.pose_net.state_dict()
+    predictor = DepthPosePredictor.from_weights(tmp_path / "new")
+    image = np.zeros((64, 128, 3), np.uint8)
+    assert predictor.depth(image).shape == (64, 128)
+    with pytest.raises(CheckpointError, match="holds no pose network"):
+        predictor.poses([image] * 5)
 
 
 class Malice:

@@ -192,8 +192,8 @@ def section(mode: str, command: str, outcomes: Sequence[Outcome], at_a_time: str
 
     {command}
 
-Commit {commits}; seeds {seeds}; {len(outcomes)} runs, {failed} failed; {at_a_time} at a time on {os.cpu_count()} cores
-({platform.machine()}).
+Commit {commits}; seeds {seeds}; {len(outcomes)} runs, {failed} failed; {at_a_time} at a time on
+{os.cpu_count()} {platform.machine()} cores.
 
 {TABLES[mode](outcomes)}
 """

@@ -15,6 +15,7 @@ from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import EIGEN_FILE, eigen_protocol, read_split
+from erfsfm.evaluation.protocols import depth_protocol
 from erfsfm.inference import DepthPosePredictor
 
 DRIVE = "2011_09_26_drive_0099"
@@ -117,6 +118,11 @@ def test_the_eigen_list(tmp_path: Path, write_drive: Write) -> None:
     lines = [f"2011_09_26_drive_{1000 + i % 28} {i}" for i in range(697)]
     (root / EIGEN_FILE).write_text("\n".join(lines))
     assert len(read_split("eigen", root)) == 697
+
+
+def test_raw_drives_want_a_split(tmp_path: Path, write_drive: Write) -> None:
+    with pytest.raises(DataError, match="name their frames with --split"):
+        depth_protocol(Oracle(), write_drive(tmp_path / "raw"), allow_leak=False)
 
 
 def test_splits_that_are_none(tmp_path: Path, write_drive: Write) -> None:

@@ -1,0 +1,300 @@
+"""The benchmark's plan, rows and tables without any run; then one real run, twice."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from slam.config import SlamConfig, load_config
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+@pytest.fixture(scope="module")
+def tools() -> Iterator[Callable[[str], ModuleType]]:
+    """Modules as ``python tools/benchmark.py`` finds them."""
+    sys.path.insert(0, str(TOOLS))
+    yield importlib.import_module
+    sys.path.remove(str(TOOLS))
+
+
+@pytest.fixture(scope="module")
+def benchmark(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmark")
+
+
+@pytest.fixture(scope="module")
+def plan(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.plan")
+
+
+@pytest.fixture(scope="module")
+def work(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.work")
+
+
+@pytest.fixture(scope="module")
+def page(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.page")
+
+
+@pytest.fixture(scope="module")
+def quantities(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.quantities")
+
+
+def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[str, Any]:
+    """What a run leaves, as far as the tables look."""
+    alignments = {how: {"ate_rmse_m": ate, "scale": 1.1, "r_rel_deg_per_100m": 0.5} for how in ("6dof", "7dof")}
+    return {
+        "status": "ok",
+        "provenance": {"leak": False},
+        "sequence": {"frames": 100, "length_m": 90.0},
+        "timing": {
+            "seconds_total": seconds,
+            "frames_per_second": 100 / seconds,
+            "cpu_seconds": 10.0,
+            "peak_rss_mb": 500.0,
+            "stages": stages,
+        },
+        "trajectories": {name: {"align": alignments} for name in ("network", "odometry", "optimised")},
+        "graph": {"coverage": {"95": 0.9}},
+        "loops": {"accepted": 3},
+        "map": {"completeness": None, "completeness_reason": "no map"},
+    }
+
+
+@pytest.fixture
+def job(plan: ModuleType, tmp_path: Path) -> Any:
+    drive = plan.Drive("loop 610", tmp_path / "world")
+    return plan.Job(tmp_path / "runs", drive, "sim", plan.EVERYTHING, 0)
+
+
+def outcomes_of(plan: ModuleType, work: ModuleType, job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
+    """Outcomes of configurations, one a seed."""
+    return [
+        work.Outcome(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
+        for name, values in ates.items()
+        for seed, ate in enumerate(values)
+    ]
+
+
+def cells(table: str) -> list[list[str]]:
+    """Rows of the first Markdown table, its head first."""
+    lines = [line for line in table.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_plan_has_every_combination_and_first_what_fills_the_cache(plan: ModuleType, tmp_path: Path) -> None:
+    drives = [plan.Drive(name, tmp_path) for name in ("a", "b")]
+    jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.words=20"])
+    assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
+    assert {job.configuration.name for job in jobs[:12]} == {plan.EVERYTHING.name}
+    assert len({job.cache for job in jobs}) == 4
+    assert all(job.arguments[-2:] == ["--set", "loops.words=20"] for job in jobs)
+
+
+def test_every_part_can_be_turned_off(plan: ModuleType) -> None:
+    default = load_config(None, plan.EVERYTHING.overrides)
+    for configuration in plan.ABLATION[1:]:
+        changed = load_config(None, configuration.overrides)
+        sections = [name for name in SlamConfig.model_fields if getattr(changed, name) != getattr(default, name)]
+        assert len(sections) == 1, configuration.name
+
+
+def test_excerpts_share_one_world(plan: ModuleType, tmp_path: Path) -> None:
+    (grid,) = plan.worlds(tmp_path, ["grid"], [610], 50)
+    first, second = plan.excerpts(grid, [20, 50])
+    assert first.root == second.root == grid.root
+    assert [first.frames, second.frames] == ["0:20", "0:50"]
+    assert grid.simulate == ("--route", "grid", "--seed", "610", "--frames", "50")
+
+
+def test_recordings_are_all_sequences_or_those_named(
+    plan: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slam.sequences.catalogue.sequence_names", lambda root: ["00", "09"])
+    assert [d.name for d in plan.recordings(tmp_path, [], None)] == ["KITTI 00", "KITTI 09"]
+    (only,) = plan.recordings(tmp_path, ["09"], "0:60")
+    assert (only.sequence, only.frames) == ("09", "0:60")
+
+
+def test_rows_hold_numbers_stages_and_reasons(quantities: ModuleType, work: ModuleType, job: Any) -> None:
+    ok = work.Outcome(job, metrics(0.25, graph=2.0), "abc")
+    failed = work.Outcome(replace(job, seed=1), {}, "abc", "no such weights")
+    first, second = quantities.rows([ok, failed])
+    assert (first["status"], first["ate_7dof_optimised_m"], first["seconds_graph"]) == ("ok", 0.25, 2.0)
+    assert (second["status"], second["reason"], second["ate_7dof_optimised_m"]) == ("failed", "no such weights", None)
+    assert list(first) == list(second)
+
+
+def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
+    page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
+) -> None:
+    outcomes = outcomes_of(plan, work, job, {"default": [1.0, 3.0]})
+    outcomes.append(work.Outcome(replace(job, seed=2), {}, "abc", "out of memory"))
+    text = page.accuracy_tables(outcomes)
+    head, row = cells(text)
+    assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
+    assert row[head.index("scale")] == "1.100"
+    assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
+
+
+def test_a_leak_is_told(page: ModuleType, work: ModuleType, job: Any) -> None:
+    assert "LEAK" not in page.accuracy_tables([work.Outcome(job, metrics(), "abc")])
+    leaky = metrics() | {"provenance": {"leak": True}}
+    assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.Outcome(job, leaky, "abc")])
+
+
+def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
+    outcomes = outcomes_of(plan, work, job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
+    text = page.ablation_tables(outcomes)
+    table = cells(text)
+    assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
+    assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
+    assert "– map completeness, loop 610: no map." in text
+
+
+def test_ablation_without_the_whole_has_no_ratio(
+    page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
+) -> None:
+    table = cells(page.ablation_tables(outcomes_of(plan, work, job, {"no loops": [4.0]})))
+    assert table[1][:2] == ["no loops", "–"]
+
+
+def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
+    asked = replace(job, configuration=plan.SPEED[0])
+    grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
+    outcomes = [
+        work.Outcome(asked, metrics(seconds=20.0, read=5.0, map=10.0), "abc"),
+        work.Outcome(grown, metrics(seconds=10.0, read=4.0), "abc"),
+    ]
+    table = cells(page.speed_tables(outcomes))
+    assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
+    assert ["loop 610", "sim", "networks asked", "25.0", "50.0", "25.0"] in table
+    assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
+    assert table[-1][-1] == "40.00"
+
+
+def test_a_section_takes_the_place_of_its_older_self(page: ModuleType) -> None:
+    text = page.with_section("", "## Speed\n\nold\n")
+    text = page.with_section(text, "## Accuracy\n\nnumbers\n")
+    text = page.with_section(text, "## Speed\n\nnew\n")
+    assert text.startswith(page.PAGE)
+    assert text.index("numbers") < text.index("new")
+    assert "old" not in text
+    assert text.count("## Speed") == 1
+
+
+def test_a_section_names_commit_and_seeds(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
+    outcomes = outcomes_of(plan, work, job, {"default": [1.0, 3.0]})
+    outcomes.append(work.Outcome(replace(job, seed=7), {}, "def", "why"))
+    text = page.section("accuracy", "the command", outcomes, "1")
+    assert "Commit abc, def; seeds 0, 1, 7; 3 runs, 1 failed" in text
+    assert "    the command\n" in text
+
+
+def test_no_cache_no_measurement_from_it(
+    plan: ModuleType, work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "fingerprint", lambda weights: "same")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("ran"))
+    monkeypatch.setattr(work, "revision", lambda: "abc")
+    from_cache = replace(job, configuration=plan.SPEED[2])
+    work.perform(from_cache)
+    assert work.outcome(from_cache).reason.startswith("there is no cache in ")
+
+
+def test_only_what_ended_well_with_the_same_sources_is_kept(
+    work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    codes = iter([-9, 0, 0, 0])
+    runs = []
+
+    def run(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        runs.append(words)
+        code = next(codes)
+        if code == 0:
+            (job.place / "run").mkdir()
+            (job.place / "run" / "metrics.json").write_text(json.dumps(metrics()))
+        return subprocess.CompletedProcess(words, code, "", "")
+
+    monkeypatch.setattr(work, "revision", lambda: "abc")
+    monkeypatch.setattr(work.subprocess, "run", run)
+    monkeypatch.setattr(work, "fingerprint", lambda weights: "first")
+    work.perform(job)
+    assert work.outcome(job).reason == "killed by SIGKILL"
+    work.perform(job)
+    work.perform(job)
+    assert (len(runs), work.outcome(job).reason) == (2, "")
+    work.perform(replace(job, device="cuda"))
+    assert len(runs) == 3
+    monkeypatch.setattr(work, "fingerprint", lambda weights: "second")
+    work.perform(replace(job, device="cuda"))
+    assert len(runs) == 4
+
+
+def test_the_fingerprint_sees_sources_and_weights(
+    work: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "ROOT", tmp_path)
+    for name in (*work.SOURCES, "weights"):
+        (tmp_path / name).mkdir()
+    seen = {work.fingerprint("default")}
+    (tmp_path / "slam" / "run.py").write_text("1")
+    seen.add(work.fingerprint("default"))
+    (tmp_path / "weights" / "model.safetensors").write_text("2")
+    seen.add(work.fingerprint(str(tmp_path / "weights")))
+    (tmp_path / "slam" / "__pycache__").mkdir()
+    (tmp_path / "slam" / "__pycache__" / "run.pyc").write_text("3")
+    seen.add(work.fingerprint(str(tmp_path / "weights")))
+    assert len(seen) == 3
+
+
+def test_parallel_runs_want_dask(work: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    with pytest.raises(SystemExit, match=r"erfsfm-slam\[benchmark\]"), work.workers(2, None):
+        pass
+
+
+def test_dask_does_everything_once(work: ModuleType, tmp_path: Path) -> None:
+    pytest.importorskip("dask.distributed")
+    places = [tmp_path / str(n) for n in range(4)]
+    with work.workers(2, None) as spread:
+        assert len(list(spread(Path.mkdir, places))) == 4  # a second time would raise
+    assert all(place.is_dir() for place in places)
+
+
+def test_nothing_to_measure_is_said(benchmark: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="nothing to measure"):
+        benchmark.main(["accuracy", "--routes", "--output", str(tmp_path)])
+
+
+def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) -> None:
+    words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
+    words += ["--weights", "sim", "nonesuch", "--set", "mapping.enabled=false", "--output", str(tmp_path / "out")]
+    report = tmp_path / "page.md"
+    benchmark.main([*words, "--report", str(report)])
+    with (tmp_path / "out" / "accuracy.csv").open() as file:
+        real, failed = csv.DictReader(file)
+    assert (real["status"], real["frames"], failed["status"]) == ("ok", "8", "failed")
+    assert 0 < float(real["ate_7dof_optimised_m"]) < 1
+    assert "nonesuch" in failed["reason"]
+    head, *rows = cells(report.read_text())
+    assert [row[head.index("frames")] for row in rows] == ["8", "–"]
+    assert str(tmp_path) not in report.read_text()
+
+    (record,) = (tmp_path / "out" / "accuracy").glob("*sim*/record.json")
+    before = record.stat().st_mtime_ns
+    benchmark.main([*words, "--report", str(report)])
+    assert record.stat().st_mtime_ns == before

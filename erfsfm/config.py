@@ -180,8 +180,11 @@ def find_config(name_or_path: str) -> Path:
         known |= {file.stem: file for file in sorted(folder.glob("*.yaml"))}
     if name_or_path in known:
         return known[name_or_path]
+    near = difflib.get_close_matches(name_or_path, known, n=3)
+    short = [name for name in sorted(known) if "-" not in name]  # not the rows of the paper's tables
     raise ConfigError(
-        f"no configuration '{name_or_path}': it is neither a file nor one of {', '.join(sorted(known)) or 'none'}"
+        f"no configuration '{name_or_path}': it is neither a file nor one of {', '.join(dict.fromkeys([*near, *short]))} "
+        f"({len(known)} in all, see configs/erfsfm)"
     )
 
 

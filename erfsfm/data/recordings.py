@@ -217,6 +217,11 @@ def _odometry_camera(calib: Path, row: str, image: Path) -> tuple[Camera, tuple[
     if not (P[0, 0] > 0 and P[1, 1] > 0):
         raise DataError(f"{calib}: the focal lengths in row '{row}' must be positive")
     height, width = image_size(image)
+    if not (width / 4 < P[0, 2] < 3 * width / 4 and height / 4 < P[1, 2] < 3 * height / 4):
+        raise DataError(
+            f"{calib}: the principal point ({P[0, 2]:g}, {P[1, 2]:g}) in row '{row}' is far from the middle of "
+            f"{image.name}, {width} x {height}: calibration and images are of different sizes"
+        )
     tx, ty, tz = np.linalg.solve(P[:, :3], P[:, 3])
     camera = Camera(width, height, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
     return camera, (float(tx), float(ty), float(tz))

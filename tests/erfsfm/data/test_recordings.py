@@ -242,6 +242,12 @@ def test_bad_calibration(tmp_path: Path, write_root: Callable[..., Path], line: 
     assert "P2" in refusal(tmp_path)
 
 
+def test_calibration_of_larger_images(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path)
+    (tmp_path / "sequences/00/calib.txt").write_text("P2: 718 0 607 45 0 718 185 0 0 0 1 0\n")
+    assert "of different sizes" in refusal(tmp_path)
+
+
 @pytest.mark.parametrize("damage", ["remove", "rename"])
 def test_gaps(tmp_path: Path, write_root: Callable[..., Path], damage: str) -> None:
     write_root(tmp_path)

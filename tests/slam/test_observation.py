@@ -96,9 +96,9 @@ def test_ten_frames_are_bridged_and_reported(damage: Damage, caplog: pytest.LogC
     bridges = [factor for factor in result.factors if factor.source == BRIDGE_SOURCE]
     assert [factor.from_index for factor in bridges] == list(range(24, 35))
     assert min(factor.sigmas[0] for factor in bridges) > 5 * np.deg2rad(0.3)
-    # nothing was measured on ten metres: an error of a metre there is an honest one
-    errors = trajectory_metrics(result.optimised, result.reference)["align"]["6dof"]
-    assert errors["ate_rmse_m"] < 1.0
+    # the gap is ten metres of seventy; standing still through it would cost more than a metre
+    errors = trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]
+    assert errors["ate_rmse_m"] < 0.6
     assert result.map is not None and not {k.index for k in seen.keyframes} & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
 

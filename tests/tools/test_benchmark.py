@@ -177,13 +177,14 @@ def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: Modul
     grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
     outcomes = [
         work.Outcome(asked, metrics(seconds=20.0, read=5.0, map=10.0), "abc"),
-        work.Outcome(grown, metrics(seconds=10.0, read=4.0), "abc"),
+        work.Outcome(grown, metrics(seconds=10.0, loops=1.0, read=4.0), "abc"),
     ]
     table = cells(page.speed_tables(outcomes))
     assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
     assert ["loop 610", "sim", "networks asked", "25.0", "50.0", "25.0"] in table
     assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
-    assert table[-1][-1] == "40.00"
+    assert (table[-2][-2:], table[-1][-2:]) == (["loops", "read"], ["10.00", "40.00"])
+    assert table[-1][table[-2].index("loops closed")] == "3"
 
 
 def test_a_section_takes_the_place_of_its_older_self(page: ModuleType) -> None:

@@ -32,7 +32,7 @@ from benchmarking.quantities import (
 )
 from benchmarking.work import Outcome
 
-from slam.comparison import MISSING, lookup, written
+from slam.comparison import MISSING, lookup
 
 Label = Callable[[Outcome], str]
 Cell = Callable[[Sequence[Outcome]], str]
@@ -117,13 +117,12 @@ def grouped(outcomes: Sequence[Outcome], *labels: Label) -> dict[tuple[str, ...]
 
 
 def over_seeds(quantity: Quantity) -> Cell:
-    """Mean and, where seeds differ, sample standard deviation."""
+    """Mean and, where it is more than nothing, sample standard deviation."""
 
     def cell(group: Sequence[Outcome]) -> str:
         values = _values(group, *quantity.path)
-        deviation = stdev(values) if len(set(values)) > 1 else 0.0
-        spread = f" ± {written(deviation, quantity.decimals)}" if deviation else ""
-        return _mean(values, quantity.decimals) + spread
+        deviation = round(stdev(values), quantity.decimals) if len(values) > 1 else 0.0
+        return _mean(values, quantity.decimals) + (f" ± {deviation:.{quantity.decimals}f}" if deviation else "")
 
     return cell
 
@@ -225,7 +224,7 @@ def _values(outcomes: Sequence[Outcome], *path: str) -> list[float]:
 
 
 def _mean(values: Sequence[float], decimals: int) -> str:
-    return written(fmean(values), decimals) if values else MISSING
+    return f"{fmean(values):.{decimals}f}" if values else MISSING
 
 
 def _stage(o: Outcome, stage: str) -> float:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,12 +139,13 @@ def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
         "n_workers": count,
         "threads_per_worker": 1,
         "memory_limit": None,
-        "dashboard_address": None,
+        "dashboard_address": ":0",
     }
     with Client(scheduler) if scheduler else Client(**local) as client:
 
         def spread(work: Callable[[Any], None], items: Sequence[Any]) -> Iterator[None]:
-            for future in as_completed(client.map(work, items, pure=False)):
+            packed = [cloudpickle.dumps(partial(work, item)) for item in items]
+            for future in as_completed(client.map(lambda task: cloudpickle.loads(task)(), packed, pure=False)):
                 yield future.result()
 
         yield spread

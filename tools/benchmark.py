@@ -72,7 +72,7 @@ def _command(options: argparse.Namespace) -> str:
     words += ["--kitti", "KITTI"] if options.kitti else []
     for name in ("weights", "routes", "worlds", "frames", "sequences", "excerpt", "seeds", "growth", "device", "set"):
         value = getattr(options, name, None)
-        if value not in (None, []):
+        if value not in (None, ()):
             words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
     return shlex.join(words)
 
@@ -90,14 +90,14 @@ def _parser() -> argparse.ArgumentParser:
         ).add_argument
         fast = mode == "speed"
         add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
-        add("--sequences", nargs="+", default=[], metavar="NAME", help="of that root; all of them without it")
+        add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
         add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
         add("--routes", nargs="*", default=["loop"] if fast else ["loop", "straight"], help="of simulated worlds")
         add("--worlds", nargs="+", type=int, default=[610, 611] if mode == "accuracy" else [610], help="their seeds")
         add("--frames", type=int, default=300, help="their length")
         add("--weights", nargs="+", default=["default"] if fast else ["default", "sim"], help="names or folders")
         add("--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the runs")
-        add("--set", nargs="+", default=[], metavar="KEY=VALUE", help="changes to every configuration")
+        add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")

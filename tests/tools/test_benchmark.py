@@ -70,7 +70,7 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[st
         "trajectories": {name: {"align": alignments} for name in ("network", "odometry", "optimised")},
         "graph": {"coverage": {"95": 0.9}},
         "loops": {"accepted": 3},
-        "map": {"completeness": None, "completeness_reason": "no map"},
+        "map": {"triangles": None, "triangles_reason": "no map"},
     }
 
 
@@ -162,7 +162,7 @@ def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType
     table = cells(text)
     assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
     assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
-    assert "– map completeness, loop 610: no map." in text
+    assert "– map triangles, loop 610: no map." in text
 
 
 def test_ablation_without_the_whole_has_no_ratio(
@@ -279,6 +279,15 @@ def test_dask_does_everything_once(work: ModuleType, tmp_path: Path) -> None:
 def test_nothing_to_measure_is_said(benchmark: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="nothing to measure"):
         benchmark.main(["accuracy", "--routes", "--output", str(tmp_path)])
+
+
+def test_the_command_is_told_whole_but_without_paths_and_hosts(benchmark: ModuleType) -> None:
+    words = ["accuracy", "--routes", "--kitti", "/data/k", "--excerpt", "0:9", "--scheduler", "tcp://host:1"]
+    command = benchmark._command(benchmark._parser().parse_args(words))
+    assert command.startswith(
+        "python tools/benchmark.py accuracy --kitti KITTI --weights default sim --routes --worlds"
+    )
+    assert command.endswith("--excerpt 0:9 --seeds 0 1 2 --device cpu")
 
 
 def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from benchmarking.quantities import (
     ATE_6,
     ATE_7,
     COMMAND,
-    COMPLETENESS,
     COVERAGE,
     CPU,
     ERRORS,
@@ -27,6 +26,7 @@ from benchmarking.quantities import (
     RATE,
     SCALE,
     TIME,
+    TRIANGLES,
     Quantity,
     stages,
 )
@@ -55,7 +55,7 @@ def accuracy_tables(outcomes: Sequence[Outcome]) -> str:
 
 def ablation_tables(outcomes: Sequence[Outcome]) -> str:
     """What each part brings: errors over those of everything on, then the errors themselves."""
-    errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, COMPLETENESS, MEMORY)
+    errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, TRIANGLES, MEMORY)
     columns = {f"{q.title}: ratio (worst)": against_everything(q, outcomes) for q in errors}
     columns |= {q.title: average(q) for q in others}
     drives = grouped(outcomes, _drive, _weights)

@@ -29,6 +29,7 @@ class Configuration:
     cache: Literal["none", "keep", "fill", "full"] = "none"
 
 
+_UNINFORMATIVE = 100.0  # sigma of a logarithm: nothing is learned from the measurement
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
@@ -40,6 +41,8 @@ ABLATION = (
             "no loops": "loops.enabled=false",
             "no image geometry": "geometry.enabled=false",
             "no lengths from the road's motion": "road.enabled=false",
+            "no lengths from learned depth": f"lengths.learned_sigma={_UNINFORMATIVE}",
+            "no ratios of neighbouring steps": f"lengths.ratio_sigma={_UNINFORMATIVE}",
             "no bridging": "bridging.enabled=false",
             "no robust noise": "pose_graph.kernel=none",
             "no fusion": "mapping.enabled=false",

@@ -37,7 +37,7 @@ R_REL = Quantity("r_rel_deg_per_100m", "r_rel (deg / 100 m)", (*_ALIGNED, "r_rel
 SCALE = Quantity("scale", "scale", (*_ALIGNED, "scale"), 3)
 LOOPS = Quantity("loops_accepted", "loops closed", ("loops", "accepted"), 0)
 COVERAGE = Quantity("coverage_95", "coverage of 95 %", ("graph", "coverage", "95"), 2)
-COMPLETENESS = Quantity("map_completeness", "map completeness", ("map", "completeness"), 2)
+TRIANGLES = Quantity("map_triangles", "map triangles", ("map", "triangles"), 0)
 RATE = Quantity("frames_per_second", "frames / s", ("timing", "frames_per_second"), 1)
 MEMORY = Quantity("peak_rss_mb", "peak RSS (MiB)", ("timing", "peak_rss_mb"), 0)
 SECONDS = Quantity("seconds_total", "seconds", ("timing", "seconds_total"), 1)
@@ -45,7 +45,7 @@ COMMAND = Quantity("command_seconds", "whole command (s)", ("process", "seconds"
 LOAD = Quantity("load_average", "load before", ("process", "load"), 1)
 TIME = Quantity("ms_per_frame", "ms / frame", ("process", "ms_per_frame"), 1)
 CPU = Quantity("cpu_ms_per_frame", "CPU ms / frame", ("process", "cpu_ms_per_frame"), 1)
-QUANTITIES = (FRAMES, LENGTH, *ERRORS, R_REL, SCALE, LOOPS, COVERAGE, COMPLETENESS)
+QUANTITIES = (FRAMES, LENGTH, *ERRORS, R_REL, SCALE, LOOPS, COVERAGE, TRIANGLES)
 QUANTITIES += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)
 
 

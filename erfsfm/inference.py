@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -45,6 +46,8 @@ class DepthPosePredictor:
         self.sources: int = model.record.network.sources
         self._depth_net = model.depth_net.eval().to(self.device)
         self._pose_net = model.pose_net.eval().to(self.device)
+        # an image of a sequence is asked for its depth and again in every snippet: image, its bytes then, tensor
+        self._inputs: deque[tuple[NDArray[np.uint8], NDArray[np.uint8], Tensor]] = deque(maxlen=self.sources + 1)
 
     @classmethod
     def from_weights(cls, name_or_dir: str | Path, device: str = "cpu") -> DepthPosePredictor:
@@ -105,9 +108,14 @@ class DepthPosePredictor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
-        image = resize_image(image, self.record.network.height, self.record.network.width)
-        tensor = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
-        return tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
+        for known, content, tensor in self._inputs:
+            if known is image and np.array_equal(content, image):
+                return tensor
+        resized = resize_image(image, self.record.network.height, self.record.network.width)
+        tensor = torch.from_numpy(np.ascontiguousarray(resized)).to(self.device)
+        tensor = tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
+        self._inputs.append((image, image.copy(), tensor))
+        return tensor
 
 
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

@@ -51,6 +51,8 @@ class GeometryConfig(Section):
     corner_quality: float = Field(default=0.003, gt=0, lt=1, description="share of the best corner's strength")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners")
     window_px: int = Field(default=11, ge=5, le=63, description="side of the tracking window")
+    wide_window_px: int = Field(default=21, ge=5, le=63, description="its side where few corners could be followed")
+    few_corners: int = Field(default=60, ge=0, description="fewer are few: they are sought again, exposure made alike")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
@@ -62,9 +64,12 @@ class GeometryConfig(Section):
     )
     min_point_parallax_px: float = Field(default=2.0, gt=0, description="least parallax of a point measuring length")
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
-    rotation_floor_deg: float = Field(default=0.03, gt=0, description="least rotation sigma")
-    direction_floor_deg: float = Field(default=0.6, gt=0, description="least sigma of the translation's direction")
-    length_floor_share: float = Field(default=0.015, gt=0, description="least sigma of the translation's length")
+    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma")
+    direction_floor_deg: float = Field(default=0.3, gt=0, description="least sigma of the translation's direction")
+    length_floor_share: float = Field(default=0.005, gt=0, description="least sigma of the translation's length")
+    shake_rotation_share: float = Field(default=0.7, ge=0, description="rotation sigma, share of the camera's shake")
+    shake_direction_share: float = Field(default=6.0, ge=0, description="sigma of the direction, likewise")
+    length_spread_share: float = Field(default=0.6, ge=0, description="sigma of a length, share of the road's spread")
 
 
 class RoadConfig(Section):

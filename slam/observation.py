@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 
@@ -23,6 +25,8 @@ from slam.loops.descriptors import FeatureExtractor, View
 from slam.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,11 @@ def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
 
 
 class Observer:
-    """Watches the frames of one sequence in time order."""
+    """Watches the frames of one sequence in time order.
+
+    The networks compute in a second thread while corners and road are measured in the first; a frame is finished
+    before the next begins, so that results do not depend on which of them is faster.
+    """
 
     def __init__(
         self,
@@ -97,8 +105,9 @@ class Observer:
         self._features = FeatureExtractor(config.loops, intrinsics)
         self._steps = config.geometry.steps if config.geometry.enabled else ()
         self._window: deque[Frame] = deque(maxlen=predictor.sources + 1)
-        self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=0) + 1)
+        self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=1))
         self._unread = 0
+        self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks")
 
     def add(self, index: int, frame: Frame | SequenceError) -> None:
         """Watch the next frame, or learn that there is no image of it.
@@ -157,30 +166,41 @@ class Observer:
 
     def _observe(self, frame: Frame) -> None:
         seen = self.seen
-        with self._watch.stage("depth network"):
-            depth = self._predictor.depth(frame)
+        self._window.append(frame)
+        asked_depth = self._ask("depth network", lambda: self._predictor.depth(frame))
+        asked_snippet = None
+        if len(self._window) == self._window.maxlen:
+            asked_snippet = self._ask("pose network", lambda: self._predictor.snippet(list(self._window)))
+        with self._watch.stage("geometry"):
+            self._measure_geometry(frame)
+        depth = asked_depth.result()
         with self._watch.stage("road"):
             road = fit_road(depth, self._intrinsics, self._config.scale)
         seen.roads.append(road)
-        self._window.append(frame)
-        if len(self._window) == self._window.maxlen:
-            with self._watch.stage("pose network"):
-                seen.snippets.append(self._predictor.snippet(list(self._window)))
         height = road.height_unscaled if isinstance(road, RoadPlane) else None
         self._recent.append((frame, depth, height))
-        with self._watch.stage("geometry"):
-            self._measure_geometry()
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
             with self._watch.stage("loops"):
                 seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
+        if asked_snippet is not None:
+            seen.snippets.append(asked_snippet.result())
 
-    def _measure_geometry(self) -> None:
-        current = self._recent[-1][0]
+    def _ask(self, stage: str, question: Callable[[], _T]) -> Future[_T]:
+        """The answer of the networks, on its way; they answer one question after the other."""
+
+        def answer() -> _T:
+            with self._watch.stage(stage):
+                return question()
+
+        return self._networks.submit(answer)
+
+    def _measure_geometry(self, current: Frame) -> None:
+        """Steps from earlier frames, by the depth of the earlier one."""
         for step in self._steps:
-            if len(self._recent) <= step:
+            if len(self._recent) < step:
                 continue
-            previous, depth_previous, height = self._recent[-1 - step]
+            previous, depth_previous, height = self._recent[-step]
             measured = self._geometry.measure(previous, current, depth_previous, height)
             if isinstance(measured, Refusal):
                 self.seen.refusals.append((previous.index, current.index, measured.reason))

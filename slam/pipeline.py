@@ -12,6 +12,7 @@ from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
 from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.drive_noise import DriveNoise, drive_noise
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.frontend.metric_scale import LengthMeasurements, Scale, find_scale
 from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors, without_measured
@@ -192,7 +193,9 @@ class SlamPipeline:
 
     def _measure(self, seen: Observations, lidar: LidarPath | None, scale: Scale) -> list[RelativePose]:
         """All relative poses with their noise, in the mode's unit."""
-        geometric = [self._with_length(g, seen, scale) for g in seen.geometric]
+        by_corners = {step: m.relative_pose.T_from_to for step, m in seen.motions.items()}
+        drive = drive_noise(by_corners, scale.length_spread, self._config.geometry)
+        geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
         noise = measured_noise(seen.trusted, seen.geometric, self._config.frontend)
         networks = network_factors(seen.trusted, noise)
         if self._config.frontend.use == "bridge":
@@ -203,12 +206,11 @@ class SlamPipeline:
             factors += lidar_steps(lidar, self._config.lidar)
         return factors + geometric
 
-    def _with_length(self, measured: RelativePose, seen: Observations, scale: Scale) -> RelativePose:
+    def _with_length(self, measured: RelativePose, seen: Observations, scale: Scale, drive: DriveNoise) -> RelativePose:
         """A geometric measurement with its step's length, or by learned depth where the step has none."""
         step = measured.from_index
         if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
-            share = self._config.geometry.length_floor_share
-            return seen.motions[step].with_length(float(scale.lengths[step]), share)
+            return seen.motions[step].with_length(float(scale.lengths[step]), drive)
         return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

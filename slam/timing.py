@@ -20,7 +20,10 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a stage; a stage may be entered many times."""
+        """Add the time of the block to a stage; a stage may be entered many times, by one thread each.
+
+        Stages of different threads overlap, so that their sum may exceed the whole.
+        """
         start = time.perf_counter()
         try:
             yield

@@ -152,9 +152,9 @@ def _sampson(
     gradient = np.sqrt((lines_current[:, :2] ** 2).sum(axis=1) + (lines_previous[:, :2] ** 2).sum(axis=1))
     gradient = np.maximum(gradient, 1e-9)
     axis = np.eye(3)[np.abs(direction).argmin()]
-    first = np.cross(direction, axis)
+    first = _cross(direction, axis)
     first = first / np.linalg.norm(first)
-    tangent = np.stack([first, np.cross(direction, first)], axis=1)
+    tangent = np.stack([first, _cross(direction, first)], axis=1)
     by_rotation = _cross(turned, across)
     by_direction = _cross(turned, rays_current) @ tangent
     jacobian = np.concatenate([by_rotation, by_direction], axis=1) / gradient[:, None]

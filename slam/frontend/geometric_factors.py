@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
+from slam.frontend.drive_noise import DriveNoise
 from slam.frontend.epipolar import (
     Structure,
     TwoView,
@@ -49,14 +50,16 @@ class Motion:
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
 
-    def with_length(self, length: float, sigma_share: float) -> RelativePose:
-        """The same rotation and direction with a length from elsewhere and its relative sigma."""
+    def with_length(self, length: float, noise: DriveNoise) -> RelativePose:
+        """The same rotation and direction with a length from elsewhere, and the noise that this drive showed."""
         if self.direction_sigmas is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
-        rotation_sigmas = self.relative_pose.sigmas[:3]
-        sigmas = _sigmas(T_previous_current, rotation_sigmas, self.direction_sigmas, sigma_share)
+        rotation = np.hypot(self.relative_pose.sigmas[:3], noise.rotation)
+        along = invert(T_previous_current)[:3, 3] / length
+        direction = np.hypot(self.direction_sigmas, noise.direction * np.sqrt(np.maximum(1.0 - along**2, 0.0)))
+        sigmas = _sigmas(T_previous_current, rotation, direction, noise.length)
         return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas)
 
 

@@ -43,12 +43,12 @@ class CornerTracker:
         if first.corners is None:
             self._fill(first, _no_corners())
         assert first.corners is not None
-        forward, found = self._flow(first, second, first.corners.pixels)
-        backward, found_back = self._flow(second, first, forward)
-        error = np.abs(backward - first.corners.pixels).max(axis=1, initial=0.0)
-        height, width = second.grey.shape
-        inside = (forward >= 0).all(axis=1) & (forward <= [width - 1, height - 1]).all(axis=1)
-        kept = found & found_back & inside & (error < self._config.forward_backward_px)
+        forward, kept = self._follow(first, second, first.corners.pixels, self._config.window_px)
+        if kept.sum() < self._config.few_corners:
+            alike = _Seen(second.image, _exposed_like(second.grey, first.grey))
+            wider, kept_wider = self._follow(first, alike, first.corners.pixels, self._config.wide_window_px)
+            if kept_wider.sum() > kept.sum():
+                forward, kept = wider, kept_wider
         names = first.corners.names[kept]
         if second.corners is None:
             self._fill(second, _Corners(forward[kept], names))
@@ -82,12 +82,22 @@ class CornerTracker:
             self._named += len(fresh)
         seen.corners = _Corners(pixels, names)
 
+    def _follow(
+        self, first: _Seen, second: _Seen, points: NDArray[np.float32], side: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Where points ``(M, 2)`` went, and which of them can be believed: those that come back to where they were."""
+        forward, found = self._flow(first, second, points, side)
+        backward, found_back = self._flow(second, first, forward, side)
+        error = np.abs(backward - points).max(axis=1, initial=0.0)
+        height, width = second.grey.shape
+        inside = (forward >= 0).all(axis=1) & (forward <= [width - 1, height - 1]).all(axis=1)
+        return forward, found & found_back & inside & (error < self._config.forward_backward_px)
+
     def _flow(
-        self, first: _Seen, second: _Seen, points: NDArray[np.float32]
+        self, first: _Seen, second: _Seen, points: NDArray[np.float32], side: int
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         if len(points) == 0:
             return points, np.zeros(0, dtype=bool)
-        side = self._config.window_px
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
             first.grey,
             second.grey,
@@ -104,6 +114,13 @@ class CornerTracker:
 class _Corners:
     pixels: NDArray[np.float32]
     names: NDArray[np.int64]
+
+
+def _exposed_like(grey: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image ``(H, W)`` with the grey levels of another: each level takes that of the same rank."""
+    ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
+    levels = np.interp(ranks, ranks_other, np.arange(256.0))
+    return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))
 
 
 def _no_corners() -> _Corners:

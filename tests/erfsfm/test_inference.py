@@ -69,6 +69,14 @@ def echo(sources: int = 4) -> tuple[DepthPosePredictor, Echo]:
     return DepthPosePredictor(Model(model(sources).record, net, net)), net
 
 
+def test_a_buffer_that_is_filled_anew_is_a_new_image(predictor: DepthPosePredictor) -> None:
+    buffer, second = image(), image()
+    first_depth = predictor.depth(buffer)
+    buffer[:] = second
+    np.testing.assert_array_equal(predictor.depth(buffer), predictor.depth(second))
+    assert np.abs(predictor.depth(buffer) - first_depth).max() > 0
+
+
 def test_networks_see_rgb_from_minus_one_to_one() -> None:
     predictor, net = echo()
     red = np.zeros((32, 64, 3), np.uint8)

@@ -50,3 +50,12 @@ def test_two_trackers_agree(frames):
     one, other = (CornerTracker(CONFIG).track(frames[0], frames[2]) for _ in range(2))
     np.testing.assert_array_equal(one.current, other.current)
     np.testing.assert_array_equal(one.names, other.names)
+
+
+def test_few_corners_are_sought_again_under_another_exposure(frames):
+    dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
+    once = CornerTracker(CONFIG.model_copy(update={"few_corners": 0})).track(frames[0], dark)
+    again = CornerTracker(CONFIG.model_copy(update={"few_corners": 1000})).track(frames[0], dark)
+    assert len(again.names) > max(2 * len(once.names), 40)
+    error = np.abs(again.previous - again.current - [SHIFT_PX, 0]).max(axis=1)
+    assert np.median(error) < 0.1

@@ -182,8 +182,9 @@ def find_config(name_or_path: str) -> Path:
         return known[name_or_path]
     near = difflib.get_close_matches(name_or_path, known, n=3)
     short = [name for name in sorted(known) if "-" not in name]  # not the rows of the paper's tables
+    offered = ", ".join(dict.fromkeys([*near, *short]))
     raise ConfigError(
-        f"no configuration '{name_or_path}': it is neither a file nor one of {', '.join(dict.fromkeys([*near, *short]))} "
+        f"no configuration '{name_or_path}': it is neither a file nor one of {offered} "
         f"({len(known)} in all, see configs/erfsfm)"
     )
 

@@ -27,7 +27,7 @@ CARD = """# Weights `{name}`
 | commit | {commit} |
 | licence | {licence} |
 
-Trained without labels, from images and intrinsics alone. Depth and poses share one scale, about ten camera heights a unit.
+Trained without labels, from images and intrinsics alone. Depth and poses share one unit, about ten camera heights.
 {note}
 
 Measured (`{evaluation}`):

@@ -327,6 +327,4 @@ def _save(figure: Figure, output: Path) -> None:
     """Write beside the target and move into place; without a date, so that alike figures are alike files."""
     kind = output.suffix.lower().removeprefix(".")
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
-    write_atomically(
-        output, lambda path: figure.savefig(path, format=kind, dpi=200, metadata=undated), RunError
-    )
+    write_atomically(output, lambda path: figure.savefig(path, format=kind, dpi=200, metadata=undated), RunError)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import cv2
 
@@ -25,8 +24,6 @@ from slam.loops.descriptors import FeatureExtractor, View
 from slam.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -167,13 +164,14 @@ class Observer:
     def _observe(self, frame: Frame) -> None:
         seen = self.seen
         self._window.append(frame)
-        asked_depth = self._ask("depth network", lambda: self._predictor.depth(frame))
+        asked_depth = self._networks.submit(lambda: self._predictor.depth(frame))
         asked_snippet = None
         if len(self._window) == self._window.maxlen:
-            asked_snippet = self._ask("pose network", lambda: self._predictor.snippet(list(self._window)))
+            asked_snippet = self._networks.submit(lambda: self._predictor.snippet(list(self._window)))
         with self._watch.stage("geometry"):
             self._measure_geometry(frame)
-        depth = asked_depth.result()
+        with self._watch.stage("depth network"):
+            depth = asked_depth.result()
         with self._watch.stage("road"):
             road = fit_road(depth, self._intrinsics, self._config.scale)
         seen.roads.append(road)
@@ -184,16 +182,8 @@ class Observer:
                 seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
         if asked_snippet is not None:
-            seen.snippets.append(asked_snippet.result())
-
-    def _ask(self, stage: str, question: Callable[[], _T]) -> Future[_T]:
-        """The answer of the networks, on its way; they answer one question after the other."""
-
-        def answer() -> _T:
-            with self._watch.stage(stage):
-                return question()
-
-        return self._networks.submit(answer)
+            with self._watch.stage("pose network"):
+                seen.snippets.append(asked_snippet.result())
 
     def _measure_geometry(self, current: Frame) -> None:
         """Steps from earlier frames, by the depth of the earlier one."""

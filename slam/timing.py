@@ -20,9 +20,10 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Add the time of the block to a stage; a stage may be entered many times, by one thread each.
+        """Add the time of the block to a stage; a stage may be entered many times.
 
-        Stages of different threads overlap, so that their sum may exceed the whole.
+        Only the thread that waits for all others keeps stages, so that they add up: work beside another stage counts
+        for as long as it is waited for.
         """
         start = time.perf_counter()
         try:

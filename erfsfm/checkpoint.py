@@ -7,11 +7,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import subprocess
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +22,7 @@ from torch import nn
 
 from erfsfm.config import NetworkConfig, Section, dump_yaml
 from erfsfm.errors import CheckpointError, ConfigError
+from erfsfm.files import write_atomically
 from erfsfm.networks.presets import PRESETS, NetworkKind, build
 
 FORMAT: Literal[1] = 1
@@ -89,23 +87,14 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
     """
     _require_kind("depth", config.depth)
     _require_kind("pose", config.pose)
-    depth_net = build(
-        config.depth,
-        config.fidelity,
-        config.depth_width,
-        normalisation=config.normalisation,
-        activation=config.activation,
-    )
-    pose_net = build(
-        config.pose,
-        config.fidelity,
-        config.pose_width,
-        sources=config.sources,
-        normalisation=config.normalisation,
-        mask_branch=config.masks,
-        activation=config.activation,
-    )
-    return depth_net, pose_net
+
+    def built(name: str, width: float) -> nn.Module:
+        # a depth network has no sources and no mask branch
+        return build(
+            name, config.fidelity, width, config.sources, config.normalisation, config.masks, config.activation
+        )
+
+    return built(config.depth, config.depth_width), built(config.pose, config.pose_width)
 
 
 def _require_kind(kind: NetworkKind, name: str) -> None:
@@ -244,17 +233,3 @@ def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
     return tensors
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a file beside ``path``, then put it in place at once."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    try:
-        write(Path(temporary))
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)

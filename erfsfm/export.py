@@ -17,9 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from erfsfm.checkpoint import Absent, Model, write_atomically
+from erfsfm.checkpoint import Absent, Model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import ExportError
+from erfsfm.files import write_atomically
 from erfsfm.networks.presets import NetworkKind
 
 OPSET = 17

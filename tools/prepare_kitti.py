@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from erfsfm.checkpoint import write_atomically
 from erfsfm.data.recordings import image_files, image_size, resize_image
 from erfsfm.errors import DataError, ErfsfmError
+from erfsfm.files import write_atomically
 
 MARK = "prepared.json"
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")

@@ -20,10 +20,11 @@ import cv2
 import numpy as np
 import torch
 
-from erfsfm.checkpoint import commit, write_atomically
+from erfsfm.checkpoint import commit
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.recordings import discover
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
+from erfsfm.files import write_atomically
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.networks.presets import describe
 from erfsfm.training.run import train

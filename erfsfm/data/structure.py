@@ -7,7 +7,6 @@ sure, the depths averaged, and everything is put in heights of the camera over t
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from erfsfm.data.road import camera_height
 from erfsfm.data.two_view import TwoView, rays, two_view
+from erfsfm.files import write_atomically
 
 VERSION = 2
 SURE = 5.0  # inverse depth over its sigma
@@ -113,10 +113,12 @@ def _read(path: Path) -> Structure | None:
 
 
 def _write(path: Path, structure: Structure) -> None:
+    def fill(part: Path) -> None:
+        with part.open("wb") as file:  # given a path, savez would end its name in .npz
+            np.savez(file, T_source_target=structure.T_source_target, least=structure.least, most=structure.most)
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
-        np.savez(part, T_source_target=structure.T_source_target, least=structure.least, most=structure.most)
-    Path(part.name).replace(path)
+    write_atomically(path, fill)
 
 
 def _relative_lengths(views: Sequence[TwoView | None]) -> list[float]:

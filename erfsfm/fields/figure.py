@@ -13,8 +13,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from erfsfm.checkpoint import write_atomically
 from erfsfm.fields.survey import HELD, FieldRow
+from erfsfm.files import write_atomically
 
 _WIDTH_IN = 12.0
 _DIM = 0.3  # brightness of pixels that are never read

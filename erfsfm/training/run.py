@@ -25,12 +25,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import erfsfm
-from erfsfm.checkpoint import Model, ModelRecord, commit, load_model, read_record, save_model, write_atomically
+from erfsfm.checkpoint import Model, ModelRecord, commit, load_model, read_record, save_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError, TrainingError
+from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.progress import ProgressLine

@@ -20,10 +20,10 @@ from erfsfm.checkpoint import (
     load_model,
     save_model,
     weights_sha256,
-    write_atomically,
 )
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import CheckpointError
+from erfsfm.files import write_atomically
 
 FILES = ("depth.safetensors", "pose.safetensors")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,16 +15,21 @@ LEAST_SHARE = 0.25  # of the points looked at
 LEAST_UPRIGHT = 0.95  # cosine between the road's normal and the image's down
 ROWS = (0.62, 0.9)  # part of the image that a road fills and where it does not rush by
 COLUMNS = (0.3, 0.7)
+AROUND = (0.3, 0.1)  # of the image's height and width, in which a pixel's neighbours lie
+LEAST_AROUND = 0.1  # share of them that is known
+LEAST_AGREEING = 0.7  # share of the known ones that lies on the road
+NEAR = 0.2  # of the depth, within which a pixel may lie on the road: single ones are noisy
 
 
-def camera_height(
+def road_plane(
     inverse_depth: Array, known: NDArray[np.bool_], rays: Array, forward: NDArray[np.float64]
-) -> float | None:
-    """Height of the camera over the road, in the unit that the inverse depth is one over.
+) -> NDArray[np.float64] | None:
+    """The road as the plane ``m . X = 1``, ``(3,)``, in the unit that the inverse depth is one over.
 
-    A plane ``m . X = 1`` that contains the direction of travel is found by random sampling among the points in the
-    lower middle of the image and refined by least squares; ``1 / |m|`` is its distance. Without that direction the
-    few rows of a road leave its slope, and with it the height, all too free.
+    The plane contains the direction of travel; it is found by random sampling among the points in the lower middle
+    of the image and refined by least squares. The camera is ``1 / |m|`` above it, and a ray p meets it at the inverse
+    depth ``m . p``. Without that direction the few rows of a road leave its slope, and with it the height, all too
+    free.
 
     Args:
         inverse_depth: ``(H, W)``.
@@ -62,4 +68,20 @@ def camera_height(
         if len(on_plane) < max(LEAST_POINTS, LEAST_SHARE * len(flat)):
             return None
         line = np.linalg.lstsq(on_plane, np.ones(len(on_plane)), rcond=None)[0]
-    return float(1 / np.linalg.norm(line))
+    return np.asarray(line[0] * across + line[1] * down)
+
+
+def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDArray[np.bool_]:
+    """Where the road is, also where nothing was measured: nearly all that is known around lies on it, ``(H, W)``.
+
+    Args:
+        inverse_depth: ``(H, W)``.
+        known: where it may be used, ``(H, W)``.
+        road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
+    """
+    height, width = inverse_depth.shape
+    window = (2 * int(AROUND[1] * width / 2) + 1, 2 * int(AROUND[0] * height / 2) + 1)
+    agreeing = known & (np.abs(inverse_depth - road) < NEAR * road)
+    share = [cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT) for mask in (known, agreeing)]
+    level = (road > 0) & (share[0] > LEAST_AROUND) & (share[1] > LEAST_AGREEING * share[0])
+    return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.data.road import camera_height
+from erfsfm.data.road import TOLERANCE, on_road, road_plane
 from erfsfm.data.two_view import TwoView, rays, two_view
 from erfsfm.files import write_atomically
 
-VERSION = 2
+VERSION = 3
 SURE = 5.0  # inverse depth over its sigma
 OUTLIER = 3.0  # sigmas from the average
 LEAST_SHARED = 100  # pixels
@@ -55,15 +55,19 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
             T[:3, 3] *= length
     inverse_depth, sigma = _average(views, lengths, grey[middle].shape)
     forward = _forward(T_source_target)
-    height = None
-    if forward is not None:
-        p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
-        height = camera_height(inverse_depth, inverse_depth > SURE * sigma, p, forward)
-    if height is None:
+    sure = inverse_depth > SURE * sigma
+    p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
+    plane = None if forward is None else road_plane(inverse_depth, sure, p, forward)
+    height = 1.0
+    if plane is None:
         sigma[:] = np.inf
         moved = np.array([view is not None and not view.still for view in views])
         T_source_target[moved, :3, 3] = np.nan
-        height = 1.0
+    else:
+        height = float(1 / np.linalg.norm(plane))
+        road = p @ plane.astype(np.float32)
+        level = on_road(inverse_depth, sure, road)
+        inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     T_source_target[:, :3, 3] /= height
     with np.errstate(over="ignore"):
         least = np.maximum((inverse_depth - sigma) * height, 0).astype(np.float16)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.data import structure as module
-from erfsfm.data.road import camera_height
+from erfsfm.data.road import on_road, road_plane
 from erfsfm.data.structure import Structure, StructureCache, measure_structure
 from erfsfm.data.two_view import rays, two_view
 from slam.sequences.simulated import SimulatedStreet, SimulationOptions
@@ -68,14 +68,28 @@ def test_height_over_a_known_plane_with_a_car_on_it():
     inverse_depth = (p @ down / 1.6).astype(np.float32)
     forward = Rotation.from_euler("x", 3, degrees=True).apply([0, 0, 1])
     inverse_depth[85:105, 180:240] = 0.2
-    height = camera_height(inverse_depth, inverse_depth > 0, p, forward)
-    assert height == pytest.approx(1.6, rel=0.01)
+    plane = road_plane(inverse_depth, inverse_depth > 0, p, forward)
+    assert plane is not None and 1 / np.linalg.norm(plane) == pytest.approx(1.6, rel=0.01)
+
+
+def test_the_road_is_known_where_nothing_was_measured_but_not_under_a_car():
+    K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
+    p = rays(128, 416, K)
+    road = (p @ np.array([0, 1, 0]) / 1.6).astype(np.float32)
+    inverse_depth = road.copy()
+    inverse_depth[:64] = 0.05
+    inverse_depth[70:112, 60:140] = 0.25
+    known = np.ones(road.shape, bool)
+    known[112:] = False
+    level = on_road(inverse_depth, known, road)
+    assert level[120, 200:300].all() and level[95, 200:300].all()
+    assert not level[:62].any() and not level[70:88, 80:120].any()
 
 
 def test_no_road_in_a_wall():
     K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
     wall = np.full((128, 416), 0.1, np.float32)
-    assert camera_height(wall, wall > 0, rays(128, 416, K), np.array([0.0, 0, 1])) is None
+    assert road_plane(wall, wall > 0, rays(128, 416, K), np.array([0.0, 0, 1])) is None
 
 
 def test_the_cache_measures_once_and_mends_a_broken_entry(street, tmp_path, monkeypatch):

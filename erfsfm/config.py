@@ -151,7 +151,9 @@ class ExperimentConfig(Section):
     loss: LossConfig = Field(default_factory=LossConfig)
     teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
-    initial_weights: str | None = Field(default=None, description="weights to start from; architecture must match")
+    initial_weights: str | None = Field(
+        default=None, description="weights to start from; the networks must match but for their presets"
+    )
 
     @model_validator(mode="after")
     def _masks_exist(self) -> Self:

@@ -33,6 +33,7 @@ from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
+from erfsfm.networks.transfer import take_over
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.progress import ProgressLine
 
@@ -261,14 +262,16 @@ def _steps_of(checkpoint: Path) -> int:
 
 
 def _start_from(module: SelfSupervision, name: str) -> list[str]:
-    """Take over trained weights; what they were trained on."""
+    """Take over trained weights, of another variant too; what they were trained on."""
     model = load_model(name)
-    if model.record.network != module.config.network:
+    variant = {"depth": module.config.network.depth, "pose": module.config.network.pose}
+    if model.record.network.model_copy(update=variant) != module.config.network:
         raise ConfigError(
-            f"initial_weights '{name}' are of another network: {model.record.network.model_dump()}; set the same"
+            f"initial_weights '{name}' are of another network: {model.record.network.model_dump()}; set the same, "
+            "only the presets may differ"
         )
-    module.depth_net.load_state_dict(model.depth_net.state_dict())
-    module.pose_net.load_state_dict(model.pose_net.state_dict())
+    take_over(module.depth_net, model.depth_net.state_dict())
+    take_over(module.pose_net, model.pose_net.state_dict())
     return model.record.trained_on
 
 

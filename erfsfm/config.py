@@ -152,7 +152,7 @@ class ExperimentConfig(Section):
     teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     initial_weights: str | None = Field(
-        default=None, description="weights to start from; the networks must match but for their presets"
+        default=None, description="weights to start from: the same networks, other presets of them, or half as wide"
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,8 @@
-"""A trained network as the start of another variant of it: the kernels stay, only where their taps lie is learned."""
+"""A trained network as the start of another variant of it, or of one twice as wide, that says the same at first.
+
+In another variant the kernels stay, and only where their taps lie is learned. In a wider one every channel stands
+twice and counts half (Chen et al. 2016, Net2Net); a little noise lets the two part.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,11 @@ from torch import Tensor, nn
 
 from erfsfm.errors import ConfigError
 
+PARTING = 0.05  # of a tensor's standard deviation
+
 
 def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
-    """Fill ``network`` with the weights of one that may have deformable layers in other places.
+    """Fill ``network`` with the weights of one that may have deformable layers in other places or half the width.
 
     A deformable layer that was plain starts with its kernel at rest, zero offsets and a modulator of one; a plain
     layer that was deformable keeps the kernel and loses what moved it. A bias that has no place is dropped, and one
@@ -17,7 +23,7 @@ def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
 
     Args:
         network: to be filled.
-        trained: ``state_dict`` of a network of the same width and normalisation.
+        trained: ``state_dict`` of a network of the same normalisation.
 
     Raises:
         ConfigError: if the two differ in more than that; the network is left as it was.
@@ -27,11 +33,7 @@ def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
     for key, fresh in filled.items():
         source = key if key in trained else _elsewhere(key)
         if source in trained:
-            if trained[source].shape != fresh.shape:
-                raise ConfigError(
-                    f"'{source}' has shape {tuple(trained[source].shape)} where {tuple(fresh.shape)} is needed"
-                )
-            filled[key] = trained[source]
+            filled[key] = _widened(trained[source], fresh.shape, source)
             known.discard(source)
         elif key.endswith(".bias") and f"{key.removesuffix('bias')}kernel.weight" in trained:
             filled[key] = torch.zeros_like(fresh)
@@ -41,6 +43,32 @@ def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
     if strange:
         raise ConfigError(f"'{strange[0]}' has no place in this network")
     network.load_state_dict(filled)
+
+
+def _widened(value: Tensor, shape: torch.Size, name: str) -> Tensor:
+    """A weight at its new shape: outputs twice, inputs twice at half their strength.
+
+    Images and, behind the skip connections, a disparity come in as often as before; they are the first layer's whole
+    input or a decoder layer's last channel.
+    """
+    if value.shape == shape:
+        return value
+    if value.dim() != len(shape) or value.shape[2:] != shape[2:]:
+        raise ConfigError(f"'{name}' has shape {tuple(value.shape)} where {tuple(shape)} is needed")
+    transposed = "upconv" in name and value.dim() == 4
+    if transposed:
+        value, shape = value.transpose(0, 1), torch.Size([shape[1], shape[0], *shape[2:]])
+    if shape[0] == 2 * len(value):
+        value = value.repeat_interleave(2, dim=0)
+    if value.dim() > 1 and shape[1] != value.shape[1]:
+        single = 2 * value.shape[1] - shape[1]
+        twice, once = value.split([value.shape[1] - single, single], dim=1) if single in (0, 1) else (value, value)
+        value = torch.cat([twice.repeat_interleave(2, dim=1) / 2, once], dim=1)
+    if value.shape != shape:
+        raise ConfigError(f"'{name}' can be taken over at its width or twice of it, not as {tuple(shape)}")
+    if value.dim() > 1:
+        value = value + PARTING * value.std() * torch.randn_like(value)
+    return value.transpose(0, 1).contiguous() if transposed else value
 
 
 def _elsewhere(key: str) -> str:

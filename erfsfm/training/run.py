@@ -262,16 +262,19 @@ def _steps_of(checkpoint: Path) -> int:
 
 
 def _start_from(module: SelfSupervision, name: str) -> list[str]:
-    """Take over trained weights, of another variant too; what they were trained on."""
+    """Take over trained weights, of another variant or half the width too; what they were trained on."""
     model = load_model(name)
-    variant = {"depth": module.config.network.depth, "pose": module.config.network.pose}
-    if model.record.network.model_copy(update=variant) != module.config.network:
+    wanted = module.config.network
+    free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width")}
+    try:
+        if model.record.network.model_copy(update=free) != wanted:
+            raise ConfigError("only presets and widths may differ")
+        take_over(module.depth_net, model.depth_net.state_dict())
+        take_over(module.pose_net, model.pose_net.state_dict())
+    except ConfigError as error:
         raise ConfigError(
-            f"initial_weights '{name}' are of another network: {model.record.network.model_dump()}; set the same, "
-            "only the presets may differ"
-        )
-    take_over(module.depth_net, model.depth_net.state_dict())
-    take_over(module.pose_net, model.pose_net.state_dict())
+            f"initial_weights '{name}' are of another network, {model.record.network.model_dump()}: {error}"
+        ) from error
     return model.record.trained_on
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from scipy.stats import ttest_ind
 
 from erfsfm.checkpoint import commit
 from erfsfm.config import ExperimentConfig, load_experiment
@@ -31,6 +32,7 @@ from erfsfm.training.run import train
 
 POSE = ("posenet", "erf-posenet-dilated", "erf-posenet-dfc", "erf-posenet-dfcv2")
 DEPTH = ("depthnet", "erf-depthnet-dilated", "erf-depthnet-dfc", "erf-depthnet-dfcv2")
+LEVEL = 0.05  # of significance
 PAIRS = [(DEPTH[0], pose) for pose in POSE] + [(depth, POSE[0]) for depth in DEPTH[1:]]
 
 PAGE = """# Does a wider receptive field help?
@@ -195,7 +197,7 @@ def spread(values: Sequence[float], digits: int) -> str:
 
 
 def verdict(outcomes: Sequence[Outcome]) -> str:
-    """Each variant against the plain one, in units of their standard errors."""
+    """Each variant against the plain one, by Welch's t-test."""
     lines = []
     for kind, fields in (("pose", ("ate", "re")), ("depth", ("abs_rel",))):
         groups = of_kind(outcomes, kind)
@@ -204,13 +206,12 @@ def verdict(outcomes: Sequence[Outcome]) -> str:
             for field in fields:
                 a = np.array([getattr(o, field) for o in groups[plain_name]])
                 b = np.array([getattr(o, field) for o in groups[name]])
-                error = np.sqrt(a.var(ddof=1) / len(a) + b.var(ddof=1) / len(b)) if len(a) > 1 else np.inf
+                p = float(ttest_ind(a, b, equal_var=False).pvalue) if len(a) > 1 else 1.0
                 change = 100 * (b.mean() / a.mean() - 1)
-                clear = abs(b.mean() - a.mean()) > 2 * error
-                word = ("better" if change < 0 else "worse") if clear else "no clear difference"
+                word = ("better" if change < 0 else "worse") if p < LEVEL else "no clear difference"
                 label = {"ate": "snippet ATE", "re": "snippet RE", "abs_rel": "AbsRel"}[field]
-                lines.append(f"- `{name}` against `{plain_name}`: {label} {change:+.1f} %, {word}.")
-    lines.append("\nClear means: the means differ by more than two standard errors of their difference.")
+                lines.append(f"- `{name}` against `{plain_name}`: {label} {change:+.1f} % (p = {p:.2f}), {word}.")
+    lines.append(f"\nClear means p < {LEVEL} in Welch's t-test; with so few seeds only large differences are.")
     return "\n".join(lines)
 
 

@@ -22,7 +22,7 @@ import torch
 
 from erfsfm.checkpoint import commit
 from erfsfm.config import ExperimentConfig, load_experiment
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
 from erfsfm.files import write_atomically
 from erfsfm.inference import DepthPosePredictor

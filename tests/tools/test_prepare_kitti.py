@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.errors import DataError
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
 

@@ -175,7 +175,7 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
     """
     kept = [r for r in recordings if len(r) >= length]
     if not kept:
-        sizes = ", ".join(f"{r.name} ({len(r)} frames)" for r in recordings) or "no recording"
+        sizes = _some([f"{r.name} ({len(r)} frames)" for r in recordings]) or "no recording"
         raise DataError(f"a snippet needs {length} consecutive frames; found {sizes}")
     return kept
 
@@ -197,7 +197,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     found = [recording for root in config.roots for recording in discover(root)]
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):
-            names = ", ".join(sorted({recording.name for recording in found}))
+            names = _some([recording.name for recording in found])
             raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
     training: list[Recording] = []
     validation: list[Recording] = []
@@ -208,12 +208,18 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             if not overlapping([part.frames_name], forbidden):
                 training.append(part)
     if not training:
-        names = ", ".join(sorted({recording.name for recording in found}))
+        names = _some([recording.name for recording in found])
         raise DataError(
             f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
             "data.exclude, data.validation, data.split and data.leave_out"
         )
     return _without_stops(training, config), _without_stops(validation, config)
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names for an error: each once, and the first few of many."""
+    distinct = sorted(set(names))
+    return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
 
 
 def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:
@@ -237,10 +243,10 @@ def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Reco
     lost = sum(map(len, recordings)) - sum(map(len, kept))
     blind = sum(recording.oxts is None for recording in raw)
     logger.info(
-        "the car stands in %d of %d frames of KITTI raw, which are left out: by the speed of the GPS/IMU%s",
+        "left out %d of %d frames of KITTI raw, in which the car stands by the speed of its GPS/IMU%s",
         lost,
         sum(map(len, raw)),
-        f", in {blind} of {len(raw)} recordings, which have none, by their images" if blind else "",
+        f" ({blind} of {len(raw)} recordings have none: by their images)" if blind else "",
     )
     if not kept:
         raise DataError(

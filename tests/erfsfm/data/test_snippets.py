@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,13 @@ def test_too_short_recordings_are_left_out(coded: Path) -> None:
         usable([], 5)
 
 
+def test_errors_name_a_few_of_many(coded: Path) -> None:
+    """A raw root falls into hundreds of stretches."""
+    first, _ = discover(coded)
+    with pytest.raises(DataError, match=r"found f/0 \(2 frames\), .*f/15 \(2 frames\) and 12 more$"):
+        usable([replace(first.part(0, 2), name=f"f/{k}") for k in range(20)], 5)
+
+
 def test_as_tensors_puts_the_target_apart() -> None:
     images = [np.full((2, 2, 3), 51 * k, np.uint8) for k in range(5)]
     sample = as_tensors(images, np.eye(3, dtype=np.float32))
@@ -364,7 +372,7 @@ def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture)
     with caplog.at_level("INFO"):
         training, _ = names(DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"]))
     assert training[:2] == ["kitti_raw/2011_09_26_drive_0001[0:3]", "kitti_raw/2011_09_26_drive_0001[4:6]"]
-    assert "stands in 4 of 24 frames of KITTI raw" in caplog.text
+    assert "left out 4 of 24 frames of KITTI raw" in caplog.text
     kept = DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"], static_frames="keep")
     assert names(kept)[0][0] == "kitti_raw/2011_09_26_drive_0001[0:6]"
 

@@ -218,7 +218,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
 
 def _some(names: Sequence[str]) -> str:
     """Names for an error: each once, and the first few of many."""
-    distinct = sorted(set(names))
+    distinct = list(dict.fromkeys(names))
     return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
 
 

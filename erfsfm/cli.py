@@ -38,7 +38,7 @@ Fidelity = Annotated[
 def train(
     config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
     dataset: Annotated[
-        list[Path] | None, typer.Option(help="KITTI odometry root, image folder or video; repeat")
+        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
     ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint in OUTPUT")] = False,
@@ -77,7 +77,7 @@ def predict(
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.data.recordings import image_files
+    from erfsfm.data.images import image_files
     from erfsfm.errors import DataError
     from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
 
@@ -141,7 +141,7 @@ def receptive_field(
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.data.recordings import image_files, resize_image
+    from erfsfm.data.images import image_files, resize_image
     from erfsfm.errors import ConfigError, DataError
     from erfsfm.fields.figure import draw_survey
     from erfsfm.fields.street import street_snippet
@@ -238,7 +238,8 @@ def evaluate_depth(
     ],
     weights: Weights = "default",
     split: Annotated[
-        str | None, typer.Option(help="frames of KITTI raw: eigen, or a file of lines 'drive frame' or image paths")
+        str | None,
+        typer.Option(help="frames of KITTI raw: eigen, a YAML split, or a file of lines 'drive frame' or image paths"),
     ] = None,
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,

@@ -52,6 +52,16 @@ class DataConfig(Section):
     validation: list[str] = Field(
         default_factory=lambda: ["simulated/500-599"], description="recordings that only validate"
     )
+    split: str | None = Field(
+        default=None,
+        description="file of recordings to train, validate and test on, or its shipped name: configs/splits",
+    )
+    leave_out: Literal["eigen", "none"] = Field(
+        default="eigen", description="KITTI raw drives never trained on: the 28 test scenes of Eigen et al."
+    )
+    static_frames: Literal["remove", "keep"] = Field(
+        default="remove", description="frames of KITTI raw in which the car stands, by GPS/IMU, else by their images"
+    )
     weights: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,
         description="share of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from erfsfm.checkpoint import Model, find_weights, load_model, weights_sha256
 from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
-from erfsfm.data.recordings import resize_image
+from erfsfm.data.images import resize_image
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically

@@ -6,7 +6,7 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +14,7 @@ import pytest
 import erfsfm
 import slam
 from erfsfm.config import load_experiment
+from erfsfm.data.split_file import read_split_file
 from slam.config import load_config
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,6 +22,11 @@ PACKAGES = ("erfsfm", "slam")
 SOURCES = sorted(path for part in (*PACKAGES, "tools") for path in (ROOT / part).rglob("*.py"))
 MODULES = [path for path in SOURCES if path.relative_to(ROOT).parts[0] in PACKAGES]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+LOADERS: dict[str, Callable[[str], object]] = {
+    "erfsfm": load_experiment,
+    "slam": load_config,
+    "splits": read_split_file,
+}
 MOST_LINES = 350
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -106,12 +112,12 @@ def test_tests_shadow_no_package() -> None:
 
 @pytest.mark.parametrize("path", CONFIGS, ids=name_of)
 def test_every_configuration_loads_by_file_and_by_name(path: Path) -> None:
-    load = {"erfsfm": load_experiment, "slam": load_config}[path.parent.name]
-    assert load(path) == load(path.stem)
+    load = LOADERS[path.parent.name]
+    assert load(str(path)) == load(path.stem)
 
 
-def test_there_are_configurations_of_both() -> None:
-    assert {path.parent.name for path in CONFIGS} == set(PACKAGES)
+def test_there_are_configurations_of_every_kind() -> None:
+    assert {path.parent.name for path in CONFIGS} == set(LOADERS)
 
 
 def test_no_tracked_text_names_a_place_on_one_machine() -> None:

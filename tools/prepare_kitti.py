@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from erfsfm.data.recordings import image_files, image_size, resize_image
+from erfsfm.data.images import image_files, image_size, resize_image
 from erfsfm.errors import DataError, ErfsfmError
 from erfsfm.files import write_atomically
 

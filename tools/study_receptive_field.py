@@ -23,7 +23,7 @@ from scipy.stats import ttest_ind
 
 from erfsfm.checkpoint import commit
 from erfsfm.config import ExperimentConfig, load_experiment
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
 from erfsfm.files import write_atomically
 from erfsfm.inference import DepthPosePredictor

@@ -6,6 +6,7 @@ variation. A run that resumes at step k therefore sees exactly what it would hav
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,10 +19,15 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import augment
-from erfsfm.data.recordings import Recording, discover
-from erfsfm.data.splits import EVERYTHING, FrameRange, overlapping
+from erfsfm.data.discovery import discover
+from erfsfm.data.recordings import Recording
+from erfsfm.data.split_file import Split, read_split_file
+from erfsfm.data.splits import FrameRange, overlapping
+from erfsfm.data.standstill import moving_parts
 from erfsfm.data.structure import StructureCache
 from erfsfm.errors import DataError
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -169,43 +175,84 @@ def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
     """
     kept = [r for r in recordings if len(r) >= length]
     if not kept:
-        sizes = ", ".join(f"{r.name} ({len(r)} frames)" for r in recordings) or "no recording"
+        sizes = _some([f"{r.name} ({len(r)} frames)" for r in recordings]) or "no recording"
         raise DataError(f"a snippet needs {length} consecutive frames; found {sizes}")
     return kept
 
 
 def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recording]]:
-    """Training and validation recordings of all roots, by the configuration's ranges and exclusions."""
+    """Training and validation recordings of all roots, by the configuration's split, ranges and exclusions.
+
+    Raises:
+        DataError: no root, nothing left to train on, or ranges of nothing.
+    """
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
+    split = read_split_file(config.split) if config.split else Split()
+    scenes = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
+    ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
+    listed = [FrameRange.parse(name) for name in split.train]
+    held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
+    never = [*map(str, held_out), *config.exclude, *split.test_recordings]
+    found = [recording for root in config.roots for recording in discover(root)]
+    for key, span in zip(config.ranges, ranges):
+        if all(span.counted_in(recording.name) is None for recording in found):
+            names = _some([recording.name for recording in found])
+            raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
     training: list[Recording] = []
     validation: list[Recording] = []
-    spans = {key: FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()}
-    ranges = {span.recording: span for span in spans.values()}
-    found = [recording for root in config.roots for recording in discover(root)]
-    for key, span in spans.items():
-        if all(recording.name != span.recording for recording in found):
-            names = ", ".join(sorted({recording.name for recording in found}))
-            raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
-    held_out = [FrameRange.parse(name) for name in config.validation]
     for recording in found:
-        validation += [_part(recording, span) for span in held_out if span.covers(FrameRange.parse(recording.name))]
-        part = _part(recording, ranges.get(recording.name))
-        if not overlapping([part.frames_name], [*config.validation, *config.exclude]):
-            training.append(part)
+        validation += _parts(recording, held_out)
+        forbidden = [*never, *scenes] if recording.name.startswith("kitti_raw/") else never
+        for part in _parts(recording, ranges) or (_parts(recording, listed) if listed else [recording]):
+            if not overlapping([part.frames_name], forbidden):
+                training.append(part)
     if not training:
+        names = _some([recording.name for recording in found])
         raise DataError(
-            f"every recording found is excluded or for validation (data.exclude: {', '.join(config.exclude)})"
+            f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
+            "data.exclude, data.validation, data.split and data.leave_out"
         )
-    return training, validation
+    return _without_stops(training, config), _without_stops(validation, config)
 
 
-def _part(recording: Recording, span: FrameRange | None) -> Recording:
-    if span is None or (span.start, span.stop) == (0, EVERYTHING):
-        return recording
+def _some(names: Sequence[str]) -> str:
+    """Names for an error: each once, and the first few of many."""
+    distinct = list(dict.fromkeys(names))
+    return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
+
+
+def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:
+    """What spans name of a recording."""
+    same = [span.counted_in(recording.name) for span in spans]
+    return [_part(recording, span) for span in same if span is not None]
+
+
+def _part(recording: Recording, span: FrameRange) -> Recording:
     if span.start >= len(recording):
         raise DataError(f"{span} begins after the {len(recording)} frames that there are")
     return recording.part(span.start, span.stop)
+
+
+def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
+    """The stretches of KITTI raw drives in which the car moves; other recordings as they are."""
+    raw = [recording for recording in recordings if recording.name.startswith("kitti_raw/")]
+    if config.static_frames == "keep" or not raw:
+        return recordings
+    kept = [part for r in recordings for part in (moving_parts(r) if r.name.startswith("kitti_raw/") else [r])]
+    lost = sum(map(len, recordings)) - sum(map(len, kept))
+    blind = sum(recording.oxts is None for recording in raw)
+    logger.info(
+        "left out %d of %d frames of KITTI raw, in which the car stands by the speed of its GPS/IMU%s",
+        lost,
+        sum(map(len, raw)),
+        f" ({blind} of {len(raw)} recordings have none: by their images)" if blind else "",
+    )
+    if not kept:
+        raise DataError(
+            "the car stands still in every frame found: data.static_frames=keep trains on them all the same"
+        )
+    return kept
 
 
 def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
@@ -219,4 +266,7 @@ def _probabilities(recordings: list[Recording], length: int, config: DataConfig)
         if not chosen.any():
             raise DataError(f"data.weights names '{prefix}', but no recording starts with it")
         total += np.where(chosen, weight * windows / windows[chosen].sum(), 0)
+    if not total.all():
+        name = recordings[int(np.argmin(total))].name
+        raise DataError(f"data.weights gives '{name}' no share: name it there, or leave its data set out")
     return np.asarray(total / total.sum())

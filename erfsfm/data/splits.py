@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from erfsfm.errors import ConfigError
 
@@ -27,14 +27,13 @@ ODOMETRY_RAW = {
     "09": ("2011_09_30_drive_0033", 0, 1591),
     "10": ("2011_09_30_drive_0034", 0, 1201),
 }
-_RAW_ODOMETRY = {drive: (sequence, start) for sequence, (drive, start, _) in ODOMETRY_RAW.items()}
 _NAME = re.compile(r"^(?P<base>[^\[\]]+?)(?:\[(?P<start>\d*):(?P<stop>\d*)\])?$")
 EVERYTHING = 10**9
 
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Frames ``start`` to ``stop - 1`` of a recording, in its canonical name."""
+    """Frames ``start`` to ``stop - 1`` of a recording, by its own numbers."""
 
     recording: str
     start: int
@@ -42,7 +41,7 @@ class FrameRange:
 
     @staticmethod
     def parse(name: str) -> FrameRange:
-        """Read a name; raw drives that are odometry sequences become those.
+        """Read a name; raw drives lose their ``_sync``.
 
         Raises:
             ConfigError: brackets that hold no range, or an empty one.
@@ -54,18 +53,24 @@ class FrameRange:
         stop = int(match["stop"] or EVERYTHING)
         if start >= stop:
             raise ConfigError(f"'{name}' names no frames: the range must begin before it ends")
-        base = match["base"].removesuffix("_sync")
-        kind, _, recording = base.partition("/")
-        if kind == "kitti_raw" and recording in _RAW_ODOMETRY:
-            sequence, first = _RAW_ODOMETRY[recording]
-            stop = EVERYTHING if stop == EVERYTHING else max(stop - first, 0)
-            return FrameRange(f"kitti_odometry/{sequence}", max(start - first, 0), stop)
-        return FrameRange(base, start, stop)
+        return FrameRange(match["base"].removesuffix("_sync"), start, stop)
+
+    def counted_in(self, recording: str) -> FrameRange | None:
+        """The same frames by the numbers of another recording of the drive; None where that has none of them."""
+        if _seed_span_overlaps(self.recording, recording):
+            return replace(self, recording=recording)
+        drive, first, length = _drive(recording)
+        own_drive, own_first, own_length = _drive(self.recording)
+        if drive != own_drive:
+            return None
+        start = max(self.start + own_first - first, 0)
+        stop = min(min(self.stop, own_length) + own_first - first, length)
+        return FrameRange(recording, start, stop) if start < stop else None
 
     def covers(self, other: FrameRange) -> bool:
         """Whether the two share a frame."""
-        same = self.recording == other.recording or _seed_span_overlaps(self.recording, other.recording)
-        return same and self.start < other.stop and other.start < self.stop
+        same = self.counted_in(other.recording)
+        return same is not None and same.start < other.stop and other.start < same.stop
 
     def __str__(self) -> str:
         if (self.start, self.stop) == (0, EVERYTHING):
@@ -76,7 +81,12 @@ class FrameRange:
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
     """Those of ``names`` that share frames with what was ``seen``; empty where nothing leaks."""
     ranges = [FrameRange.parse(name) for name in seen]
-    return [name for name in names if any(FrameRange.parse(name).covers(r) for r in ranges)]
+
+    def leaks(name: str) -> bool:
+        wanted = FrameRange.parse(name)
+        return any(wanted.covers(span) for span in ranges)
+
+    return [name for name in names if leaks(name)]
 
 
 def merge(names: Iterable[str]) -> list[str]:
@@ -90,6 +100,15 @@ def merge(names: Iterable[str]) -> list[str]:
         else:
             seeds |= set(range(span[0], span[1] + 1))
     return _spans(sorted(seeds)) + sorted(others)
+
+
+def _drive(recording: str) -> tuple[str, int, int]:
+    """The drive that a recording was cut from, the number there of its first frame, and how many it has."""
+    kind, _, name = recording.partition("/")
+    if kind != "kitti_odometry" or name not in ODOMETRY_RAW:
+        return recording, 0, EVERYTHING
+    drive, first, past_last = ODOMETRY_RAW[name]
+    return f"kitti_raw/{drive}", first, past_last - first
 
 
 def _spans(seeds: list[int]) -> list[str]:

@@ -13,14 +13,13 @@ from scipy.ndimage import zoom
 
 from erfsfm.checkpoint import ModelRecord
 from erfsfm.config import Fidelity
-from erfsfm.data.recordings import resize_image
+from erfsfm.data.images import resize_image
+from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import CAP_M, Networks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, lidar_depth
 
-EIGEN_FRAMES, EIGEN_DRIVES = 697, 28
-EIGEN_FILE = "test_files_eigen.txt"
 _STILL_M = 0.1
 
 
@@ -31,29 +30,31 @@ class RawNetworks(Networks, Protocol):
 
 
 def read_split(split: str, root: Path) -> list[RawFrame]:
-    """The frames of ``eigen`` or of a file, one a line.
+    """The frames to test on of a shipped split or a YAML file (`erfsfm.data.split_file`), or those of a list.
+
+    Args:
+        split: ``eigen``, a file of the list ``test``, or any other file with a frame a line.
+        root: of KITTI raw: the folder of the dates, a date, or a drive.
 
     Raises:
-        DataError: the file is missing, empty, malformed, or called ``eigen`` without being that list.
+        DataError: the file is missing, empty or malformed.
     """
     base = _root_of_dates(root)
-    path = base / EIGEN_FILE if split == "eigen" else Path(split)
-    if not path.is_file():
-        hint = (
-            f"the list of {EIGEN_FRAMES} frames is not shipped: put it there ({EIGEN_FILE} of SfMLearner), or name any "
-            "list with --split FILE"
-        )
-        raise DataError(f"no split at {path}" + (f"; {hint}" if split == "eigen" else ""))
-    frames = [RawFrame.parse(line, base) for line in path.read_text().splitlines() if line.strip()]
+    path = Path(split)
+    if path.is_file() and path.suffix not in (".yaml", ".yml"):
+        frames = [RawFrame.parse(line, base) for line in path.read_text().splitlines() if line.strip()]
+    else:
+        frames = [_raw_frame(recording, index, base) for recording, index in read_split_file(split).test_frames()]
     if not frames:
-        raise DataError(f"{path} names no frames")
-    drives = len({frame.drive for frame in frames})
-    if split == "eigen" and (len(frames), drives) != (EIGEN_FRAMES, EIGEN_DRIVES):
-        raise DataError(
-            f"{path} is not the Eigen list: wanted {EIGEN_FRAMES} frames of {EIGEN_DRIVES} drives; it has "
-            f"{len(frames)} of {drives}; use --split {path} for another list"
-        )
+        raise DataError(f"split {split} names no frames to test on")
     return frames
+
+
+def _raw_frame(recording: str, index: int, base: Path) -> RawFrame:
+    kind, _, drive = recording.partition("/")
+    if kind != "kitti_raw":
+        raise DataError(f"'{recording}' is no drive of KITTI raw: wanted kitti_raw/2011_09_26_drive_0002[0:64:3]")
+    return RawFrame.parse(f"{drive} {index}", base)
 
 
 def eigen_protocol(

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
-from erfsfm.data.recordings import Recording, discover
+from erfsfm.data.discovery import discover
+from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory

@@ -1,7 +1,7 @@
 """Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
 
 Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
-of the date. Images may be smaller than the original: the calibration follows them.
+of the date (`erfsfm.data.kitti_raw`). Images may be smaller than the original: the calibration follows them.
 """
 
 from __future__ import annotations
@@ -15,16 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
+from erfsfm.data.kitti_raw import ASPECT_TOLERANCE, CALIBRATION, FloatArray, read_calibration, velocity
 from erfsfm.errors import DataError
-
-FloatArray = NDArray[np.float64]
 
 _FRAME = re.compile(
     r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
     r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
 )
-_ASPECT_TOLERANCE = 0.01
-_VELOCITY = [6, 7, 10]  # north, east, up in m/s (oxts/dataformat.txt)
 
 
 @dataclass(frozen=True)
@@ -150,14 +147,16 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
         DataError: a file is missing or malformed.
     """
     folder = frame.folder / "oxts"
+    path = folder / "timestamps.txt"
+    if not path.is_file():
+        raise DataError(f"{path} is missing: how far the car moved needs a date and a time a frame")
+    stamps = path.read_text().split("\n")
     try:
-        stamps = (folder / "timestamps.txt").read_text().split("\n")
         seconds = np.array([_seconds(stamps[i]) for i in window])
-        velocity = np.stack([np.loadtxt(folder / "data" / f"{i:010d}.txt")[_VELOCITY] for i in window])
-    except (OSError, ValueError, IndexError) as error:
-        what = " ".join(str(error).split())
-        raise DataError(f"{folder} must hold timestamps.txt and a file of data a frame: {what}") from error
-    steps = 0.5 * (velocity[:-1] + velocity[1:]) * np.diff(seconds)[:, None]
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path} must hold a date and a time a frame: {' '.join(str(error).split())}") from error
+    speeds = np.stack([velocity(folder / "data", i) for i in window])
+    steps = 0.5 * (speeds[:-1] + speeds[1:]) * np.diff(seconds)[:, None]
     places = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     middle = len(window) // 2
     distances: FloatArray = np.linalg.norm(places - places[middle], axis=1)
@@ -187,8 +186,8 @@ def _nearest(
 def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     """LiDAR points to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
-    camera = _calibration(date / "calib_cam_to_cam.txt")
-    velodyne = _calibration(date / "calib_velo_to_cam.txt")
+    camera = read_calibration(date / CALIBRATION)
+    velodyne = read_calibration(date / "calib_velo_to_cam.txt")
     try:
         full_width, full_height = camera[f"S_rect_0{frame.camera}"]
         P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)
@@ -199,7 +198,7 @@ def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     except (KeyError, ValueError) as error:
         raise DataError(f"the calibration in {date} is incomplete: {error}") from error
     scale_y, scale_x = size[0] / full_height, size[1] / full_width
-    if abs(scale_x / scale_y - 1) > _ASPECT_TOLERANCE:
+    if abs(scale_x / scale_y - 1) > ASPECT_TOLERANCE:
         raise DataError(
             f"{frame.image_path()} is {size[1]} x {size[0]}, but the camera in {date} is {full_width:g} x "
             f"{full_height:g}: the images were cropped or are of another camera"
@@ -208,18 +207,6 @@ def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
     projection: FloatArray = resize @ P_rect @ R_rect @ T_cam_velo
     return projection
-
-
-def _calibration(path: Path) -> dict[str, FloatArray]:
-    if not path.is_file():
-        raise DataError(f"{path} is missing: KITTI's calibration lies in the folder of the date")
-    rows = {}
-    for key, _, text in (line.partition(":") for line in path.read_text().splitlines()):
-        try:
-            rows[key] = np.array([float(word) for word in text.split()])
-        except ValueError:
-            continue  # the time of calibration
-    return rows
 
 
 def _seconds(stamp: str) -> float:

@@ -105,6 +105,42 @@ def write_root() -> WriteRoot:
 
 
 @pytest.fixture
+def write_raw() -> Callable[..., Path]:
+    """Writes a KITTI raw drive with both colour cameras, and packets of the GPS/IMU where speeds are given."""
+
+    def write(
+        root: Path,
+        drive: str = "2011_09_26_drive_0001",
+        frames: int = 6,
+        size: tuple[int, int] = (64, 96),
+        stored: tuple[int, int] | None = None,
+        speeds: list[float] | None = None,
+    ) -> Path:
+        home = root / drive[:10] / f"{drive}_sync"
+        height, width = size
+        rows = [
+            f"S_rect_{camera}: {width} {height}\nP_rect_{camera}: 60 0 {cx} 0 0 62 30 0 0 0 1 0\n"
+            for camera, cx in (("00", 47), ("02", 47), ("03", 46))
+        ]
+        scene = Plane(Camera(width, height, 60.0, 62.0, 47.0, 30.0), 6.0)
+        for camera in ("image_02", "image_03"):
+            (home / camera / "data").mkdir(parents=True)
+            for index in range(len(speeds) if speeds else frames):
+                image = scene.image(np.array([0.05, 0, 0.1]) * index)
+                shrunken = cv2.resize(image, (stored or size)[::-1], interpolation=cv2.INTER_AREA)
+                cv2.imwrite(str(home / camera / "data" / f"{index:010d}.png"), shrunken[..., ::-1])
+        (home.parent / "calib_cam_to_cam.txt").write_text("calib_time: 09-Jan-2012 13:57:47\n" + "".join(rows))
+        for index, speed in enumerate(speeds or []):
+            (home / "oxts" / "data").mkdir(parents=True, exist_ok=True)
+            packet = np.zeros(30)
+            packet[[6, 7]] = 0.6 * speed, 0.8 * speed
+            (home / "oxts/data" / f"{index:010d}.txt").write_text(" ".join(f"{number:g}" for number in packet))
+        return home
+
+    return write
+
+
+@pytest.fixture
 def small() -> dict[str, dict[str, object]]:
     """Settings of an experiment that runs in a second."""
     return {

@@ -9,10 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
 from erfsfm.cli import main
-from erfsfm.config import NetworkConfig
+from erfsfm.config import NetworkConfig, dump_yaml, load_experiment
 
 Refusal = Callable[..., str]
 WriteRoot = Callable[..., Path]
@@ -73,6 +74,86 @@ def test_intrinsics_of_another_resolution(refusal: Refusal, tmp_path: Path) -> N
     (drive / "camera.yaml").write_text("width: 192\nheight: 96\nfx: 100\nfy: 100\ncx: 96\ncy: 48\nfps: 10\n")
     error = refusal(*TRAIN, *SMALL, "--dataset", drive, "--output", tmp_path / "run")
     assert "is 96 x 48; the camera of folder/drive is 192 x 96" in error
+
+
+def test_calibration_of_another_resolution(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+    """Raw images may be shrunk, never cropped: their camera knows its own shape."""
+    write_raw(tmp_path, stored=(48, 48), speeds=[9] * 6)
+    error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
+    assert "0000000000.png is 48 x 48, but camera 02 in" in error
+    assert "is 96 x 64: the images were cropped or are of another camera" in error
+
+
+def test_a_raw_drive_shorter_than_a_snippet(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+    write_raw(tmp_path, speeds=[9, 9, 9, 0, 9, 9])
+    error = refusal(*TRAIN, *SMALL, "--set", "network.sources=4", "--dataset", tmp_path, "--output", tmp_path / "run")
+    assert "a snippet needs 5 consecutive frames; found kitti_raw/2011_09_26_drive_0001 (3 frames)" in error
+
+
+def test_a_raw_drive_for_tests(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+    write_raw(tmp_path, drive="2011_09_26_drive_0013")
+    error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
+    assert "nothing left to train on: every recording found (kitti_raw/2011_09_26_drive_0013) is excluded" in error
+    assert "data.leave_out" in error
+
+
+@pytest.fixture
+def trip(tmp_path: Path) -> Path:
+    """A folder with a video of 96 x 64 and its camera."""
+    (tmp_path / "trip").mkdir()
+    writer = cv2.VideoWriter(str(tmp_path / "trip/drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
+    for index in range(8):
+        writer.write(np.full((64, 96, 3), 20 * index, np.uint8))
+    writer.release()
+    (tmp_path / "trip/camera.yaml").write_text("width: 96\nheight: 64\nfx: 60\nfy: 60\ncx: 48\ncy: 32\nfps: 10\n")
+    return tmp_path / "trip"
+
+
+def test_a_damaged_video(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
+    path = trip / "drive.mp4"
+    path.write_bytes(path.read_bytes()[:600])
+    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
+    assert "drive.mp4 cannot be read as a video: it is damaged or of an unknown format; copy it again" in error
+
+
+def test_a_video_of_another_resolution(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
+    camera = trip / "camera.yaml"
+    camera.write_text(camera.read_text().replace("width: 96", "width: 192"))
+    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
+    assert "drive.mp4 is 96 x 64; the camera of folder/trip is 192 x 64" in error
+
+
+def test_a_video_without_camera(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
+    (trip / "camera.yaml").unlink()
+    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
+    assert "images or a video with camera.yaml; found drive.mp4" in error
+
+
+def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
+    root, run = write_root(tmp_path / "root", frames=5), tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    torch.save({"global_step": 1}, run / "checkpoints/last.ckpt")
+    path = run / "checkpoints/last.ckpt"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    config = load_experiment("tiny", [text for text in SMALL if "=" in text])
+    (run / "config.yaml").write_text(dump_yaml(config))
+    error = refusal(*TRAIN, *SMALL, "--dataset", root, "--output", run, "--resume")
+    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew" in error
+
+
+def test_initial_weights_of_another_architecture(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path
+) -> None:
+    root = write_root(tmp_path / "root", frames=5)
+    start = f"initial_weights={weights}"
+    error = refusal(*TRAIN, *SMALL, "--set", start, "--dataset", root, "--output", tmp_path / "run")
+    assert f"initial_weights '{weights}' are of another network" in error
+
+
+def test_an_unknown_split(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
+    root = write_root(tmp_path / "root", frames=5)
+    error = refusal(*TRAIN, "--set", "data.split=eigne", "--dataset", root, "--output", tmp_path / "run")
+    assert "no split 'eigne': neither a file nor one of eigen, odometry" in error
 
 
 @pytest.mark.parametrize("verb", ["predict", "export", "receptive-field"])

@@ -125,7 +125,10 @@ def test_usage(run: Run, arguments: list[str]) -> None:
         (["evaluate", "pose", "--dataset", "{root}", "--sequence", "44", "--weights", "{weights}"], "found 00"),
         (["evaluate", "pose", "--dataset", "{root}", "--sequence", "00", "--weights", "bad"], "no weights 'bad'"),
         (["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}"], "no true depth"),
-        (["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}", "--split", "eigen"], "is not shipped"),
+        (
+            ["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}", "--split", "eigen"],
+            "0000000000.png (or .jpg) is missing: download the drive",
+        ),
         (
             ["evaluate", "depth", "--dataset", "{root}", "--weights", "{weights}", "--fidelity", "paper"],
             "needs --split",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.errors import DataError
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
 
@@ -153,4 +154,7 @@ def test_raw_drives(tool: ModuleType, tmp_path: Path) -> None:
     depth = lidar_depth(frame, (32, 48))
     assert depth[depth > 0] == pytest.approx(20)
     assert (depth > 0).mean() > 0.2
+    (full,), (small,) = discover(tmp_path / "raw"), discover(tmp_path / "small")
+    assert dataclasses.astuple(small.camera) == pytest.approx(dataclasses.astuple(full.camera.resized(48, 32)))
+    assert small.name == full.name == "kitti_raw/2011_09_26_drive_0099"
     assert "S_rect_02: 4.8" in (tmp_path / "small/2011_09_26/calib_cam_to_cam.txt").read_text()

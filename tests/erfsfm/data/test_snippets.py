@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import (
     ImageCache,
     SnippetDraws,
@@ -159,6 +160,29 @@ def test_weights_set_the_shares(coded: Path) -> None:
     assert counts["b"] / 400 == pytest.approx(3 / 4, abs=0.06)
 
 
+def test_weights_mix_kinds_of_data(
+    tmp_path: Path, write_root: Callable[..., Path], write_raw: Callable[..., Path]
+) -> None:
+    """However many frames each has: a long simulated root, an odometry sequence and two stretches of a raw drive."""
+    write_root(tmp_path / "sim", frames=20, seed=3)
+    write_root(tmp_path / "kitti", frames=5)
+    write_raw(tmp_path / "raw", speeds=[9, 9, 9, 9, 0, 9, 9, 9])
+    weights = {"simulated": 1, "kitti_odometry": 2, "kitti_raw": 1}
+    config = experiment(
+        roots=[str(tmp_path / name) for name in ("sim", "kitti", "raw")], weights=weights, validation=[]
+    )
+    draws = SnippetDraws(split_recordings(config.data)[0], config, 1)
+    chances: Counter[str] = Counter()
+    for recording, chance in zip(draws.recordings, draws._probabilities):
+        chances[recording.name.partition("/")[0]] += chance
+    assert chances == {name: pytest.approx(weight / 4) for name, weight in weights.items()}
+
+
+def test_recordings_without_a_share_are_refused(coded: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no share: name it there"):
+        SnippetDraws(discover(coded), experiment(weights={"folder/a": 1}), 1)
+
+
 def test_weights_of_nothing_are_refused(coded: Path) -> None:
     with pytest.raises(DataError, match="kitti"):
         SnippetDraws(discover(coded), experiment(weights={"kitti": 1}), 1)
@@ -172,6 +196,13 @@ def test_too_short_recordings_are_left_out(coded: Path) -> None:
     assert "folder/a (4 frames)" in str(caught.value)
     with pytest.raises(DataError, match="no recording"):
         usable([], 5)
+
+
+def test_errors_name_a_few_of_many(coded: Path) -> None:
+    """A raw root falls into hundreds of stretches."""
+    first, _ = discover(coded)
+    with pytest.raises(DataError, match=r"found f/0 \(2 frames\), .*f/7 \(2 frames\) and 12 more$"):
+        usable([replace(first.part(0, 2), name=f"f/{k}") for k in range(20)], 5)
 
 
 def test_as_tensors_puts_the_target_apart() -> None:
@@ -296,7 +327,7 @@ def test_exclude_by_raw_drive(kitti: Path) -> None:
 def test_exclude_a_part(kitti: Path) -> None:
     """Frames kept back do not forbid the frames before them, once those are named."""
     held_back = ["kitti_odometry/00[4:]", "kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"]
-    with pytest.raises(DataError, match="excluded"):
+    with pytest.raises(DataError, match="nothing left to train on"):
         split_recordings(DataConfig(roots=[kitti], exclude=held_back))
     config = DataConfig(roots=[kitti], exclude=held_back, ranges={"kitti_odometry/00": "0:4"})
     assert names(config)[0] == ["kitti_odometry/00[0:4]"]
@@ -315,6 +346,68 @@ def test_validation_of_held_back_frames(kitti: Path) -> None:
         roots=[kitti], ranges={"kitti_odometry/00": "0:4"}, validation=["kitti_odometry/00[4:]", "kitti_odometry/09"]
     )
     assert names(config) == (["kitti_odometry/00[0:4]"], ["kitti_odometry/00[4:6]", "kitti_odometry/09[0:6]"])
+
+
+@pytest.fixture
+def raw(tmp_path: Path, write_raw: Callable[..., Path]) -> Path:
+    """A drive to train on, one of Eigen's scenes, and the drives of the odometry sequences 00 (a scene too) and 09."""
+    for drive in ("09_26_drive_0001", "09_26_drive_0005", "09_26_drive_0013", "10_03_drive_0027", "09_30_drive_0033"):
+        write_raw(tmp_path / "raw", drive=f"2011_{drive}", speeds=[9, 9, 9, 0, 9, 9], size=(16, 24))
+    return tmp_path / "raw"
+
+
+def drives(config: DataConfig) -> tuple[set[str], set[str]]:
+    training, validation = split_recordings(config)
+    return {r.name[-10:] for r in training}, {r.name[-10:] for r in validation}
+
+
+def test_eigens_scenes_and_test_sequences_are_left_out(raw: Path) -> None:
+    assert drives(DataConfig(roots=[raw])) == ({"drive_0001", "drive_0005"}, set())
+    everything = DataConfig(roots=[raw], leave_out="none", exclude=[])
+    assert drives(everything)[0] == {"drive_0001", "drive_0005", "drive_0013", "drive_0027", "drive_0033"}
+    assert "drive_0033" not in drives(DataConfig(roots=[raw], leave_out="none"))[0], "it is sequence 09"
+
+
+def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        training, _ = names(DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"]))
+    assert training[:2] == ["kitti_raw/2011_09_26_drive_0001[0:3]", "kitti_raw/2011_09_26_drive_0001[4:6]"]
+    assert "left out 4 of 24 frames of KITTI raw" in caplog.text
+    kept = DataConfig(roots=[raw], exclude=["kitti_raw/2011_09_26_drive_0005"], static_frames="keep")
+    assert names(kept)[0][0] == "kitti_raw/2011_09_26_drive_0001[0:6]"
+
+
+def test_a_car_that_never_moves(tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+    write_raw(tmp_path, speeds=[0, 0, 0, 0])
+    with pytest.raises(DataError, match=r"stands still in every frame found: data\.static_frames=keep"):
+        split_recordings(DataConfig(roots=[tmp_path]))
+
+
+def test_a_split_says_who_trains_validates_and_tests(raw: Path) -> None:
+    assert drives(DataConfig(roots=[raw], split="eigen", exclude=[])) == ({"drive_0001", "drive_0033"}, {"drive_0005"})
+
+
+def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    root = write_root(tmp_path, frames=3, sequences=("00", "03", "06", "09", "10", "11"), size=(8, 8))
+    training, validation = names(DataConfig(roots=[root], split="odometry", validation=[], exclude=[]))
+    assert training == ["kitti_odometry/00[0:3]", "kitti_odometry/03[0:3]"]
+    assert validation == ["kitti_odometry/06[0:3]"]
+
+
+def test_a_split_of_ones_own(tmp_path: Path, kitti: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(
+        "train: ['kitti_odometry/00[1:4]', kitti_odometry/09]\ntest: [kitti_odometry/09]\n"
+    )
+    config = DataConfig(roots=[kitti], split=str(tmp_path / "mine.yaml"), exclude=[])
+    assert names(config)[0] == ["kitti_odometry/00[1:4]"], "what tests never trains"
+
+
+def test_eigens_scenes_exclude_their_odometry_sequences_by_split_alone(tmp_path: Path, kitti: Path) -> None:
+    """Training on 00 is what the paper does; who asks for the split does not want it."""
+    assert names(DataConfig(roots=[kitti]))[0] == ["kitti_odometry/00[0:6]"]
+    (tmp_path / "test.yaml").write_text("test: ['kitti_raw/2011_10_03_drive_0027[0:3]']\n")
+    with pytest.raises(DataError, match="nothing left to train on"):
+        split_recordings(DataConfig(roots=[kitti], split=str(tmp_path / "test.yaml")))
 
 
 def test_several_roots_add_up(kitti: Path, coded: Path) -> None:

@@ -42,8 +42,10 @@ def test_leaks(name: str, seen: str, leaks: bool) -> None:
 @pytest.mark.parametrize("sequence", sorted(ODOMETRY_RAW))
 def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
     drive, first, past_last = ODOMETRY_RAW[sequence]
-    whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]")
-    assert whole == FrameRange(f"kitti_odometry/{sequence}", 0, past_last - first)
+    cut, whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"), FrameRange.parse(f"kitti_raw/{drive}")
+    name = f"kitti_odometry/{sequence}"
+    assert cut.counted_in(name) == whole.counted_in(name) == FrameRange(name, 0, past_last - first)
+    assert FrameRange.parse(name).counted_in(cut.recording) == cut
 
 
 def test_frames_of_the_table() -> None:
@@ -78,8 +80,22 @@ def test_names_round_trip(name: str) -> None:
     assert FrameRange.parse(str(FrameRange.parse(name))) == FrameRange.parse(name)
 
 
-def test_a_whole_raw_drive_is_the_whole_sequence() -> None:
-    assert str(FrameRange.parse("kitti_raw/2011_09_30_drive_0028_sync")) == "kitti_odometry/08"
+@pytest.mark.parametrize(
+    ("name", "recording", "same"),
+    [
+        ("kitti_raw/2011_09_30_drive_0028[1000:1200]", "kitti_odometry/08", "kitti_odometry/08[0:100]"),
+        ("kitti_odometry/08[0:100]", "kitti_raw/2011_09_30_drive_0028", "kitti_raw/2011_09_30_drive_0028[1100:1200]"),
+        ("kitti_raw/2011_09_30_drive_0028[5000:]", "kitti_odometry/08", "kitti_odometry/08[3900:4071]"),
+        ("kitti_raw/2011_09_30_drive_0028[0:1100]", "kitti_odometry/08", None),
+        ("kitti_odometry/08", "kitti_odometry/07", None),
+        ("simulated/500-599[10:]", "simulated/512", "simulated/512[10:]"),
+        ("simulated/500-599", "simulated/499", None),
+        ("folder/a[3:]", "folder/a", "folder/a[3:]"),
+    ],
+)
+def test_the_same_frames_by_other_numbers(name: str, recording: str, same: str | None) -> None:
+    found = FrameRange.parse(name).counted_in(recording)
+    assert (str(found) if found else None) == same
 
 
 def test_merge() -> None:
@@ -96,5 +112,8 @@ def test_merge_round_trip() -> None:
     assert overlapping(["simulated/3", "simulated/8", "kitti_odometry/00[250:]"], record) == []
 
 
-def test_merge_names_raw_drives_by_their_sequence() -> None:
-    assert merge(["kitti_raw/2011_10_03_drive_0027_sync[0:10]"]) == ["kitti_odometry/00[0:10]"]
+def test_frames_of_a_drive_before_its_sequence_are_recorded() -> None:
+    """Drive 0028 begins 1100 frames before sequence 08: what was seen there has no name among the sequence's."""
+    record = merge(["kitti_raw/2011_09_30_drive_0028_sync[0:10]", "kitti_raw/2011_09_30_drive_0028_sync[1095:1105]"])
+    assert record == ["kitti_raw/2011_09_30_drive_0028[0:10]", "kitti_raw/2011_09_30_drive_0028[1095:1105]"]
+    assert overlapping(["kitti_odometry/08[0:5]", "kitti_odometry/08[5:]"], record) == ["kitti_odometry/08[0:5]"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from erfsfm.config import NetworkConfig
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import depth_errors
-from erfsfm.evaluation.eigen import EIGEN_FILE, eigen_protocol, read_split
+from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import depth_protocol
 from erfsfm.inference import DepthPosePredictor
 
@@ -108,16 +109,44 @@ def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_drive: Write, split
     assert read_split(split, root / place)[0].root == root.resolve()
 
 
-def test_the_eigen_list(tmp_path: Path, write_drive: Write) -> None:
+def test_the_eigen_list(tmp_path: Path) -> None:
+    """697 frames of 28 drives; of the four that are odometry sequences, one frame lies beyond its sequence's end."""
+    frames = read_split("eigen", tmp_path)
+    assert len(frames) == len(set(frames)) == 697
+    drives = Counter(frame.drive for frame in frames)
+    assert len(drives) == 28
+    assert drives.pop("2011_09_26_drive_0048") == 22
+    assert set(drives.values()) == {25}
+    assert {frame.camera for frame in frames} == {2}
+    odometry = [f"kitti_odometry/{sequence:02d}" for sequence in range(11)]
+    assert len(overlapping([frame.name for frame in frames], odometry)) == 99
+    assert len(overlapping([f"kitti_raw/{frame.drive}" for frame in frames], odometry)) == 100
+
+
+@pytest.mark.parametrize(
+    ("drive", "wanted"),
+    [
+        ("2011_09_26_drive_0002", [*range(0, 66, 3), 69, 72, 75]),
+        ("2011_09_26_drive_0020", [*range(0, 22, 3), 27, 33, 36, *range(42, 79, 3), 84]),
+        ("2011_09_26_drive_0106", [15, *range(35, 220, 8)]),
+        ("2011_09_30_drive_0016", [frame for frame in range(0, 276, 11) if frame != 99]),
+    ],
+)
+def test_frames_of_the_eigen_list(tmp_path: Path, drive: str, wanted: list[int]) -> None:
+    assert [frame.index for frame in read_split("eigen", tmp_path) if frame.drive == drive] == wanted
+
+
+def test_a_split_of_ones_own_in_yaml(tmp_path: Path, write_drive: Write) -> None:
     root = write_drive(tmp_path / "raw")
-    with pytest.raises(DataError, match="697 frames is not shipped: put it there"):
-        read_split("eigen", root)
-    (root / EIGEN_FILE).write_text(f"{DRIVE} 1\n")
-    with pytest.raises(DataError, match="wanted 697 frames of 28 drives; it has 1 of 1"):
-        read_split("eigen", root)
-    lines = [f"2011_09_26_drive_{1000 + i % 28} {i}" for i in range(697)]
-    (root / EIGEN_FILE).write_text("\n".join(lines))
-    assert len(read_split("eigen", root)) == 697
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"test:\n  - kitti_raw/{DRIVE}[0:5:2, 8]\n")
+    assert [frame.index for frame in read_split(str(path), root)] == [0, 2, 4, 8]
+    assert eigen_protocol(Oracle(), root, str(path), "default", allow_leak=False)[0]["images"] == 4
+    path.write_text("test: ['kitti_odometry/09[3]']\n")
+    with pytest.raises(DataError, match="'kitti_odometry/09' is no drive of KITTI raw"):
+        read_split(str(path), root)
+    with pytest.raises(DataError, match="'kitti_odometry/09' names no single frames"):
+        read_split("odometry", root)
 
 
 def test_raw_drives_want_a_split(tmp_path: Path, write_drive: Write) -> None:
@@ -132,7 +161,7 @@ def test_splits_that_are_none(tmp_path: Path, write_drive: Write) -> None:
     for name, words in [
         ("empty.txt", "names no frames"),
         ("words.txt", "'one two' names no frame"),
-        ("no", "no split at"),
+        ("no", "no split '.*no': neither a file nor one of eigen, odometry"),
     ]:
         with pytest.raises(DataError, match=words):
             read_split(str(tmp_path / name), root)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.data.recordings import discover
+from erfsfm.data.discovery import discover
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol

@@ -114,8 +114,8 @@ def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> Non
     [
         ("image_02/data/0000000003.png", "0000000003.png .* is missing"),
         ("velodyne_points/data/0000000003.bin", "true depth .* comes from the LiDAR"),
-        ("oxts/data/0000000003.txt", "a file of data a frame"),
-        ("oxts/timestamps.txt", "a file of data a frame"),
+        ("oxts/data/0000000003.txt", "a packet of the GPS/IMU a frame"),
+        ("oxts/timestamps.txt", "needs a date and a time a frame"),
         ("../calib_cam_to_cam.txt", "calibration lies in the folder of the date"),
     ],
 )

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from erfsfm.data.recordings import Recording, discover, image_files, resize_image
+from erfsfm.data.discovery import discover
+from erfsfm.data.images import image_files, resize_image
+from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 
 CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
@@ -183,11 +185,18 @@ def test_video(tmp_path: Path, give: str) -> None:
     root = write_camera(tmp_path / "trip")
     write_video(root / "drive.avi")
     recording = one(root / give)
-    assert recording.name == "folder/trip"
-    assert len(recording) == 4
+    assert (recording.name, recording.frames_name) == ("folder/trip", "folder/trip[0:4]")
     assert float(recording.image(2, 32, 48).mean()) == pytest.approx(80, abs=3)
-    with pytest.raises(DataError, match="is a video"):
-        recording.part(0, 2)
+    part = recording.part(1, 3)
+    assert (len(part), part.frames_name) == (2, "folder/trip[1:3]")
+    assert (part.image(1, 32, 48) == recording.image(2, 32, 48)).all()
+
+
+def test_every_video_of_a_folder(tmp_path: Path) -> None:
+    write_camera(tmp_path)
+    for name, frames in (("b.avi", 3), ("a.avi", 2)):
+        write_video(tmp_path / name, frames)
+    assert [len(recording) for recording in discover(tmp_path)] == [2, 3]
 
 
 def test_a_collection_of_roots(tmp_path: Path, write_root: Callable[..., Path]) -> None:

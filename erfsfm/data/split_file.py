@@ -1,0 +1,84 @@
+"""Splits as files: which recordings train, validate and test, each named as in the leak record (`erfsfm.data.splits`).
+
+The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
+0, 3, ..., 63, 69 and 72.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import yaml
+from pydantic import Field, ValidationError
+
+from erfsfm.config import Section, config_folders
+from erfsfm.errors import DataError
+
+_FRAMES = re.compile(r"(?P<recording>[^\[\]]+)\[(?P<runs>[\d:, ]+)\]")
+_RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
+
+
+class Split(Section):
+    """A division of recordings; a list that is left out names none."""
+
+    train: list[str] = Field(default_factory=list, description="recordings or frame ranges; none: all that are found")
+    validation: list[str] = Field(default_factory=list, description="recordings or frame ranges that only validate")
+    test: list[str] = Field(default_factory=list, description="recordings or single frames")
+
+    @property
+    def test_recordings(self) -> list[str]:
+        """Recordings with a frame to test on, without their frames."""
+        return [name.partition("[")[0] for name in self.test]
+
+    def test_frames(self) -> list[tuple[str, int]]:
+        """Every single frame to test on: its recording and number.
+
+        Raises:
+            DataError: a recording is named without frames, or its runs are malformed.
+        """
+        return [frame for name in self.test for frame in _frames(name)]
+
+
+def read_split_file(name_or_path: str) -> Split:
+    """Read a shipped split by its name, or a file.
+
+    Raises:
+        DataError: neither, not YAML, or other keys than these; one line.
+    """
+    path = Path(name_or_path)
+    if not path.is_file():
+        shipped = {file.stem: file for folder in _folders() for file in sorted(folder.glob("*.yaml"))}
+        if name_or_path not in shipped:
+            raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
+        path = shipped[name_or_path]
+    try:
+        return Split.model_validate(yaml.safe_load(path.read_text()) or {})
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "all of it"
+        raise DataError(
+            f"{path} is no split, a file of the lists train, validation and test: {where}: {first['msg']}"
+        ) from error
+
+
+def _folders() -> list[Path]:
+    """Beside the named configurations: in the wheel, or in the source tree."""
+    wheel, source = config_folders()
+    return [wheel / "splits", source.parent / "splits"]
+
+
+def _frames(name: str) -> list[tuple[str, int]]:
+    match = _FRAMES.fullmatch(name.strip())
+    runs = [_RUN.fullmatch(text.strip()) for text in match["runs"].split(",")] if match else []
+    if match is None or None in runs:
+        raise DataError(f"'{name}' names no single frames: wanted kind/recording[0:64:3, 69, 72]")
+    numbers = [
+        number
+        for run in runs
+        if run is not None
+        for number in range(int(run["first"]), int(run["stop"] or int(run["first"]) + 1), int(run["step"] or 1))
+    ]
+    return [(match["recording"], number) for number in numbers]

@@ -1,0 +1,59 @@
+"""Frames of a standing car: nothing moves but the traffic, which teaches a wrong depth.
+
+They are known by the speed of the GPS/IMU, or by the images where there is none.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.data.kitti_raw import velocity
+from erfsfm.data.recordings import Recording
+
+STILL_M_S = 0.5  # 5 cm a frame
+STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2
+_SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
+
+
+def moving_parts(recording: Recording) -> list[Recording]:
+    """The stretches of a recording in which the car moves, in order; all of it where it never stands."""
+    moving = (~_still(recording)).astype(np.int8)
+    edges = np.flatnonzero(np.diff(moving, prepend=0, append=0))  # starts and ends by turns
+    return [recording.part(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+
+
+def _still(recording: Recording) -> NDArray[np.bool_]:
+    """``(N,)``, whether the car stands."""
+    if recording.oxts is None:
+        return _unchanged(recording)
+    return _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
+
+
+@lru_cache(maxsize=1)
+def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
+    """``(N,)`` in m/s; the cameras of a drive share them."""
+    return np.array([np.linalg.norm(velocity(oxts, start + index)) for index in range(frames)])
+
+
+def _unchanged(recording: Recording) -> NDArray[np.bool_]:
+    """``(N,)``, whether most of an image is that of the frame before, whatever passes through it.
+
+    Medians forgive the traffic: that of the changes is the exposure's, that of the rest tells. The first frame is
+    judged by the step to the second.
+    """
+    columns, rows = _SMALL
+    changes = []
+    previous: NDArray[np.float32] | None = None
+    for index in range(len(recording)):
+        image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        if previous is not None:
+            change = image - previous
+            changes.append(np.median(np.abs(change - np.median(change))))
+        previous = image
+    steps = np.array(changes[:1] + changes)
+    return steps < STILL_LEVELS if len(steps) else np.zeros(len(recording), dtype=np.bool_)

@@ -1,0 +1,100 @@
+"""Raw drives as recordings: which cameras, which intrinsics, and what is said of incomplete ones."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.data.discovery import discover
+from erfsfm.data.kitti_raw import open_drive
+from erfsfm.errors import DataError
+
+WriteDrive = Callable[..., Path]
+NAME = "kitti_raw/2011_09_26_drive_0001"
+
+
+def refusal(root: Path) -> str:
+    with pytest.raises(DataError) as caught:
+        discover(root)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("place", ["", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"])
+def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_raw: WriteDrive, place: str) -> None:
+    write_raw(tmp_path / "raw")
+    left, right = discover(tmp_path / "raw" / place)
+    assert left.frames_name == right.frames_name == f"{NAME}[0:6]"
+    assert [recording.images[0].parts[-3] for recording in (left, right)] == ["image_02", "image_03"]
+
+
+def test_every_drive_of_every_date(tmp_path: Path, write_raw: WriteDrive) -> None:
+    for drive in ("2011_10_03_drive_0047", "2011_09_26_drive_0005", "2011_09_26_drive_0002"):
+        write_raw(tmp_path, drive=drive, frames=1)
+    (tmp_path / "2011_09_26/2011_09_26_drive_0009_sync/oxts").mkdir(parents=True)  # downloaded in part
+    names = [recording.name.removeprefix("kitti_raw/") for recording in discover(tmp_path)]
+    assert names == [
+        name for name in ("2011_09_26_drive_0002", "2011_09_26_drive_0005", "2011_10_03_drive_0047") for _ in range(2)
+    ]
+
+
+def test_intrinsics_follow_the_stored_size(tmp_path: Path, write_raw: WriteDrive) -> None:
+    full, _ = open_drive(write_raw(tmp_path / "full"))
+    half, _ = open_drive(write_raw(tmp_path / "half", stored=(32, 48)))
+    assert (full.camera.width, full.camera.fx, full.camera.cx) == (96, 60, 47)
+    assert half.camera == full.camera.resized(48, 32)
+    assert half.camera.cx == pytest.approx((47 + 0.5) / 2 - 0.5)
+    right = open_drive(tmp_path / "full/2011_09_26/2011_09_26_drive_0001_sync")[1]
+    assert right.camera.cx == 46, "each camera has its own row"
+
+
+def test_grey_cameras_where_there_is_no_colour(tmp_path: Path, write_raw: WriteDrive) -> None:
+    drive = write_raw(tmp_path)
+    shutil.copytree(drive / "image_02", drive / "image_00")
+    for camera in ("image_02", "image_03"):
+        shutil.rmtree(drive / camera)
+    (recording,) = open_drive(drive)
+    assert recording.images[0].parts[-3] == "image_00"
+
+
+def test_what_is_missing(tmp_path: Path, write_raw: WriteDrive) -> None:
+    drive = write_raw(tmp_path)
+    frame = drive / "image_02/data/0000000002.png"
+    content = frame.read_bytes()
+    frame.unlink()
+    assert "has no frame 0000000002: KITTI numbers from 0; found 0000000003.png there" in refusal(tmp_path)
+    frame.write_bytes(content)
+    calibration = tmp_path / "2011_09_26/calib_cam_to_cam.txt"
+    calibration.write_text("S_rect_02: 96 64\n")
+    assert "no valid rows S_rect_02 (2 numbers) and P_rect_02 (12)" in refusal(tmp_path)
+    calibration.unlink()
+    assert "calib_cam_to_cam.txt is missing" in refusal(tmp_path)
+
+
+def test_images_of_another_camera(tmp_path: Path, write_raw: WriteDrive) -> None:
+    drive = write_raw(tmp_path)
+    cv2.imwrite(str(drive / "image_02/data/0000000000.png"), np.zeros((64, 64, 3), np.uint8))
+    error = refusal(tmp_path)
+    assert "is 64 x 64, but camera 02 in" in error
+    assert "is 96 x 64: the images were cropped or are of another camera" in error
+
+
+def test_an_unrectified_drive(tmp_path: Path) -> None:
+    drive = tmp_path / "2011_09_26_drive_0001_extract"
+    drive.mkdir()
+    assert "is not rectified: download the drive as synced+rectified" in refusal(drive)
+
+
+@pytest.mark.data
+def test_a_real_drive(data_root: Path) -> None:
+    (recording,) = discover(data_root / "kitti_raw")
+    assert recording.frames_name == "kitti_raw/2011_09_26_drive_0013[0:144]"
+    camera = recording.camera
+    assert (camera.width, camera.height) == (828, 250)
+    assert camera.fx == pytest.approx(721.5377 * 828 / 1242)
+    assert camera.cy == pytest.approx((172.854 + 0.5) * 250 / 375 - 0.5)

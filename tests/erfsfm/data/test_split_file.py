@@ -1,0 +1,66 @@
+"""Splits as files: what is shipped, how frames are written, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from erfsfm.data.split_file import Split, read_split_file
+from erfsfm.data.splits import overlapping
+from erfsfm.errors import DataError
+
+SHIPPED = sorted(path.stem for path in (Path(__file__).parents[3] / "configs" / "splits").glob("*.yaml"))
+
+
+def test_shipped_splits() -> None:
+    assert SHIPPED == ["eigen", "odometry"]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_nothing_is_in_two_lists(name: str) -> None:
+    split = read_split_file(name)
+    assert split.train
+    assert split.validation
+    assert overlapping([*split.train, *split.validation], split.test_recordings) == []
+    assert overlapping(split.train, split.validation) == []
+    everything = [*split.train, *split.validation, *split.test_recordings]
+    assert len(set(everything)) == len(everything) == {"eigen": 61, "odometry": 11}[name]
+
+
+@pytest.mark.parametrize(
+    ("runs", "frames"),
+    [("3", [3]), ("0:3", [0, 1, 2]), ("0:7:3", [0, 3, 6]), ("0:7:3, 9,11:13", [0, 3, 6, 9, 11, 12])],
+)
+def test_runs(runs: str, frames: list[int]) -> None:
+    assert Split(test=[f"kitti_raw/a[{runs}]"]).test_frames() == [("kitti_raw/a", frame) for frame in frames]
+
+
+@pytest.mark.parametrize(
+    "name", ["kitti_raw/a", "kitti_raw/a[]", "kitti_raw/a[:]", "a[1:]", "a[0:9:0]", "a[1,,2]", "a[x]"]
+)
+def test_runs_that_are_none(name: str) -> None:
+    with pytest.raises(DataError, match="names no single frames"):
+        Split(test=[name]).test_frames()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("tests: [a]", "is no split, a file of the lists train, validation and test: tests: Extra inputs"),
+        ("test: a", "test: Input should be a valid list"),
+        ("- a", "all of it: Input should be a valid dictionary"),
+        ("test: [", "is not YAML"),
+    ],
+)
+def test_files_that_are_no_splits(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(DataError, match=words) as caught:
+        read_split_file(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_split() -> None:
+    with pytest.raises(DataError, match="no split 'eigne': neither a file nor one of eigen, odometry"):
+        read_split_file("eigne")

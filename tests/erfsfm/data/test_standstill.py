@@ -1,0 +1,89 @@
+"""Which frames of a raw drive are left out because the car stands, by its speed and by its images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.data.kitti_raw import open_drive
+from erfsfm.data.recordings import Recording
+from erfsfm.data.standstill import moving_parts
+from erfsfm.errors import DataError
+
+WriteDrive = Callable[..., Path]
+
+
+def spans(recording: Recording) -> list[tuple[int, int]]:
+    return [(part.start, part.start + len(part)) for part in moving_parts(recording)]
+
+
+@pytest.mark.parametrize(
+    ("speeds", "expected"),
+    [
+        ([10] * 6, [(0, 6)]),
+        ([0] * 6, []),
+        ([10, 10, 0, 0.3, 9, 9], [(0, 2), (4, 6)]),
+        ([0, 0.6, 0, 0, 0, 5], [(1, 2), (5, 6)]),
+    ],
+)
+def test_by_speed(tmp_path: Path, write_raw: WriteDrive, speeds: list[float], expected: list[tuple[int, int]]) -> None:
+    for recording in open_drive(write_raw(tmp_path, speeds=speeds)):
+        assert spans(recording) == expected
+
+
+def test_parts_of_parts_keep_their_numbers(tmp_path: Path, write_raw: WriteDrive) -> None:
+    left, _ = open_drive(write_raw(tmp_path, speeds=[9, 9, 9, 0, 9, 9, 9]))
+    names = [part.frames_name for part in moving_parts(left.part(1, 6))]
+    assert names == [f"{left.name}[1:3]", f"{left.name}[4:6]"]
+
+
+def test_a_missing_packet(tmp_path: Path, write_raw: WriteDrive) -> None:
+    drive = write_raw(tmp_path, speeds=[9, 9, 9])
+    (drive / "oxts/data/0000000001.txt").write_text("49.0 8.4\n")
+    with pytest.raises(DataError, match=r"0000000001\.txt must hold the 30 numbers"):
+        moving_parts(open_drive(drive)[0])
+    (drive / "oxts/data/0000000001.txt").unlink()
+    with pytest.raises(DataError, match=r"0000000001\.txt is missing: the speed"):
+        moving_parts(open_drive(drive)[0])
+
+
+def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> np.ndarray:
+    """A picture that the camera's motion shifts, with a car that passes, noise and an exposure."""
+    v, u = np.mgrid[:64, :208].astype(np.float64)
+    picture = 110 + 45 * np.sin((u + shift) / 9) * np.cos(v / 7)
+    picture[20:50, traffic : traffic + 50] = 230
+    noisy = gain + picture + rng.normal(0, 1, picture.shape)
+    return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def test_by_images_where_there_is_no_speed(tmp_path: Path, write_raw: WriteDrive) -> None:
+    """Traffic, noise and exposure change while the car stands from frame 3 to 6: its images stay those of frame 3."""
+    drive = write_raw(tmp_path, speeds=None, frames=10, size=(64, 208))
+    shifts = [0, 4, 8, 12, 12, 12, 12, 16, 20, 24]
+    for camera in ("image_02", "image_03"):
+        rng = np.random.default_rng(1)
+        for index, shift in enumerate(shifts):
+            image = street(shift, 10 * index, 12 * (index % 2), rng)
+            cv2.imwrite(str(drive / camera / "data" / f"{index:010d}.png"), image)
+    for recording in open_drive(drive):
+        assert recording.oxts is None
+        assert spans(recording) == [(0, 4), (7, 10)]
+
+
+def test_one_frame_alone(tmp_path: Path, write_raw: WriteDrive) -> None:
+    left, _ = open_drive(write_raw(tmp_path, speeds=None, frames=1))
+    assert spans(left) == [(0, 1)]
+
+
+@pytest.mark.data
+def test_real_recordings_never_stand(data_root: Path) -> None:
+    """A drive at 38 km/h and more: both ways of knowing say so."""
+    (drive,) = (data_root / "kitti_raw/2011_09_26").glob("*_0013_sync")
+    (recording,) = open_drive(drive)
+    assert spans(recording) == [(0, 144)]
+    blind = Recording(recording.name, recording.images[:40], recording.camera)
+    assert spans(blind) == [(0, 40)]

@@ -1,0 +1,79 @@
+"""Videos: every frame in its place, at any order of asking, and what is said of damaged ones."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.data import video as module
+from erfsfm.data.video import Video
+from erfsfm.errors import DataError
+
+FRAMES, SIZE = 40, (48, 32)
+
+
+def write(path: Path, frames: int = FRAMES, codec: str = "mp4v") -> Path:
+    """Frame k is painted 5 k, and a bar of its own makes each depend on the one before in the codec's eyes."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 10, SIZE)
+    for index in range(frames):
+        image = np.full((SIZE[1], SIZE[0], 3), 5 * index, np.uint8)
+        image[:, index % SIZE[0]] = 255
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def number(image: np.ndarray) -> int:
+    return round((float(np.median(image)) + 2) / 5)  # codecs darken by up to 3 levels
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")])
+def test_any_frame_at_any_time(tmp_path: Path, suffix: str, codec: str) -> None:
+    video = Video(write(tmp_path / f"a{suffix}", codec=codec))
+    assert (len(video), video.width, video.height) == (FRAMES, *SIZE)
+    order = [0, 39, 7, 8, 30, 2, 39, 7]
+    assert [number(video.image(index, 32, 48)) for index in order] == order
+
+
+def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = Video(write(tmp_path / "a.mp4"))
+    opened: list[Path] = []
+    monkeypatch.setattr(module, "_open", lambda path: opened.append(path) or cv2.VideoCapture(str(path)))
+    small = [video.image(index, 16, 24) for index in (9, 3, 9)]
+    assert len(opened) == 1
+    assert small[0].shape == (16, 24, 3)
+    assert video.image(9, 32, 48).shape == (32, 48, 3)
+    assert len(opened) == 2
+
+
+def test_a_video_that_was_cut_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """An avi keeps its count of frames in front: half the file has half of them, and that is said."""
+    path = write(tmp_path / "a.avi", codec="MJPG")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with caplog.at_level(logging.WARNING):
+        video = Video(path)
+    assert 5 <= len(video) <= 30
+    assert f"announces {FRAMES} frames and has {len(video)}: it may be cut off" in caplog.text
+    assert number(video.image(len(video) - 2, 32, 48)) == len(video) - 2
+
+
+def test_a_video_that_breaks_after_it_was_counted(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.avi", codec="MJPG")
+    video = Video(path)
+    write(path, 12, "MJPG")
+    with pytest.raises(DataError, match=r"frame 12 of .*a\.avi cannot be decoded"):
+        video.image(0, 32, 48)
+
+
+@pytest.mark.parametrize("content", [b"", b"no video", "half"])
+def test_no_video(tmp_path: Path, content: bytes | str) -> None:
+    """An mp4 keeps its index at the end: half of one cannot be read at all."""
+    path = write(tmp_path / "a.mp4")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if isinstance(content, str) else content)
+    with pytest.raises(DataError, match=r"a\.mp4 cannot be read as a video: .*copy it again") as caught:
+        Video(path)
+    assert "\n" not in str(caught.value)

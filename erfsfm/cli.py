@@ -268,7 +268,7 @@ def evaluate_depth(
 @evaluate_app.command("pose")
 def evaluate_pose(
     dataset: Annotated[Path, typer.Option(help="a KITTI odometry root with poses")],
-    sequence: Annotated[list[str], typer.Option(help="sequence names; repeat")],
+    sequence: Annotated[list[str], typer.Option(help="sequence names, or frames of one: 00[250:300]; repeat")],
     weights: Weights = "default",
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
+from erfsfm.data.splits import FrameRange
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
@@ -76,7 +77,8 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
 def pose_protocol(
     networks: Networks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
-    """Five-frame snippets of each sequence: the networks, and a straight constant motion.
+    """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and a straight
+    constant motion.
 
     In paper fidelity the truth is that of camera 0, whichever camera took the images.
 
@@ -88,19 +90,26 @@ def pose_protocol(
     found = {r.name: r for r in recordings} | {r.sequence: r for r in recordings}
     rows = []
     for name in sequences:
-        recording = found.get(name)
-        if recording is None:
-            raise DataError(f"no sequence {name} in {root}: found {', '.join(sorted(found)) or 'none'}")
+        span = FrameRange.parse(name)
+        whole = found.get(span.recording)
+        if whole is None:
+            raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
+        recording = whole.part(span.start, span.stop)
         T_world_camera = recording.true_poses(fidelity)
         if T_world_camera is None:
             raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
         leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak)
+        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, partly=recording != whole)
     return rows
 
 
 def _pose_rows(
-    networks: Networks, recording: Recording, T_world_camera: NDArray[np.float64], fidelity: Fidelity, leak: bool
+    networks: Networks,
+    recording: Recording,
+    T_world_camera: NDArray[np.float64],
+    fidelity: Fidelity,
+    leak: bool,
+    partly: bool,
 ) -> list[dict[str, Any]]:
     length = networks.sources + 1
     if length != 5:
@@ -111,10 +120,11 @@ def _pose_rows(
     predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in _windows(networks, recording)])
     straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
+    shown = recording.frames_name if partly else recording.name
     rows = []
     for name, guess in (("networks", predicted), ("straight constant motion", straight)):
         errors = snippet_errors(guess, true, fidelity=fidelity)
-        row = {"method": name, "recording": recording.name, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
+        row = {"method": name, "recording": shown, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
         rows.append(row | {"re_mean": errors.re_mean, "re_std": errors.re_std, "snippets": errors.count, "leak": leak})
     return rows
 

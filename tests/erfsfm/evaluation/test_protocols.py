@@ -60,6 +60,16 @@ def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> Non
     assert networks["leak"] is False
 
 
+def test_frames_of_a_sequence_are_held_against_what_was_seen(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=20, step=STEP)
+    seen = Oracle(STEP, seen=["kitti_odometry/00[0:12]"])
+    networks, _ = pose_protocol(seen, tmp_path, ["00[12:]"], "default", allow_leak=False)
+    assert networks["snippets"] == 4 and networks["leak"] is False
+    assert networks["recording"] == "kitti_odometry/00[12:20]"
+    with pytest.raises(DataError):
+        pose_protocol(seen, tmp_path, ["00[11:]"], "default", allow_leak=False)
+
+
 def test_sequences_of_a_simulated_root_go_by_their_folder(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=5, seed=600, step=STEP)
     for name in ("00", "simulated/600"):

@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from kiss_icp.config import load_config as kiss_icp_defaults
+from kiss_icp.config import load_config as load_kiss_icp_config
 from kiss_icp.kiss_icp import KissICP
 from rich.console import Console
 
@@ -28,13 +28,16 @@ from slam.errors import SlamError
 from slam.evaluation import trajectory_metrics
 from slam.frames import DepthMap, Intrinsics
 from slam.networks import NetworkPredictor
-from slam.pipeline import SlamPipeline, SlamResult
+from slam.observation import Keyframe
+from slam.pipeline import SlamPipeline
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.excerpt import Excerpt
 from slam.tables import metrics_table
 from slam.trajectory import Trajectory
 
 SEED = 0
+EDGE_SHARE = 0.12  # relative step of depth around a pixel, as where the map leaves edges out
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -51,48 +54,61 @@ def main(words: Sequence[str] | None = None) -> None:
         raise SystemExit(str(error)) from error
     if result.reference is None or not result.observations.keyframes:
         raise SystemExit(f"{recording.name} has no true poses to compare with, or mapping.enabled=false kept no depth")
+    keyframes = result.observations.keyframes
+    rows = np.array([keyframe.index for keyframe in keyframes])
+    truth = result.reference.select(rows).rebased()
     one_unit = np.full(len(recording), np.median(result.scale.per_frame))
-    estimates = {
-        "network": result.network,
-        "odometry": result.odometry,
-        "optimised": result.optimised,
-        "kiss-icp, one unit": registered(result, recording.intrinsics, one_unit, options),
-        "kiss-icp, unit of each frame": registered(result, recording.intrinsics, result.scale.per_frame, options),
+    clouds = {
+        "kiss-icp, one unit": in_metres(keyframes, one_unit),
+        "kiss-icp, unit of each frame": in_metres(keyframes, result.scale.per_frame),
     }
-    rows = [keyframe.index for keyframe in result.observations.keyframes]
-    truth = result.reference.select(np.array(rows)).rebased()
+    if options.true_depth is not None:
+        first = recording.start if isinstance(recording, Excerpt) else 0
+        clouds["kiss-icp, true depth"] = [true_depth(options.true_depth, first + int(row)) for row in rows]
     measured = {
-        name: trajectory_metrics(estimate, truth if len(estimate) == len(truth) else result.reference)
-        for name, estimate in estimates.items()
+        name: trajectory_metrics(estimate, result.reference)
+        for name, estimate in (
+            ("network", result.network),
+            ("odometry", result.odometry),
+            ("optimised", result.optimised),
+        )
     }
+    for name, depths in clouds.items():
+        T_first_camera = registered(depths, recording.intrinsics, options.far_m, options.voxel_m, options.share)
+        measured[name] = trajectory_metrics(Trajectory(truth.stamps, T_first_camera), truth)
     title = f"{recording.name}, {len(rows)} of {len(recording)} frames, scale mode {result.scale.mode}"
     Console(width=options.columns).print(metrics_table(measured, title))
 
 
-def registered(result: SlamResult, intrinsics: Intrinsics, unit: FloatArray, options: argparse.Namespace) -> Trajectory:
-    """The path by kiss-icp on the depth of all frames that the run could use.
+def in_metres(keyframes: Sequence[Keyframe], unit: FloatArray) -> list[DepthMap]:
+    """Depth ``(H, W)`` of keyframes; ``unit`` ``(N,)`` are the metres in an unscaled length at every frame."""
+    return [keyframe.depth_unscaled * np.float32(unit[keyframe.index]) for keyframe in keyframes]
 
-    Args:
-        result: a run whose observations kept depth.
-        intrinsics: of the recording.
-        unit: ``(N,)`` metres per unscaled length of each frame.
-        options: range, voxel and share of pixels.
-    """
-    settings = kiss_icp_defaults(None)
+
+def true_depth(folder: Path, frame: int) -> DepthMap:
+    """Depth ``(H, W)``, metres, as ``erfsfm-slam simulate --depth`` writes it, infinite where nothing was hit."""
+    raw = cv2.imread(str(folder / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
+    if raw is None:
+        raise SystemExit(f"{folder} has no depth map {frame:06d}.png")
+    return np.where(raw > 0, raw / np.float32(256), np.float32(np.inf))
+
+
+def registered(
+    depths: Sequence[DepthMap], intrinsics: Intrinsics, far_m: float, voxel_m: float, share: float
+) -> FloatArray:
+    """``T_first_camera`` ``(N, 4, 4)``, metres, of depth maps in time order; the rest as in ``cloud``."""
+    settings = load_kiss_icp_config(None)
     settings.data.deskew = False
-    settings.data.max_range = 2 * options.far_m  # points at far_m of depth lie farther aside
-    settings.mapping.voxel_size = options.voxel_m
+    settings.data.max_range = 2 * far_m  # a point at far_m of depth is farther away than that
+    settings.mapping.voxel_size = voxel_m
     settings.registration.max_num_threads = 1  # the same bytes every time
     odometry = KissICP(settings)
     rng = np.random.default_rng(SEED)
     T_first_camera = []
-    for keyframe in result.observations.keyframes:
-        depth = keyframe.depth_unscaled * np.float32(unit[keyframe.index])
-        odometry.register_frame(cloud(depth, intrinsics, options.far_m, options.share, rng), np.array([]))
+    for depth in depths:
+        odometry.register_frame(cloud(depth, intrinsics, far_m, share, rng), np.array([]))
         T_first_camera.append(odometry.last_pose.copy())
-    T_world_camera = np.stack(T_first_camera)
-    stamps = result.reference.stamps[[keyframe.index for keyframe in result.observations.keyframes]]
-    return Trajectory(stamps, invert(T_world_camera[0]) @ T_world_camera)
+    return invert(T_first_camera[0]) @ np.stack(T_first_camera)
 
 
 def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:
@@ -104,15 +120,12 @@ def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, r
     height, width = depth.shape
     camera = intrinsics.resized(width, height)
     window = np.ones((3, 3), np.uint8)
-    smooth = cv2.dilate(depth, window) - cv2.erode(depth, window) < EDGE_SHARE * depth
+    smooth = cv2.dilate(depth, window) < (1 + EDGE_SHARE) * cv2.erode(depth, window)
     kept = rng.permutation(np.flatnonzero(smooth & (depth < far_m)))
     kept = kept[: round(share * len(kept))]
     v, u = np.divmod(kept, width)
     z = depth.ravel()[kept].astype(np.float64)
     return np.column_stack([z * (u - camera.cx) / camera.fx, z * (v - camera.cy) / camera.fy, z])
-
-
-EDGE_SHARE = 0.12  # relative step of depth around a pixel, as where the map leaves edges out
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -124,8 +137,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--weights", default="default")
     add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="of the run")
     add("--cache", type=Path, help="folder that keeps the networks' answers")
-    add("--far-m", type=float, default=25.0, help="points beyond are left out")
-    add("--voxel-m", type=float, default=0.5, help="voxel of kiss-icp's map")
+    add("--true-depth", type=Path, metavar="FOLDER", help="16-bit depth maps (metres x 256) to register as a control")
+    add("--far-m", type=float, default=40.0, help="points beyond are left out")
+    add("--voxel-m", type=float, default=1.0, help="voxel of kiss-icp's map")
     add("--share", type=float, default=0.3, help="of the pixels that become points")
     add("--columns", type=int, default=160, help="width of the table")
     return parser

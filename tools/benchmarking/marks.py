@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from benchmarking.cells import Cell, middle_and_extreme, spread, table, values, weights
-from benchmarking.quantities import ATE_7, FALSE_LOOPS, MEMORY, NETWORK_PERCENT, OF_NETWORK, PERCENT, RATE, TRUE_LOOPS
+from benchmarking.quantities import (
+    ATE_7,
+    CPU,
+    FALSE_LOOPS,
+    MEMORY,
+    NETWORK_PERCENT,
+    OF_NETWORK,
+    PERCENT,
+    RATE,
+    TRUE_LOOPS,
+)
 from benchmarking.work import Outcome
 
 
@@ -21,6 +31,7 @@ def marks(outcomes: Sequence[Outcome]) -> str:
         "drives with a true loop": found,
         "false loops": lambda group: f"{sum(values(group, FALSE_LOOPS)):.0f}",
         "frames / s": middle_and_extreme(RATE, min),
+        "CPU ms / frame": middle_and_extreme(CPU, max),
         "peak RSS (MiB)": middle_and_extreme(MEMORY, max),
     }
     return table({"drives": kind, "weights": weights}, columns, outcomes)

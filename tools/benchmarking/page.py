@@ -68,8 +68,8 @@ def accuracy_tables(outcomes: Sequence[Outcome]) -> str:
     quantities += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in quantities}
     picture = f"\n\n![every drive from above]({PICTURE})" if drawable(outcomes) else ""
-    return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised trajectory,
-7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
+    return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
+trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
 {marks(outcomes)}
 

@@ -6,9 +6,12 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from benchmarking.cells import drive, grouped
 from benchmarking.work import Outcome
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from slam.files import write_atomically
 from slam.plots import draw_trajectories, trajectories_of
@@ -16,6 +19,7 @@ from slam.run_folder import RunFolder
 
 SIDE_IN = 1.9
 DPI = 90
+COLOURS = 48  # a third of the bytes of a full palette, and no eye sees it
 
 
 def drawable(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -28,7 +32,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
     chosen = drawable(outcomes)
     columns = math.ceil(math.sqrt(1.6 * len(chosen)))
     rows = math.ceil(len(chosen) / columns)
-    figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), layout="constrained")
+    figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
         [axes] = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
@@ -36,6 +40,10 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
         axes.set(xlabel="", ylabel="")
         axes.set_title(drive(o), fontsize=8)
         axes.tick_params(labelsize=6)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=5, fontsize=9)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    light = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None}))
+    write_atomically(path, lambda file: light.save(file, format="png", optimize=True))

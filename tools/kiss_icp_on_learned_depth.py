@@ -86,11 +86,11 @@ def in_metres(keyframes: Sequence[Keyframe], unit: FloatArray) -> list[DepthMap]
 
 
 def true_depth(folder: Path, frame: int) -> DepthMap:
-    """Depth ``(H, W)``, metres, as ``erfsfm-slam simulate --depth`` writes it, infinite where nothing was hit."""
+    """Depth ``(H, W)``, metres, as ``erfsfm-slam simulate --depth`` writes it, 0 where nothing was hit."""
     raw = cv2.imread(str(folder / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
     if raw is None:
         raise SystemExit(f"{folder} has no depth map {frame:06d}.png")
-    return np.where(raw > 0, raw / np.float32(256), np.float32(np.inf))
+    return np.asarray(raw / np.float32(256))
 
 
 def registered(
@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--true-depth", type=Path, metavar="FOLDER", help="16-bit depth maps (metres x 256) to register as a control")
     add("--far-m", type=float, default=40.0, help="points beyond are left out")
     add("--voxel-m", type=float, default=1.0, help="voxel of kiss-icp's map")
-    add("--share", type=float, default=0.3, help="of the pixels that become points")
+    add("--share", type=float, default=0.1, help="of the pixels that become points")
     add("--columns", type=int, default=160, help="width of the table")
     return parser
 

@@ -59,6 +59,9 @@ PAGE = """# Benchmarks
 Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
 measured with. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale*
 is the factor that the optimised trajectory still needs.
+
+An experiment beside these runs, kiss-icp on the point clouds of learned depth, is told in
+[design/0012](design/0012-kiss-icp-on-learned-depth.md).
 """
 
 

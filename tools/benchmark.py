@@ -2,8 +2,9 @@
 
 accuracy measures simulated worlds and KITTI sequences, ablation turns off one part at a time, speed measures time and
 memory. Every run is a process and a folder of its own under --output. One that ended well is not repeated as long as
-sources, weights and options stay the same; one that failed is a row that says why. --jobs and --scheduler want Dask:
-pip install 'erfsfm-slam[benchmark]'. A scheduler's workers see the same files at the same paths.
+sources, weights and options stay the same, so that a killed benchmark goes on where it was; one that failed is a row
+that says why. --jobs and --scheduler want Dask: pip install 'erfsfm-slam[benchmark]'. A scheduler's workers see the
+same files at the same paths.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -15,9 +16,12 @@ import csv
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
-from benchmarking.page import section, with_section
-from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Job, excerpts, plan, recordings, worlds
+from benchmarking.marks import marks
+from benchmarking.page import PICTURE, section, with_section
+from benchmarking.picture import draw, drawable
+from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Condition, Job, excerpts, plan, recordings, worlds
 from benchmarking.quantities import rows
 from benchmarking.work import ROOT, measured, workers
 
@@ -44,17 +48,22 @@ def main(words: Sequence[str] | None = None) -> None:
         writer.writeheader()
         writer.writerows(table_of_runs)
     text = section(options.mode, _command(options), outcomes, "several" if scheduler else str(at_a_time))
-    for path, name in ((options.output, "OUTPUT"), (options.kitti, "KITTI"), (ROOT, ".")):
+    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), (options.kitti, "KITTI"), (ROOT, ".")
+    for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
     write_atomically(options.report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
+    if options.mode == "accuracy":
+        print(marks(outcomes))
+        if drawable(outcomes):
+            draw(outcomes, options.report.parent / PICTURE)
     print(f"{options.report}: {len(outcomes)} runs, {sum(bool(o.reason) for o in outcomes)} failed")
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     folder = options.output.resolve() / options.mode
-    simulated = options.output.resolve() / "worlds"
-    drives = worlds(simulated, options.routes, options.worlds, options.frames)
+    simulated = (options.worlds_in or options.output / "worlds").resolve()
+    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions)
     if options.kitti is not None:
         drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED}[options.mode]
@@ -70,7 +79,19 @@ def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
     words += ["--kitti", "KITTI"] if options.kitti else []
-    for name in ("weights", "routes", "worlds", "frames", "sequences", "excerpt", "seeds", "growth", "device", "set"):
+    for name in (
+        "weights",
+        "routes",
+        "worlds",
+        "frames",
+        "conditions",
+        "sequences",
+        "excerpt",
+        "seeds",
+        "growth",
+        "device",
+        "set",
+    ):
         value = getattr(options, name, None)
         if value not in (None, ()):
             words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
@@ -95,6 +116,8 @@ def _parser() -> argparse.ArgumentParser:
         add("--routes", nargs="*", default=["loop"] if fast else ["loop", "straight"], help="of simulated worlds")
         add("--worlds", nargs="+", type=int, default=[610, 611] if mode == "accuracy" else [610], help="their seeds")
         add("--frames", type=int, default=300, help="their length")
+        add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
+        add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
         add("--weights", nargs="+", default=["default"] if fast else ["default", "sim"], help="names or folders")
         add("--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the runs")
         add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")

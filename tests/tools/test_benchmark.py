@@ -13,9 +13,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slam.config import SlamConfig, load_config
+from slam.run_folder import RunFolder
+from slam.se3 import from_rotation_vector, invert
+from slam.trajectory import Trajectory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -51,6 +57,16 @@ def page(tools: Callable[[str], ModuleType]) -> ModuleType:
 @pytest.fixture(scope="module")
 def quantities(tools: Callable[[str], ModuleType]) -> ModuleType:
     return tools("benchmarking.quantities")
+
+
+@pytest.fixture(scope="module")
+def judgement(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.judgement")
+
+
+@pytest.fixture(scope="module")
+def marks(tools: Callable[[str], ModuleType]) -> ModuleType:
+    return tools("benchmarking.marks")
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[str, Any]:
@@ -120,6 +136,14 @@ def test_excerpts_share_one_world(plan: ModuleType, tmp_path: Path) -> None:
     assert grid.simulate == ("--route", "grid", "--seed", "610", "--frames", "50")
 
 
+def test_hazards_are_all_at_once_and_know_their_clean_twin(plan: ModuleType, tmp_path: Path) -> None:
+    clean, hard = plan.worlds(tmp_path, ["loop"], [620], 800, ["clean", "hazards"])
+    assert clean.root.name == "loop-620-800-v1"
+    assert hard.root.name == "loop-620-800-hazards-v1"
+    assert (hard.clean, hard.kind) == (clean.name, "loop, hazards")
+    assert hard.simulate == (*clean.simulate, "--hazards", "moving-cars,exposure,blur,stop,rain")
+
+
 def test_recordings_are_all_sequences_or_those_named(
     plan: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,10 +168,66 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     outcomes = outcomes_of(plan, work, job, {"default": [1.0, 3.0]})
     outcomes.append(work.Outcome(replace(job, seed=2), {}, "abc", "out of memory"))
     text = page.accuracy_tables(outcomes)
-    head, row = cells(text)
+    *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
     assert row[head.index("scale")] == "1.100"
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
+
+
+def test_shares_of_path_and_network(judgement: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").write_text("{}")
+    run = metrics(ate=0.9)
+    run["trajectories"]["network"] = {"align": {"7dof": {"ate_rmse_m": 3.6}}}
+    judged = judgement.judged(tmp_path, run)
+    shares = judged["network_percent"], judged["optimised_percent"], judged["of_network"]
+    assert shares == pytest.approx((4.0, 1.0, 0.25))
+    assert judged["false_loops"] is None
+    assert judged["false_loops_reason"] == "the sequence has no true poses"
+    run["sequence"] = {"length_m": None, "length_m_reason": "no truth"}
+    assert judgement.judged(tmp_path, run)["optimised_percent_reason"] == "no truth"
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
+)
+def test_loops_are_sorted_by_the_truth(
+    judgement: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
+) -> None:
+    T_world_camera = np.tile(np.eye(4), (3, 1, 1))
+    T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
+    T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    off = from_rotation_vector(np.deg2rad([0.0, turned_deg, 0.0]), np.array([moved_m, 0.0, 0.0]))
+    loops = [{"from": 1, "to": 2, "T_from_to": (invert(T_world_camera[1]) @ T_world_camera[2] @ off).tolist()}]
+    (tmp_path / "metrics.json").write_text("{}")
+    (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
+    RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
+    judged = judgement.judged(tmp_path, metrics())
+    assert (judged["true_loops"], judged["false_loops"]) == (1 - false, false)
+    in_heights = metrics() | {"scale": {"mode": "none", "value": 1.0}}
+    assert judgement.judged(tmp_path, in_heights)["true_loops"] is None
+
+
+def test_marks_count_drives_and_pair_hazards_with_their_clean_twins(
+    marks: ModuleType, plan: ModuleType, work: ModuleType, job: Any, tmp_path: Path
+) -> None:
+    drives = plan.worlds(tmp_path, ["loop"], [620, 621], 800, ["clean", "hazards"])
+    ates, true_loops = (1.0, 2.0, 1.5, 5.0), (4, 0, 2, 1)
+    outcomes = []
+    for drive, ate, loops in zip(drives, ates, true_loops):
+        judged = {"optimised_percent": ate, "network_percent": 8.0, "of_network": ate / 8}
+        judged |= {"true_loops": loops, "false_loops": 1}
+        outcomes.append(work.Outcome(replace(job, drive=drive), metrics(ate) | {"judgement": judged}, "abc"))
+    outcomes.append(work.Outcome(replace(job, drive=drives[3], seed=1), {}, "abc", "killed"))
+    head, clean, hard = cells(marks.marks(outcomes))
+    for row, drive, runs, failed, ate, over_clean, found, false in (
+        (clean, "loop", "2", "0", "1.50 (2.00)", "–", "1 of 2", "2"),
+        (hard, "loop, hazards", "3", "1", "3.25 (5.00)", "2.00 (2.50)", "2 of 3", "2"),
+    ):
+        assert row[:4] == [drive, "sim", runs, failed]
+        assert row[head.index("ATE, % of path: median (worst)")] == ate
+        assert row[head.index("over the clean drive's")] == over_clean
+        assert row[head.index("drives with a true loop")] == found
+        assert row[head.index("false loops")] == false
 
 
 def test_a_leak_is_told(page: ModuleType, work: ModuleType, job: Any) -> None:
@@ -287,7 +367,7 @@ def test_the_command_is_told_whole_but_without_paths_and_hosts(benchmark: Module
     assert command.startswith(
         "python tools/benchmark.py accuracy --kitti KITTI --weights default sim --routes --worlds"
     )
-    assert command.endswith("--excerpt 0:9 --seeds 0 1 2 --device cpu")
+    assert command.endswith("--conditions clean --excerpt 0:9 --seeds 0 1 2 --device cpu")
 
 
 def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) -> None:
@@ -300,9 +380,11 @@ def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) 
     assert (real["status"], real["frames"], failed["status"]) == ("ok", "8", "failed")
     assert 0 < float(real["ate_7dof_optimised_m"]) < 1
     assert "nonesuch" in failed["reason"]
-    head, *rows = cells(report.read_text())
-    assert [row[head.index("frames")] for row in rows] == ["8", "–"]
+    *_, head, real_row, failed_row = cells(report.read_text())
+    assert [row[head.index("frames")] for row in (real_row, failed_row)] == ["8", "–"]
     assert str(tmp_path) not in report.read_text()
+    assert "](images/trajectories.png)" in report.read_text()
+    assert cv2.imread(str(tmp_path / "images" / "trajectories.png")).std() > 0
 
     (record,) = (tmp_path / "out" / "accuracy").glob("*sim*/record.json")
     before = record.stat().st_mtime_ns

@@ -6,9 +6,25 @@ import math
 import os
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from statistics import fmean, stdev
+from collections.abc import Callable, Iterable, Sequence
+from statistics import fmean
 
+from benchmarking.cells import (
+    Cell,
+    average,
+    average_among,
+    configuration,
+    drive,
+    grouped,
+    mean,
+    over_seeds,
+    table,
+    values,
+    weights,
+)
+from benchmarking.judgement import FALSE_DEG, FALSE_M
+from benchmarking.marks import marks
+from benchmarking.picture import drawable
 from benchmarking.plan import EVERYTHING, GROWTH
 from benchmarking.quantities import (
     ATE_6,
@@ -17,11 +33,14 @@ from benchmarking.quantities import (
     COVERAGE,
     CPU,
     ERRORS,
+    FALSE_LOOPS,
     FRAMES,
     LENGTH,
     LOAD,
     LOOPS,
     MEMORY,
+    OF_NETWORK,
+    PERCENT,
     R_REL,
     RATE,
     SCALE,
@@ -34,23 +53,32 @@ from benchmarking.work import Outcome
 
 from slam.comparison import MISSING, lookup
 
-Label = Callable[[Outcome], str]
-Cell = Callable[[Sequence[Outcome]], str]
-
-
+PICTURE = "images/trajectories.png"  # beside the page
 PAGE = """# Benchmarks
 
 Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
 measured with. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale*
 is the factor that the optimised trajectory still needs.
+
+An experiment beside these runs, kiss-icp on the point clouds of learned depth, is told in
+[design/0012](design/0012-kiss-icp-on-learned-depth.md).
 """
 
 
 def accuracy_tables(outcomes: Sequence[Outcome]) -> str:
-    """One row for each sequence and weights."""
-    quantities = (FRAMES, LENGTH, *ERRORS, R_REL, SCALE, LOOPS, COVERAGE, RATE, MEMORY)
+    """One row for each kind of drive, then one for each sequence and weights."""
+    quantities = (FRAMES, LENGTH, *ERRORS, PERCENT, OF_NETWORK, R_REL, SCALE)
+    quantities += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in quantities}
-    return table({"sequence": _drive, "weights": _weights}, columns, outcomes) + notes(outcomes, quantities)
+    picture = f"\n\n![every drive from above]({PICTURE})" if drawable(outcomes) else ""
+    return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
+trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
+
+{marks(outcomes)}
+
+Every drive:
+
+{table({"sequence": drive, "weights": weights}, columns, outcomes)}{picture}{notes(outcomes, quantities)}"""
 
 
 def ablation_tables(outcomes: Sequence[Outcome]) -> str:
@@ -58,9 +86,9 @@ def ablation_tables(outcomes: Sequence[Outcome]) -> str:
     errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, TRIANGLES, MEMORY)
     columns = {f"{q.title}: ratio (worst)": against_everything(q, outcomes) for q in errors}
     columns |= {q.title: average(q) for q in others}
-    drives = grouped(outcomes, _drive, _weights)
-    by_drive = {", ".join(label): average(ATE_7, drive) for label, drive in drives.items()}
-    rows = {"configuration": _configuration}
+    drives = grouped(outcomes, drive, weights)
+    by_drive = {", ".join(label): average_among(ATE_7, group) for label, group in drives.items()}
+    rows = {"configuration": configuration}
     return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
 above 1, the part helps. The rest are means.
 
@@ -75,7 +103,7 @@ def speed_tables(outcomes: Sequence[Outcome]) -> str:
     """Frames a second, shares of the stages, growth with the number of frames."""
     growth = [o for o in outcomes if o.job.configuration.name == GROWTH.name]
     whole = [o for o in outcomes if o not in growth]
-    rows = {"sequence": _drive, "weights": _weights, "configuration": _configuration}
+    rows = {"sequence": drive, "weights": weights, "configuration": configuration}
     costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
     shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
     by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
@@ -90,7 +118,7 @@ Share of every stage, %:
 
 Growth with the number of frames, without fusion; stages in ms / frame:
 
-{table({"sequence": _drive, "weights": _weights}, by_stage, growth)}{notes(outcomes, (*costs, *grown))}"""
+{table({"sequence": drive, "weights": weights}, by_stage, growth)}{notes(outcomes, (*costs, *grown))}"""
 
 
 TABLES: dict[str, Callable[[Sequence[Outcome]], str]] = {
@@ -100,50 +128,16 @@ TABLES: dict[str, Callable[[Sequence[Outcome]], str]] = {
 }
 
 
-def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], outcomes: Sequence[Outcome]) -> str:
-    """Markdown: one row for each group of outcomes that share their labels."""
-    lines = ["| " + " | ".join([*rows, *columns]) + " |", "|" + "---|" * len(rows) + "---:|" * len(columns)]
-    for label, group in grouped(outcomes, *rows.values()).items():
-        lines.append("| " + " | ".join([*label, *(cell(group) for cell in columns.values())]) + " |")
-    return "\n".join(lines)
-
-
-def grouped(outcomes: Sequence[Outcome], *labels: Label) -> dict[tuple[str, ...], list[Outcome]]:
-    """Outcomes by what they share, in order of appearance."""
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
-    for o in outcomes:
-        groups.setdefault(tuple(label(o) for label in labels), []).append(o)
-    return groups
-
-
-def over_seeds(quantity: Quantity) -> Cell:
-    """Mean and, where it is more than nothing, sample standard deviation."""
-
-    def cell(group: Sequence[Outcome]) -> str:
-        values = _values(group, *quantity.path)
-        deviation = round(stdev(values), quantity.decimals) if len(values) > 1 else 0.0
-        return _mean(values, quantity.decimals) + (f" ± {deviation:.{quantity.decimals}f}" if deviation else "")
-
-    return cell
-
-
-def average(quantity: Quantity, among: Sequence[Outcome] | None = None) -> Cell:
-    """Mean over a group, or over those of it that are among others too."""
-    return lambda group: _mean(
-        _values([o for o in group if among is None or o in among], *quantity.path), quantity.decimals
-    )
-
-
 def against_everything(quantity: Quantity, outcomes: Sequence[Outcome]) -> Cell:
     """Geometric mean and worst of the ratios to the runs with everything on."""
 
     def key(o: Outcome) -> tuple[str, str, int]:
         return o.job.drive.name, o.job.weights, o.job.seed
 
-    base = {key(o): _values([o], *quantity.path) for o in outcomes if o.job.configuration.name == EVERYTHING.name}
+    base = {key(o): values([o], quantity) for o in outcomes if o.job.configuration.name == EVERYTHING.name}
 
     def cell(group: Sequence[Outcome]) -> str:
-        pairs = [(value, *base.get(key(o), [])) for o in group for value in _values([o], *quantity.path)]
+        pairs = [(value, *base.get(key(o), [])) for o in group for value in values([o], quantity)]
         ratios = [pair[0] / pair[1] for pair in pairs if len(pair) == 2 and min(pair) > 0]
         return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else MISSING
 
@@ -152,18 +146,18 @@ def against_everything(quantity: Quantity, outcomes: Sequence[Outcome]) -> Cell:
 
 def stage_share(stage: str) -> Cell:
     """Per cent of the time of a run."""
-    return lambda group: _mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
+    return lambda group: mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
 
 
 def rest_share(group: Sequence[Outcome]) -> str:
     """Per cent outside of every stage."""
     shares = [100 - 100 * sum(_stage(o, s) for s in stages([o])) / _seconds(o) for o in group if not o.reason]
-    return _mean(shares, 1)
+    return mean(shares, 1)
 
 
 def stage_ms(stage: str) -> Cell:
     """Milliseconds a frame."""
-    return lambda group: _mean(
+    return lambda group: mean(
         [1e3 * _stage(o, stage) / o.metrics["sequence"]["frames"] for o in group if not o.reason], 2
     )
 
@@ -204,27 +198,6 @@ def with_section(page: str, new: str) -> str:
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
     order = [f"## {mode.capitalize()}" for mode in TABLES]
     return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=order.index))])
-
-
-def _drive(o: Outcome) -> str:
-    return o.job.drive.name
-
-
-def _weights(o: Outcome) -> str:
-    return o.job.weights
-
-
-def _configuration(o: Outcome) -> str:
-    return o.job.configuration.name
-
-
-def _values(outcomes: Sequence[Outcome], *path: str) -> list[float]:
-    found = (lookup(o.metrics, *path)[0] for o in outcomes)
-    return [value for value in found if value is not None]
-
-
-def _mean(values: Sequence[float], decimals: int) -> str:
-    return f"{fmean(values):.{decimals}f}" if values else MISSING
 
 
 def _stage(o: Outcome, stage: str) -> float:

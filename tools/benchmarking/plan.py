@@ -6,18 +6,25 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
+
+Condition = Literal["clean", "hazards"]
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options."""
+    """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options.
+
+    Drives of one ``kind`` are counted together; ``clean`` names the same drive without hazards.
+    """
 
     name: str
     root: Path
     sequence: str = "sim"
     frames: str | None = None
     simulate: tuple[str, ...] = ()
+    kind: str = ""
+    clean: str = ""
 
 
 @dataclass(frozen=True)
@@ -30,26 +37,30 @@ class Configuration:
 
 
 _UNINFORMATIVE = 100.0  # sigma of a logarithm: nothing is learned from the measurement
+_NEVER = 1e9  # a limit that nothing reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
-ABLATION = (
-    EVERYTHING,
-    *(
-        Configuration(name, (*QUIET, override), "keep")
-        for name, override in {
-            "no loops": "loops.enabled=false",
-            "no image geometry": "geometry.enabled=false",
-            "no lengths from the road's motion": "road.enabled=false",
-            "no lengths from learned depth": f"lengths.learned_sigma={_UNINFORMATIVE}",
-            "no ratios of neighbouring steps": f"lengths.ratio_sigma={_UNINFORMATIVE}",
-            "no bridging": "bridging.enabled=false",
-            "no robust noise": "pose_graph.kernel=none",
-            "no fusion": "mapping.enabled=false",
-            "network factors on every step": "frontend.use=always",
-        }.items()
+_PARTS: dict[str, tuple[str, ...]] = {
+    "no image geometry": ("geometry.enabled=false",),
+    "no lengths from the road's motion": ("road.enabled=false",),
+    "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
+    "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
+    "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
+    "no noise from the drive": (
+        "geometry.shake_rotation_share=0",
+        "geometry.shake_direction_share=0",
+        "geometry.length_spread_share=0",
     ),
-)
+    "no bridging": ("bridging.enabled=false",),
+    "network factors on every step": ("frontend.use=always",),
+    "no loops": ("loops.enabled=false",),
+    "no support among loops": ("loops.min_support=0",),
+    "no robust noise": ("pose_graph.kernel=none",),
+    "no loop given up": (f"pose_graph.max_loop_residual={_NEVER}",),
+    "no fusion": ("mapping.enabled=false",),
+}
+ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _PARTS.items()))
 SPEED = (
     Configuration("networks asked"),
     Configuration("cache filled", cache="fill"),
@@ -109,26 +120,32 @@ def plan(
     return [Job(folder, d, w, c, s, device) for c in changed for s in seeds for w in weights for d in drives]
 
 
-def worlds(folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int) -> list[Drive]:
-    """Simulated drives, in folders that name everything that decides them."""
+def worlds(
+    folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int, conditions: Sequence[Condition] = ("clean",)
+) -> list[Drive]:
+    """Simulated drives, in folders that name everything that decides them; ``hazards`` are all of them at once."""
     from slam.sequences.simulated import VERSION
+    from slam.sequences.simulation.hazards import Hazard
 
-    return [
-        Drive(
-            name=f"{route} {seed}",
-            root=folder / f"{route}-{seed}-{frames}-v{VERSION}",
-            simulate=("--route", route, "--seed", str(seed), "--frames", str(frames)),
-        )
-        for route in routes
-        for seed in seeds
-    ]
+    every_hazard = ",".join(get_args(Hazard))
+
+    def world(route: str, seed: int, condition: Condition) -> Drive:
+        name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames))
+        if condition == "clean":
+            return Drive(name, folder / f"{route}-{seed}-{frames}-v{VERSION}", simulate=words, kind=route)
+        root = folder / f"{route}-{seed}-{frames}-{condition}-v{VERSION}"
+        simulate = (*words, "--hazards", every_hazard)
+        return Drive(f"{name}, {condition}", root, simulate=simulate, kind=f"{route}, {condition}", clean=name)
+
+    return [world(route, seed, condition) for condition in conditions for route in routes for seed in seeds]
 
 
 def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[Drive]:
     """The sequences of a KITTI odometry root, all of them or those named."""
     from slam.sequences.catalogue import sequence_names
 
-    return [Drive(f"KITTI {name}", kitti, name, frames) for name in names or sequence_names(kitti)]
+    chosen = names or sequence_names(kitti)
+    return [Drive(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
 
 
 def excerpts(drive: Drive, counts: Sequence[int]) -> list[Drive]:

@@ -35,7 +35,12 @@ ERRORS = tuple(_error(trajectory, dof) for dof in "76" for trajectory in ("netwo
 ATE_7, ATE_6 = ERRORS[2], ERRORS[5]
 R_REL = Quantity("r_rel_deg_per_100m", "r_rel (deg / 100 m)", (*_ALIGNED, "r_rel_deg_per_100m"), 2)
 SCALE = Quantity("scale", "scale", (*_ALIGNED, "scale"), 3)
+PERCENT = Quantity("ate_7dof_optimised_percent", "% of path", ("judgement", "optimised_percent"), 2)
+NETWORK_PERCENT = Quantity("ate_7dof_network_percent", "network, % of path", ("judgement", "network_percent"), 2)
+OF_NETWORK = Quantity("ate_7dof_of_network", "of network's", ("judgement", "of_network"), 2)
 LOOPS = Quantity("loops_accepted", "loops closed", ("loops", "accepted"), 0)
+TRUE_LOOPS = Quantity("loops_true", "true loops", ("judgement", "true_loops"), 0)
+FALSE_LOOPS = Quantity("loops_false", "false loops", ("judgement", "false_loops"), 0)
 COVERAGE = Quantity("coverage_95", "coverage of 95 %", ("graph", "coverage", "95"), 2)
 TRIANGLES = Quantity("map_triangles", "map triangles", ("map", "triangles"), 0)
 RATE = Quantity("frames_per_second", "frames / s", ("timing", "frames_per_second"), 1)
@@ -45,7 +50,8 @@ COMMAND = Quantity("command_seconds", "whole command (s)", ("process", "seconds"
 LOAD = Quantity("load_average", "load before", ("process", "load"), 1)
 TIME = Quantity("ms_per_frame", "ms / frame", ("process", "ms_per_frame"), 1)
 CPU = Quantity("cpu_ms_per_frame", "CPU ms / frame", ("process", "cpu_ms_per_frame"), 1)
-QUANTITIES = (FRAMES, LENGTH, *ERRORS, R_REL, SCALE, LOOPS, COVERAGE, TRIANGLES)
+QUANTITIES = (FRAMES, LENGTH, *ERRORS, PERCENT, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
+QUANTITIES += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
 QUANTITIES += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)
 
 

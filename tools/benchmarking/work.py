@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarking import plan
+from benchmarking.judgement import judged
 from benchmarking.plan import Drive, Job
 
 from slam.comparison import failure
@@ -25,6 +26,7 @@ from slam.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # what decides the numbers
+BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # of hundreds of runs, and no table reads them
 
 Spread = Callable[[Callable[[Any], None], Sequence[Any]], Iterable[None]]
 
@@ -62,6 +64,8 @@ def perform(job: Job) -> None:
         start = time.perf_counter()
         finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
         record |= {"seconds": time.perf_counter() - start, "reason": _reason(finished)}
+        for name in BULKY:
+            (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
 
 
@@ -83,7 +87,7 @@ def _read_outcome(job: Job, record: Mapping[str, Any]) -> Outcome:
         "ms_per_frame": 1e3 * timing["seconds_total"] / frames,
         "cpu_ms_per_frame": 1e3 * timing["cpu_seconds"] / frames,
     }
-    return Outcome(job, metrics | {"process": process}, commit)
+    return Outcome(job, metrics | {"process": process, "judgement": judged(job.place / "run", metrics)}, commit)
 
 
 def _slam(*arguments: str) -> list[str]:

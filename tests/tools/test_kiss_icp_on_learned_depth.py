@@ -1,0 +1,53 @@
+"""Clouds of depth, and their registration where depth is true."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from slam.frames import Intrinsics
+from slam.sequences.simulated import SimulatedStreet, SimulationOptions
+
+TOOL = Path(__file__).parents[2] / "tools" / "kiss_icp_on_learned_depth.py"
+
+
+@pytest.fixture(scope="module")
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location(TOOL.stem, TOOL)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_cloud_is_what_is_near_and_smooth(tool: ModuleType) -> None:
+    depth = np.full((20, 30), 8.0, dtype=np.float32)
+    depth[:, 10:20] = 16.0
+    depth[:, 20:] = 90.0
+    depth[:5] = 0.0
+    camera = Intrinsics(60, 40, 50.0, 50.0, 29.5, 19.5)  # of an image twice as large
+    points = tool.cloud(depth, camera, 40.0, 1.0, np.random.default_rng(0))
+    assert set(points[:, 2]) == {8.0, 16.0}
+    assert len(points) == 14 * (9 + 8)  # pixels on either side of every step are lost
+    assert np.abs(points[points[:, 2] == 8.0, 0] - 8 * (-14.5 + 8) / 25).min() < 1e-9
+    assert len(tool.cloud(depth, camera, 40.0, 0.5, np.random.default_rng(0))) == 119
+
+
+def test_true_depth_gives_the_true_path(tool: ModuleType) -> None:
+    street = SimulatedStreet(SimulationOptions("straight", frames=12, seed=620))
+    frames = [street.render(k) for k in range(12)]
+    K = street.K
+    camera = Intrinsics(416, 128, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    T_first_camera = tool.registered([frame.depth for frame in frames], camera, far_m=40.0, voxel_m=1.0, share=0.3)
+    error = np.linalg.norm(T_first_camera[:, :3, 3] - street.T_world_camera[:, :3, 3], axis=1)
+    assert error.max() < 0.1 * np.linalg.norm(street.T_world_camera[-1, :3, 3])
+
+
+def test_missing_true_depth_is_said(tool: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"no depth map 000003\.png"):
+        tool.true_depth(tmp_path, 3)

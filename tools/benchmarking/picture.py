@@ -1,0 +1,49 @@
+"""Small multiples: every drive from above, before and after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from benchmarking.cells import drive, grouped
+from benchmarking.work import Outcome
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from slam.files import write_atomically
+from slam.plots import draw_trajectories, trajectories_of
+from slam.run_folder import RunFolder
+
+SIDE_IN = 1.9
+DPI = 90
+COLOURS = 48  # a third of the bytes of a full palette, and no eye sees it
+
+
+def drawable(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The first run of every drive that ended well."""
+    return [runs[0] for runs in grouped([o for o in outcomes if not o.reason], drive).values()]
+
+
+def draw(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Network, odometry and optimised trajectory over the truth, a panel a drive."""
+    chosen = drawable(outcomes)
+    columns = math.ceil(math.sqrt(1.6 * len(chosen)))
+    rows = math.ceil(len(chosen) / columns)
+    figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
+    panels = figure.subfigures(rows, columns, squeeze=False).flat
+    for o, panel in zip(chosen, panels):
+        [axes] = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
+        axes.get_legend().remove()
+        axes.set(xlabel="", ylabel="")
+        axes.set_title(drive(o), fontsize=8)
+        axes.tick_params(labelsize=6)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    light = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: light.save(file, format="png", optimize=True))

@@ -55,7 +55,6 @@ class PoseNoise(Section):
     pose_sha256: str = Field(description="of the pose network's file that this was measured with")
     measured_on: list[str] = Field(description="recordings and frame ranges")
     pairs: int = Field(ge=1, description="measured pairs of frames")
-    command: str = ""
 
     def sigmas(self, pair: PairPose) -> FloatArray:
         """Sigmas ``(6,)`` of the mean of a pair's measurements, in the later camera."""
@@ -137,7 +136,7 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
         first = error.errors()[0] if isinstance(error, ValidationError) else None
         detail = f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}" if first else "it is not YAML"
         raise CheckpointError(
-            f"{path} is not a noise record: {detail}; measure it again with erfsfm calibrate-noise"
+            f"{path} is not a noise record: {detail}; remove it, and measure anew with erfsfm calibrate-noise"
         ) from error
 
 

@@ -231,6 +231,35 @@ def export(
         typer.echo(f"{file.kind}: {file.preset} in {file.path}; differs from PyTorch by {file.difference:.1e}")
 
 
+@app.command("calibrate-noise")
+def calibrate_noise(
+    dataset: Annotated[list[Path], typer.Option(help="a KITTI odometry root with poses, real or simulated; repeat")],
+    weights: Weights = "default",
+    sequence: Annotated[list[str] | None, typer.Option(help="only these sequences; repeat")] = None,
+    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="also measure on frames seen in training")] = False,
+    device: Device = "auto",
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Measure the pose network's noise on held-out recordings; noise.yaml beside the weights keeps it for SLAM.
+
+    Prints, for each recording, how much of it the noise measured on the others covers.
+
+    Example: erfsfm calibrate-noise --weights sim --dataset worlds/600 --dataset KITTI
+    """
+    from erfsfm.checkpoint import find_weights
+    from erfsfm.evaluation.noise_fit import calibrate
+    from erfsfm.inference import DepthPosePredictor
+    from erfsfm.pose_noise import NOISE_FILE, write_pose_noise
+
+    folder = find_weights(weights)
+    predictor = DepthPosePredictor.from_weights(weights, device)
+    noise, rows = calibrate(predictor, dataset, sequence or (), allow_leak, predictor.pose_sha256)
+    write_pose_noise(folder, noise)
+    _print_result(rows, as_json)
+    typer.echo(f"noise in {folder / NOISE_FILE}", err=True)
+
+
 @evaluate_app.command("depth")
 def evaluate_depth(
     dataset: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,13 +14,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from erfsfm.checkpoint import Model, find_weights, load_model, weights_sha256
+from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
 from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
 from erfsfm.data.images import resize_image
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
+from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
+
+logger = logging.getLogger(__name__)
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
@@ -38,7 +42,13 @@ def choose_device(choice: str) -> torch.device:
 
 
 class DepthPosePredictor:
-    """Depth of single images and poses of snippets, in one unknown scale."""
+    """Depth of single images and poses of snippets, in one unknown scale.
+
+    ``noise`` is that of the poses, where it was measured with these very weights; else None.
+    """
+
+    noise: PoseNoise | None = None
+    pose_sha256: str = ""
 
     def __init__(self, model: Model, device: str = "cpu", sha256: str = "") -> None:
         self.device = choose_device(device)
@@ -55,11 +65,21 @@ class DepthPosePredictor:
         """Load a shipped model by name or a training output folder.
 
         Raises:
-            CheckpointError: missing or damaged weights.
+            CheckpointError: missing or damaged weights, or a damaged noise.yaml beside them.
             ConfigError: a device that is not there.
         """
         folder = find_weights(name_or_dir)
-        return cls(load_model(folder), device, weights_sha256(folder))
+        predictor = cls(load_model(folder), device, weights_sha256(folder))
+        predictor.pose_sha256 = file_sha256(folder / FILES[1])
+        noise = read_pose_noise(folder)
+        if noise is not None and noise.pose_sha256 != predictor.pose_sha256:
+            logger.warning(
+                "%s was measured with other weights and is not used: run erfsfm calibrate-noise again",
+                folder / NOISE_FILE,
+            )
+        else:
+            predictor.noise = noise
+        return predictor
 
     def leaks(self, names: Sequence[str]) -> list[str]:
         """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""

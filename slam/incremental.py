@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.pose_noise import PoseNoise
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
@@ -37,6 +38,7 @@ class Slam:
         camera_height_m: float | None = None,
         update_frames: int = 10,
         sweep_frames: int = 100,
+        noise: PoseNoise | None = None,
     ) -> None:
         """Prepare for the first frame.
 
@@ -47,6 +49,7 @@ class Slam:
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
             update_frames: the graph is solved after so many frames, and when it is asked.
             sweep_frames: loops are looked for after so many frames; 0 leaves it to ``close_loops``.
+            noise: of the snippet poses; None measures it against image geometry alone.
 
         Raises:
             SlamError: a scale mode that wants more than images.
@@ -60,7 +63,7 @@ class Slam:
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = config.model_copy(update={"mapping": without_map})
         self._drive = _Drive(intrinsics, camera_height_m)
-        self._pipeline = SlamPipeline(self._drive, predictor, config)
+        self._pipeline = SlamPipeline(self._drive, predictor, config, noise=noise)
         self._observer = Observer(predictor, intrinsics, config, Stopwatch())
         self._graph = IncrementalPoseGraph(config.pose_graph)
         self._shortest = predictor.sources + 1
@@ -80,7 +83,7 @@ class Slam:
     ) -> Slam:
         """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
         networks = DepthPosePredictor.from_weights(name_or_dir, device)
-        return cls(NetworkPredictor(networks), intrinsics, config, camera_height_m)
+        return cls(NetworkPredictor(networks), intrinsics, config, camera_height_m, noise=networks.noise)
 
     def __len__(self) -> int:
         """Number of frames so far."""

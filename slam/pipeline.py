@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
 from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.drive_noise import DriveNoise, drive_noise
+from slam.frontend.drive_noise import StepNoise, drive_noise
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.frontend.metric_scale import LengthMeasurements, Scale, find_scale
-from slam.frontend.network_factors import NETWORK_SOURCE, chain_raw, measured_noise, network_factors, without_measured
+from slam.frontend.network_factors import (
+    NETWORK_SOURCE,
+    calibrated_factors,
+    chain_raw,
+    measured_noise,
+    network_factors,
+    without_measured,
+)
 from slam.frontend.scale import rescaled, resolve_mode, scale_from_reference
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
@@ -65,8 +73,25 @@ class SlamPipeline:
     """From the frames of a sequence to a trajectory and a map."""
 
     def __init__(
-        self, sequence: FrameSequence, predictor: Predictor, config: SlamConfig, progress: Progress | None = None
+        self,
+        sequence: FrameSequence,
+        predictor: Predictor,
+        config: SlamConfig,
+        progress: Progress | None = None,
+        noise: PoseNoise | None = None,
     ) -> None:
+        """Prepare a run.
+
+        Args:
+            sequence: frames in time order.
+            predictor: depth and snippet poses.
+            config: of all parts.
+            progress: told the stage, and how much of it is done.
+            noise: of the snippet poses; None measures it against image geometry alone.
+        """
+        if noise is None:
+            logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
+        self._noise = noise
         self._sequence = sequence
         self._predictor = predictor
         self._config = config
@@ -196,8 +221,7 @@ class SlamPipeline:
         by_corners = {step: m.relative_pose.T_from_to for step, m in seen.motions.items()}
         drive = drive_noise(by_corners, scale.length_spread, self._config.geometry)
         geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
-        noise = measured_noise(seen.trusted, seen.geometric, self._config.frontend)
-        networks = network_factors(seen.trusted, noise)
+        networks = self._by_networks(seen)
         if self._config.frontend.use == "bridge":
             networks = without_measured(networks, seen.geometric)
         unscaled = [*networks, *seen.bridges]
@@ -206,11 +230,20 @@ class SlamPipeline:
             factors += lidar_steps(lidar, self._config.lidar)
         return factors + geometric
 
-    def _with_length(self, measured: RelativePose, seen: Observations, scale: Scale, drive: DriveNoise) -> RelativePose:
+    def _by_networks(self, seen: Observations) -> list[RelativePose]:
+        """What the pose network measured, unscaled, with the noise beside its weights or else that of this drive."""
+        config = self._config.frontend
+        if self._noise is not None:
+            return calibrated_factors(seen.trusted, seen.geometric, self._noise, config)
+        return network_factors(seen.trusted, measured_noise(seen.trusted, seen.geometric, config))
+
+    def _with_length(
+        self, measured: RelativePose, seen: Observations, scale: Scale, drive: Mapping[int, StepNoise]
+    ) -> RelativePose:
         """A geometric measurement with its step's length, or by learned depth where the step has none."""
         step = measured.from_index
         if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
-            return seen.motions[step].with_length(float(scale.lengths[step]), drive)
+            return seen.motions[step].with_length(float(scale.lengths[step]), drive[step])
         return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

@@ -279,6 +279,17 @@ def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatA
     return {str(level): float((squared <= chi2.ppf(level / 100, 6)).mean()) for level in (50, 90, 95)}
 
 
+def coverage_by_source(
+    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
+) -> dict[str, dict[str, float]]:
+    """Number of factors and `coverage` of each kind of measurement, by the name of its source."""
+    kinds = {edge.source: [e for e in relative_poses if e.source == edge.source] for edge in relative_poses}
+    return {
+        source: {"factors": len(edges), **coverage(edges, T_world_camera_true, scale)}
+        for source, edges in sorted(kinds.items())
+    }
+
+
 def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:
     ends = np.array([(e.from_index, e.to_index) for e in relative_poses], dtype=int).reshape(-1, 2)
     if len(ends) and (ends.min() < 0 or ends.max() >= count):

@@ -34,7 +34,7 @@ from slam.map_metrics import accuracy_median_m, completeness, pose_similarity, v
 from slam.networks import NetworkPredictor
 from slam.pipeline import Progress, SlamPipeline, SlamResult
 from slam.places import PLACES, Places
-from slam.pose_graph import coverage
+from slam.pose_graph import coverage, coverage_by_source
 from slam.report import DepthExample, write_report
 from slam.rerun_file import write_rerun
 from slam.run_folder import RunFolder
@@ -121,7 +121,7 @@ def run_slam(
     with _logging_to(folder.path / "run.log"):
         try:
             _seed(seed)
-            pipeline = SlamPipeline(recording, predictor, settings, progress)
+            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise)
             result = _run(folder, pipeline, recording, provenance, settings.output.report)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
@@ -261,7 +261,8 @@ def _graph(result: SlamResult) -> dict[str, Any]:
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    return summary | {"coverage": coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)}
+    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
+    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}
 
 
 @dataclass(frozen=True)

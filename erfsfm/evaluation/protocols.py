@@ -117,7 +117,7 @@ def _pose_rows(
     true = snippets_from_trajectory(T_world_camera, length)
     if len(true) == 0:
         raise DataError(f"{recording.name} has {len(recording)} frames; a snippet needs {length}")
-    predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in _windows(networks, recording)])
+    predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in windows(networks, recording)])
     straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
     shown = recording.frames_name if partly else recording.name
@@ -129,7 +129,7 @@ def _pose_rows(
     return rows
 
 
-def _windows(networks: Networks, recording: Recording) -> Iterator[NDArray[np.float64]]:
+def windows(networks: Networks, recording: Recording) -> Iterator[NDArray[np.float64]]:
     """What the pose network says of each window; no more images are held than one window has."""
     images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):

@@ -1,10 +1,9 @@
-"""How far corners err on this drive, as the drive itself shows: no truth is looked at.
+"""How far corners err on this drive and at this step, as the drive itself shows: no truth is looked at.
 
 Corners promise sigmas that hold where the camera is all that errs. On the road more goes wrong than they know of -
-stamps, the mount, whatever is not a pinhole - and it goes wrong in proportion to how the camera shakes from step to
-step. So the sigmas are widened by shares of that shake, and the lengths by how far the road's and the points' own
-lengths disagree. The shares in ``GeometryConfig`` were measured once, on the first 300 frames of KITTI 00, 02 and 05
-and on two simulated streets.
+stamps, the mount, whatever is not a pinhole - and it goes wrong in proportion to how the camera shakes, how it turns,
+and where a step does not fit the steps beside it. So the sigmas of each step are widened by shares of these. The shares
+in ``GeometryConfig`` were fitted once (``docs/design/0009-noise-from-the-drive-itself.md``).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
-from slam.se3 import FloatArray
+from slam.se3 import FloatArray, invert
 
 _MAD_TO_SIGMA = 1.4826
 _LEAST_STEPS = 20
@@ -25,40 +24,68 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 
 
 @dataclass(frozen=True)
-class DriveNoise:
-    """Sigmas to add in squares: ``rotation`` ``(3,)`` and ``direction`` in radians, ``length`` as a share."""
+class StepNoise:
+    """Sigmas to add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians, ``length`` as a share.
+
+    The direction is of the earlier camera as the later one sees it, where GTSAM perturbs; along it there is no error.
+    """
 
     rotation: FloatArray
-    direction: float
+    direction: FloatArray
     length: float
 
 
 def drive_noise(
     T_previous_current: Mapping[int, FloatArray], length_spread: float, config: GeometryConfig
-) -> DriveNoise:
-    """The noise of a drive's steps.
+) -> dict[int, StepNoise]:
+    """The noise of each step of a drive.
 
     Args:
-        T_previous_current: steps that corners measured, by their first frame; only their rotations are used.
+        T_previous_current: steps that corners measured, by their first frame; lengths are not looked at.
         length_spread: relative sigma of single measurements of length.
         config: the shares.
     """
-    shake = rotation_shake(T_previous_current)
-    return DriveNoise(
-        config.shake_rotation_share * shake,
-        config.shake_direction_share * float(np.linalg.norm(shake)),
-        float(np.hypot(config.length_floor_share, config.length_spread_share * length_spread)),
-    )
+    turned = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
+    along = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
+    shake = rotation_shake(turned)
+    noise = {}
+    for k, turn in turned.items():
+        rotation = [config.shake_rotation_share * shake, config.turn_rotation_share * turn]
+        rotation.append(config.jolt_rotation_share * jolt(turned, k))
+        aside = config.shake_direction_share * np.linalg.norm(shake) * np.sqrt(np.maximum(1.0 - along[k] ** 2, 0.0))
+        direction = np.hypot(aside, config.jolt_direction_share * jolt(along, k))
+        length = [config.length_floor_share, config.length_spread_share * length_spread]
+        length.append(config.turn_length_share * float(np.linalg.norm(turn)))
+        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction, float(np.linalg.norm(length)))
+    return noise
 
 
-def rotation_shake(T_previous_current: Mapping[int, FloatArray]) -> FloatArray:
+def rotation_shake(turned: Mapping[int, FloatArray]) -> FloatArray:
     """What of the steps' rotation vectors no smooth motion explains: sigmas ``(3,)``, radians, 0 with few steps.
 
     Third differences remove any turn that changes evenly; their middle size withstands jolts.
     """
-    steps = sorted(k for k in T_previous_current if all(k + n in T_previous_current for n in range(1, 4)))
+    steps = sorted(k for k in turned if all(k + n in turned for n in range(1, 4)))
     if len(steps) < _LEAST_STEPS:
         return np.zeros(3)
-    turned = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
     third = np.array([turned[k + 3] - 3 * turned[k + 2] + 3 * turned[k + 1] - turned[k] for k in steps])
     return np.asarray(_MAD_TO_SIGMA * np.median(np.abs(third), axis=0) / _THIRD_DIFFERENCE)
+
+
+def jolt(values: Mapping[int, FloatArray], step: int) -> FloatArray:
+    """How far a step's value ``(3,)`` lies from what the steps beside it foretell, 0 where none do.
+
+    Foretold by the two steps before, by the two after, and by one on each side; the middle of these withstands one
+    bad neighbour.
+    """
+    lines = [((-1, 0.5), (1, 0.5)), ((-1, 2.0), (-2, -1.0)), ((1, 2.0), (2, -1.0))]
+    foretold = [
+        sum((share * values[step + n] for n, share in line), np.zeros(3))
+        for line in lines
+        if all(step + n in values for n, _ in line)
+    ]
+    return np.asarray(np.abs(values[step] - np.median(foretold, axis=0))) if foretold else np.zeros(3)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

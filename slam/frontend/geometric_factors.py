@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
-from slam.frontend.drive_noise import DriveNoise
+from slam.frontend.drive_noise import StepNoise
 from slam.frontend.epipolar import (
     Structure,
     TwoView,
@@ -50,15 +50,14 @@ class Motion:
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
 
-    def with_length(self, length: float, noise: DriveNoise) -> RelativePose:
-        """The same rotation and direction with a length from elsewhere, and the noise that this drive showed."""
+    def with_length(self, length: float, noise: StepNoise) -> RelativePose:
+        """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there."""
         if self.direction_sigmas is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
         rotation = np.hypot(self.relative_pose.sigmas[:3], noise.rotation)
-        along = invert(T_previous_current)[:3, 3] / length
-        direction = np.hypot(self.direction_sigmas, noise.direction * np.sqrt(np.maximum(1.0 - along**2, 0.0)))
+        direction = np.hypot(self.direction_sigmas, noise.direction)
         sigmas = _sigmas(T_previous_current, rotation, direction, noise.length)
         return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas)
 
@@ -148,10 +147,10 @@ class GeometricOdometry:
 
     def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
-        widened = _CORRELATION * np.sqrt(np.diag(two_view.covariance))
-        rotation = np.hypot(widened[:3], np.deg2rad(self._config.rotation_floor_deg))
+        own = np.sqrt(np.diag(two_view.covariance))
+        rotation = np.hypot(own[:3], np.deg2rad(self._config.rotation_floor_deg))
         floor = np.deg2rad(self._config.direction_floor_deg)
-        return rotation, np.hypot(widened[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
+        return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
 
     def _by_points(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | Refusal:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""

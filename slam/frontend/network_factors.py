@@ -1,6 +1,10 @@
 """The pose network's snippets as relative-pose factors, and as the raw trajectory they chain to.
 
-Noise model. The network errs by a share of what it measures: for a pair n frames apart the rotation
+Noise that lies beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
+overlapping snippets measured of it, with the correlation of their errors. On the drive it is widened, never narrowed,
+by how far the network is from image geometry, for roads may be unlike those that the noise was measured on.
+
+Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
 sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_sigma_share`` of the length
 plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
 nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
@@ -9,12 +13,15 @@ their sigmas times sqrt(m) and count as one.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
@@ -22,6 +29,8 @@ from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
 _MAD_TO_SIGMA = 1.4826
+
+logger = logging.getLogger(__name__)
 
 
 def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
@@ -38,6 +47,46 @@ def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) ->
             sigmas = repeated * np.repeat([rotation, translation], 3)
             factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
     return factors
+
+
+def calibrated_factors(
+    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], noise: PoseNoise, config: FrontendConfig
+) -> list[RelativePose]:
+    """One factor for every pair of frames that snippets measured, ``T_first_last``, unscaled, with measured noise.
+
+    Args:
+        snippets: measured by the network.
+        geometric: what image geometry measured, unscaled.
+        noise: of this network.
+        config: ``noise_steps`` common steps are needed before the drive may widen the noise.
+    """
+    pairs = pair_poses([(s.target, s.sources, s.T_source_target) for s in snippets])
+    sigmas = [noise.sigmas(pair) for pair in pairs]
+    widening = _widening(pairs, sigmas, geometric, config.noise_steps)
+    return [
+        RelativePose(pair.first, pair.last, pair.T_first_last, widening[pair.last - pair.first] * sigma, NETWORK_SOURCE)
+        for pair, sigma in zip(pairs, sigmas, strict=True)
+    ]
+
+
+def _widening(
+    pairs: Sequence[PairPose], sigmas: Sequence[FloatArray], geometric: Sequence[RelativePose], least: int
+) -> dict[int, FloatArray]:
+    """Factors ``(6,)``, at least 1, on the sigmas of pairs so many frames apart, by chained steps of image geometry."""
+    steps = {g.from_index: g.T_from_to for g in geometric if g.to_index == g.from_index + 1}
+    whitened: dict[int, list[FloatArray]] = {pair.last - pair.first: [] for pair in pairs}
+    for pair, sigma in zip(pairs, sigmas, strict=True):
+        between = [steps[k] for k in range(pair.first, pair.last) if k in steps]
+        if len(between) == pair.last - pair.first:
+            T_geometric = reduce(np.matmul, between)
+            whitened[len(between)].append(difference(pair.T_first_last, T_geometric) / sigma)
+    widening = {}
+    for frames, errors in sorted(whitened.items()):
+        widening[frames] = np.ones(6)
+        if len(errors) >= least:
+            widening[frames] = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(errors), axis=0), 1.0)
+            logger.info("pose network's noise over %d frames is widened by %s", frames, widening[frames].round(2))
+    return widening
 
 
 def without_measured(factors: Sequence[RelativePose], geometric: Sequence[RelativePose]) -> list[RelativePose]:

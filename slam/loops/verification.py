@@ -17,6 +17,9 @@ from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.descriptors import View, hamming
 from slam.se3 import FloatArray, invert, make, rotation_angle
 
+_MAD_TO_SIGMA = 1.4826
+_LEAST_PIXEL_SIGMA = 0.1
+
 
 @dataclass(frozen=True)
 class Loop:
@@ -80,7 +83,7 @@ class LoopVerifier:
             reason = f"both directions differ by {turned_deg:.1f} degrees and {moved_share:.0%} of the depth"
             return refused(reason, inliers, T_earlier_later)
         T_middle = _halfway(T_earlier_later, backward.T_image_points)
-        sigmas = self._sigmas(T_middle, depth, np.deg2rad(turned_deg), moved_share * depth)
+        sigmas = self._sigmas(T_middle, depth, difference, forward, backward)
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         return Loop(measured, inliers, score)
 
@@ -115,24 +118,49 @@ class LoopVerifier:
             points[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
         )
         T_image_points = make(Rotation.from_rotvec(rotation.ravel()).as_matrix(), translation.ravel())
-        return Resection(T_image_points, chosen, float(np.median(points[chosen, 2])))
+        sigmas = _resection_sigmas(points[chosen], pixels[chosen], rotation, translation, self._intrinsics.K)
+        return Resection(T_image_points, chosen, float(np.median(points[chosen, 2])), sigmas)
 
-    def _sigmas(self, T_a_b: FloatArray, depth: float, turned: float, moved: float) -> FloatArray:
-        """Sigmas ``(6,)``: a floor, a share of the way between the views, and what both directions disagree about."""
+    def _sigmas(
+        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Resection, backward: Resection
+    ) -> FloatArray:
+        """Sigmas ``(6,)`` in camera b: of corners in both directions, of learned depth, of what they disagree about.
+
+        Both directions see the same corners, and neighbouring corners err together: the second gains nothing.
+        """
         config = self._config
-        rotation = np.hypot(np.deg2rad(config.rotation_floor_deg), turned / 2)
+        corners = config.corner_sigma_widening * np.hypot(forward.sigmas, backward.sigmas)
+        turned = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
+        disagreement = np.concatenate([turned, difference[:3, 3]]) / 2
         way = config.length_sigma_share * float(np.linalg.norm(T_a_b[:3, 3]))
-        translation = np.linalg.norm([config.translation_floor_share * depth, way, moved / 2])
-        return np.repeat([float(rotation), float(translation)], 3)
+        floors = np.repeat(
+            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_share * depth, way)], 3
+        )
+        return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
 
 
 @dataclass(frozen=True)
 class Resection:
-    """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z."""
+    """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z.
+
+    ``sigmas`` ``(6,)``: of rotation and translation in the image's camera, were its corners to err independently.
+    """
 
     T_image_points: FloatArray
     inliers: NDArray[np.intp]
     depth: float
+    sigmas: FloatArray
+
+
+def _resection_sigmas(
+    points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray, K: FloatArray
+) -> FloatArray:
+    """Sigmas ``(6,)`` of a resection from the Jacobian and the size of its reprojection residuals."""
+    projected, jacobian = cv2.projectPoints(points, rotation, translation, K, None)
+    residual = (projected.reshape(-1, 2) - pixels).ravel()
+    sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), _LEAST_PIXEL_SIGMA)
+    J = jacobian[:, :6]
+    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6)))))
 
 
 def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

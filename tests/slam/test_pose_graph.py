@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -6,7 +8,14 @@ from slam import se3
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose
-from slam.pose_graph import LOOP_SOURCE, IncrementalPoseGraph, PoseGraph, coverage, whitened_squared
+from slam.pose_graph import (
+    LOOP_SOURCE,
+    IncrementalPoseGraph,
+    PoseGraph,
+    coverage,
+    coverage_by_source,
+    whitened_squared,
+)
 
 ROTATION, TRANSLATION = 0.003, 0.03
 
@@ -115,6 +124,15 @@ def test_coverage_is_honest_and_knows_the_scale():
     for bad in (([], 1.0), (edges, 0.0)):
         with pytest.raises(SlamError):
             coverage(bad[0], truth, bad[1])
+
+
+def test_coverage_tells_which_kind_of_factor_is_not_honest():
+    truth, odometry, _, loops, _ = noisy_problem(count=600)
+    boasting = [replace(loop, sigmas=loop.sigmas / 10) for loop in loops]
+    kinds = coverage_by_source(odometry + boasting, truth, 1.0)
+    assert kinds.keys() == {odometry[0].source, LOOP_SOURCE}
+    assert kinds[LOOP_SOURCE]["factors"] == len(loops) and kinds[LOOP_SOURCE]["95"] < 0.2
+    assert kinds[odometry[0].source] == {"factors": len(odometry), **coverage(odometry, truth, 1.0)}
 
 
 def test_whitened_residual_by_hand():

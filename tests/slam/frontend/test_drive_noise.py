@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from slam.config import GeometryConfig
-from slam.frontend.drive_noise import drive_noise, rotation_shake
+from slam.frontend.drive_noise import drive_noise, jolt, rotation_shake
 from slam.se3 import from_rotation_vector
 
 CONFIG = GeometryConfig()
@@ -18,30 +18,59 @@ def turns(shake_rad: np.ndarray, count: int = 400) -> np.ndarray:
     return smooth + np.random.default_rng(0).normal(size=(count, 3)) * shake_rad
 
 
+def turned(shake_rad: np.ndarray, count: int = 400) -> dict[int, np.ndarray]:
+    return dict(enumerate(turns(shake_rad, count)))
+
+
 def test_shake_is_what_a_smooth_motion_does_not_explain():
     shake_rad = np.array([1e-3, 2e-4, 5e-4])
-    np.testing.assert_allclose(rotation_shake(steps(turns(shake_rad))), shake_rad, rtol=0.2)
-    assert rotation_shake(steps(turns(np.zeros(3)))).max() < 1e-5
+    np.testing.assert_allclose(rotation_shake(turned(shake_rad)), shake_rad, rtol=0.2)
+    assert rotation_shake(turned(np.zeros(3))).max() < 1e-5
 
 
 def test_a_few_jolts_do_not_shake_a_drive():
-    turned = turns(np.array([1e-3, 1e-3, 1e-3]))
-    turned[::50] += 0.1
-    np.testing.assert_allclose(rotation_shake(steps(turned)), 1e-3, rtol=0.4)
+    shaken = turns(np.array([1e-3, 1e-3, 1e-3]))
+    shaken[::50] += 0.1
+    np.testing.assert_allclose(rotation_shake(dict(enumerate(shaken))), 1e-3, rtol=0.4)
 
 
 def test_gaps_are_left_out_and_few_steps_say_nothing():
-    drive = steps(turns(np.full(3, 1e-3)))
-    kept = {k: T for k, T in drive.items() if k % 40 != 7}
-    np.testing.assert_allclose(rotation_shake(kept), 1e-3, rtol=0.3)
-    np.testing.assert_array_equal(rotation_shake({k: T for k, T in drive.items() if k % 4}), 0.0)
+    drive = turned(np.full(3, 1e-3))
+    np.testing.assert_allclose(rotation_shake({k: r for k, r in drive.items() if k % 40 != 7}), 1e-3, rtol=0.3)
+    np.testing.assert_array_equal(rotation_shake({k: r for k, r in drive.items() if k % 4}), 0.0)
     np.testing.assert_array_equal(rotation_shake({}), 0.0)
 
 
-def test_noise_is_shares_of_shake_and_of_the_spread_of_lengths():
-    drive = steps(turns(np.full(3, 1e-3)))
-    noise, shake = drive_noise(drive, 0.05, CONFIG), rotation_shake(drive)
-    np.testing.assert_allclose(noise.rotation, CONFIG.shake_rotation_share * shake)
-    assert noise.direction == pytest.approx(CONFIG.shake_direction_share * np.linalg.norm(shake))
-    assert noise.length == pytest.approx(np.hypot(CONFIG.length_floor_share, CONFIG.length_spread_share * 0.05))
-    assert drive_noise(drive, 0.0, CONFIG).length == CONFIG.length_floor_share
+def test_a_jolt_is_the_step_that_does_not_fit_and_not_its_neighbours():
+    even = {k: np.array([0.0, 0.01 * k, 0.0]) for k in range(9)}
+    even[4] = even[4] + [0.05, 0.0, 0.0]
+    sizes = np.array([jolt(even, k) for k in range(9)])
+    np.testing.assert_allclose(sizes[4], [0.05, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(sizes[[0, 1, 7, 8], 1:], 0.0, atol=1e-12)
+    assert sizes[[3, 5], 0].max() <= 0.025 + 1e-12
+    np.testing.assert_array_equal(jolt({3: np.ones(3)}, 3), 0.0)
+
+
+def test_noise_is_shares_of_shake_turn_and_the_spread_of_lengths():
+    shaken = turns(np.full(3, 1e-3))
+    noise, shake = drive_noise(steps(shaken), 0.05, CONFIG), rotation_shake(dict(enumerate(shaken)))
+    assert noise.keys() == set(range(400))
+    calm = min(noise.values(), key=lambda n: n.direction.sum())
+    assert calm.direction[0] == pytest.approx(CONFIG.shake_direction_share * np.linalg.norm(shake), rel=0.1)
+    assert calm.direction[2] < 0.1 * calm.direction[0], "an error along the motion is one of length"
+    for k, step in noise.items():
+        assert (step.rotation >= CONFIG.shake_rotation_share * shake).all()
+        share = [CONFIG.length_floor_share, CONFIG.length_spread_share * 0.05]
+        share.append(CONFIG.turn_length_share * np.linalg.norm(shaken[k]))
+        assert step.length == pytest.approx(np.linalg.norm(share))
+
+
+def test_sharp_turns_and_jolts_widen_their_own_steps():
+    smooth = np.zeros((60, 3))
+    smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
+    jolted = smooth.copy()
+    jolted[30, 0] += np.deg2rad(1.0)
+    before, after = drive_noise(steps(smooth), 0.0, CONFIG), drive_noise(steps(jolted), 0.0, CONFIG)
+    assert before[16].rotation[1] == pytest.approx(CONFIG.turn_rotation_share * smooth[16, 1], rel=0.1)
+    assert after[30].rotation[0] == pytest.approx(CONFIG.jolt_rotation_share * np.deg2rad(1.0), rel=0.1)
+    np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)

@@ -1,11 +1,18 @@
 import numpy as np
 import pytest
 
+from erfsfm.pose_noise import PoseNoise
 from slam import se3
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
-from slam.frontend.network_factors import chain_raw, measured_noise, network_factors, without_measured
+from slam.frontend.network_factors import (
+    calibrated_factors,
+    chain_raw,
+    measured_noise,
+    network_factors,
+    without_measured,
+)
 
 CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_sigma_share=0.1, translation_floor_share=0.05)
 
@@ -125,3 +132,41 @@ def test_the_network_bridges_what_geometry_did_not_measure():
     assert pairs == {(9, 10), (8, 10), (9, 11)}
     over_two = [RelativePose(9, 11, T[0], np.ones(6), "essential")]
     assert without_measured(factors, geometric[:9] + geometric[10:] + over_two) == gap
+
+
+NOISE = PoseNoise(
+    frame=(0.01,) * 6,
+    turn=(0.0,) * 6,
+    length=(0.0,) * 6,
+    disagreement=(0.0,) * 6,
+    correlation=(0.5,) * 6,
+    pose_sha256="",
+    measured_on=["simulated/600"],
+    pairs=990,
+)
+
+
+def test_measured_noise_gives_each_pair_one_factor_whatever_the_overlap():
+    T = drive(10)
+    factors = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets_of(T), [], NOISE, CONFIG)}
+    # targets 2 to 7: pairs of neighbours from (1, 2) to (7, 8), pairs over two from (0, 2) to (7, 9)
+    assert factors.keys() == {(k, k + 1) for k in range(1, 8)} | {(k, k + 2) for k in range(8)}
+    for (first, last), factor in factors.items():
+        np.testing.assert_allclose(factor.T_from_to, se3.invert(T[first]) @ T[last], atol=1e-9)
+    np.testing.assert_allclose(factors[1, 2].sigmas, 0.01)  # seen by the snippet of 2 alone
+    np.testing.assert_allclose(factors[4, 5].sigmas, 0.01 * np.sqrt(0.75))
+    np.testing.assert_allclose(factors[4, 6].sigmas, 0.02 * np.sqrt(0.75))
+
+
+def test_a_drive_may_widen_measured_noise_and_never_narrows_it():
+    T, rng = drive(300), np.random.default_rng(1)
+    snippets = snippets_of(T)
+    for snippet in snippets:
+        for pose in snippet.T_source_target:
+            pose[:] = pose @ se3.from_rotation_vector(np.array([0.05, 0.0, 0.0]) * rng.normal(), np.zeros(3))
+    wide = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets, geometry_of(T), NOISE, CONFIG)}
+    promised = 0.01 * np.sqrt(0.75)
+    assert wide[50, 51].sigmas[0] == pytest.approx(0.05 / np.sqrt(2), rel=0.2)
+    np.testing.assert_allclose(wide[50, 51].sigmas[1:3], promised)
+    few = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets, geometry_of(T)[:9], NOISE, CONFIG)}
+    np.testing.assert_allclose(few[50, 51].sigmas, promised)

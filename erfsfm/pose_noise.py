@@ -1,0 +1,160 @@
+"""The noise of a pose network: a law that was fitted on held-out recordings and lies beside its weights.
+
+Only the direct poses of a snippet are measurements. Overlapping snippets measure a pair of frames twice, once in each
+direction, from nearly the same images: both errors are correlated, and a pair is one measurement, their mean. NumPy
+alone, so that SLAM needs no torch for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+from scipy.spatial.transform import Rotation
+
+from erfsfm.config import Section, dump_yaml
+from erfsfm.errors import CheckpointError
+from erfsfm.files import write_atomically
+
+FloatArray = NDArray[np.float64]
+NOISE_FILE = "noise.yaml"
+
+_Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Six = tuple[_Share, _Share, _Share, _Share, _Share, _Share]
+
+
+class PoseNoise(Section):
+    """Sigmas of one direct pose, rotation x, y, z (radians) then translation x, y, z (the networks' unit).
+
+    They add in squares: ``frame`` for each frame between the two, ``turn`` of the angle turned (for the translation:
+    of the angle a frame, times the length), ``length`` of the length moved, ``disagreement`` of what the measurements
+    in both directions differ by. ``correlation`` is that of the whitened errors of both directions.
+    """
+
+    format: Literal[1] = 1
+    frame: tuple[_Positive, _Positive, _Positive, _Positive, _Positive, _Positive]
+    turn: _Six
+    length: _Six
+    disagreement: _Six
+    correlation: tuple[
+        Annotated[float, Field(ge=0, le=1)],
+        Annotated[float, Field(ge=0, le=1)],
+        Annotated[float, Field(ge=0, le=1)],
+        Annotated[float, Field(ge=0, le=1)],
+        Annotated[float, Field(ge=0, le=1)],
+        Annotated[float, Field(ge=0, le=1)],
+    ]
+    pose_sha256: str = Field(description="of the pose network's file that this was measured with")
+    measured_on: list[str] = Field(description="recordings and frame ranges")
+    pairs: int = Field(ge=1, description="measured pairs of frames")
+
+    def sigmas(self, pair: PairPose) -> FloatArray:
+        """Sigmas ``(6,)`` of the mean of a pair's measurements, in the later camera."""
+        coefficients = np.array([self.frame, self.turn, self.length, self.disagreement])  # (4, 6)
+        single = np.sqrt((coefficients**2 * pair.features**2).sum(axis=0))
+        n = pair.measurements
+        return np.asarray(single * np.sqrt((1.0 + (n - 1) * np.array(self.correlation)) / n))
+
+
+@dataclass(frozen=True)
+class PairPose:
+    """What snippets measured between two frames: ``T_first_last`` ``(4, 4)``, the mean of both directions, unscaled.
+
+    ``directions`` ``(M, 4, 4)`` are the single measurements, each as ``T_first_last``.
+    """
+
+    first: int
+    last: int
+    T_first_last: FloatArray
+    directions: FloatArray
+
+    @property
+    def measurements(self) -> int:
+        """1 or 2."""
+        return len(self.directions)
+
+    @property
+    def features(self) -> FloatArray:
+        """What the noise grows with ``(4, 6)``: frames, turn, length, disagreement of both directions."""
+        frames = float(self.last - self.first)
+        turn = float(np.linalg.norm(tangent(self.T_first_last)[:3]))
+        length = float(np.linalg.norm(self.T_first_last[:3, 3]))
+        differ = np.zeros(6)
+        if self.measurements > 1:
+            differ = np.abs(difference(self.directions[0], self.directions[1]))
+        rows = [np.full(6, frames), np.repeat([turn, turn / frames * length], 3), np.full(6, length), differ]
+        return np.stack(rows)
+
+
+def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray]]) -> list[PairPose]:
+    """Every pair of frames that snippets measured, once.
+
+    Args:
+        snippets: target, sources and ``T_source_target`` ``(N, 4, 4)`` of each.
+    """
+    measured: dict[tuple[int, int], list[FloatArray]] = {}
+    for target, sources, T_source_target in snippets:
+        for source, T in zip(sources, T_source_target, strict=True):
+            forward = source < target
+            pair = (source, target) if forward else (target, source)
+            measured.setdefault(pair, []).append(np.asarray(T if forward else np.linalg.inv(T), dtype=np.float64))
+    return [PairPose(*pair, _mean(poses), np.stack(poses)) for pair, poses in sorted(measured.items())]
+
+
+def tangent(T_a_b: FloatArray) -> FloatArray:
+    """Rotation vector and translation ``(..., 6)`` of ``(..., 4, 4)``: GTSAM's order, for small differences."""
+    R = T_a_b[..., :3, :3].reshape(-1, 3, 3)
+    turned = Rotation.from_matrix(R).as_rotvec().reshape(*T_a_b.shape[:-2], 3)
+    return np.concatenate([turned, T_a_b[..., :3, 3]], axis=-1)
+
+
+def difference(T_a_b: FloatArray, T_a_b_other: FloatArray) -> FloatArray:
+    """``tangent`` of the step from one measurement to another, in camera b."""
+    return tangent(np.linalg.inv(T_a_b) @ T_a_b_other)
+
+
+def read_pose_noise(folder: Path) -> PoseNoise | None:
+    """The noise beside a folder's weights; None where it was never measured.
+
+    Raises:
+        CheckpointError: damaged, of another format, or measured with another pose network; one line.
+    """
+    path = folder / NOISE_FILE
+    if not path.is_file():
+        return None
+    try:
+        return PoseNoise.model_validate(yaml.safe_load(path.read_text()))
+    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        detail = f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}" if first else "it is not YAML"
+        raise CheckpointError(
+            f"{path} is not a noise record: {detail}; remove it, and measure anew with erfsfm calibrate-noise"
+        ) from error
+
+
+def write_pose_noise(folder: Path, noise: PoseNoise) -> None:
+    """Put a noise record beside weights, whole or not at all."""
+    text = dump_yaml(noise)
+    write_atomically(folder / NOISE_FILE, lambda path: path.write_text(text))
+
+
+def file_sha256(path: Path) -> str:
+    """Fingerprint of a file; empty where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
+
+
+def _mean(poses: Sequence[FloatArray]) -> FloatArray:
+    """The middle of one or two transforms that lie close together."""
+    mean = poses[0].copy()
+    turned = [Rotation.from_matrix(pose[:3, :3]) for pose in poses]
+    mean[:3, :3] = Rotation.concatenate(turned).mean().as_matrix()
+    mean[:3, 3] = np.mean([pose[:3, 3] for pose in poses], axis=0)
+    return mean

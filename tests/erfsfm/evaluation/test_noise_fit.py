@@ -1,0 +1,118 @@
+"""Calibration of networks whose noise is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from erfsfm.data.splits import overlapping
+from erfsfm.errors import DataError
+from erfsfm.evaluation.noise_fit import PairErrors, calibrate, coverage, fit, pair_errors
+
+ROTATION, LENGTH_SHARE, UNIT = 0.002, 0.05, 0.3
+FloatArray = NDArray[np.float64]
+
+
+def drive(seed: int, count: int = 260) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    T_world_camera = np.tile(np.eye(4), (count, 1, 1))
+    for k in range(1, count):
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec([0.0, 0.03 * np.sin(k / 20), 0.0]).as_matrix()
+        step[2, 3] = 1.0 + 0.3 * rng.random()
+        T_world_camera[k] = T_world_camera[k - 1] @ step
+    return T_world_camera
+
+
+def snippets(T_world_camera: FloatArray, seed: int, shared: float) -> list[tuple[int, Sequence[int], FloatArray]]:
+    """Direct poses in another unit; ``shared`` is the correlation of both directions' errors."""
+    rng = np.random.default_rng(seed)
+    common: dict[tuple[int, int], FloatArray] = {}
+    found = []
+    for target in range(2, len(T_world_camera) - 2):
+        sources = [target - 2, target - 1, target + 1, target + 2]
+        poses = []
+        for source in sources:
+            pair = (min(source, target), max(source, target))
+            noise = common.setdefault(pair, rng.normal(size=6))
+            noise = np.sqrt(shared) * noise + np.sqrt(1 - shared) * rng.normal(size=6)
+            T = np.linalg.inv(T_world_camera[pair[0]]) @ T_world_camera[pair[1]]
+            T[:3, 3] += LENGTH_SHARE * np.linalg.norm(T[:3, 3]) * (T[:3, :3] @ noise[3:])
+            T[:3, :3] @= Rotation.from_rotvec(ROTATION * (pair[1] - pair[0]) * noise[:3]).as_matrix()
+            T[:3, 3] *= UNIT
+            poses.append(T if source < target else np.linalg.inv(T))
+        found.append((target, sources, np.stack(poses)))
+    return found
+
+
+def errors(seed: int, shared: float = 0.8) -> PairErrors:
+    T_world_camera = drive(seed)
+    return pair_errors(f"drive {seed}", snippets(T_world_camera, seed + 100, shared), T_world_camera)
+
+
+# where both directions share little, their disagreement tells part of each error, and what is left is more alike
+@pytest.mark.parametrize(("shared", "least", "most"), [(0.2, 0.1, 0.6), (0.9, 0.75, 1.0)])
+def test_noise_that_is_known_is_found_and_covers_an_unseen_drive(shared: float, least: float, most: float) -> None:
+    noise = fit([errors(0, shared), errors(1, shared)], "abc")
+    unseen = errors(2, shared)
+    for frames in (1.0, 2.0):
+        squares = (unseen.features[unseen.features[:, 0, 0] == frames] ** 2).mean(axis=0)
+        laws = np.array([noise.frame, noise.turn, noise.length, noise.disagreement])
+        sigmas = np.sqrt((laws**2 * squares).sum(axis=0))
+        np.testing.assert_allclose(sigmas[:3], ROTATION * frames, rtol=0.35)
+        np.testing.assert_allclose(sigmas[3:], LENGTH_SHARE * np.sqrt(squares[2, 0]), rtol=0.35)
+    assert least < min(noise.correlation) <= max(noise.correlation) < most
+    assert coverage(unseen, noise) == pytest.approx([0.5, 0.9, 0.95], abs=0.07)
+
+
+def test_a_few_gross_errors_do_not_widen_the_noise() -> None:
+    clean, spoilt = errors(0), errors(0)
+    spoilt.single[::25] += 5.0
+    spoilt.mean[::25] += 5.0
+    before, after = (fit([e], "abc") for e in (clean, spoilt))
+    assert coverage(clean, after)[1] == pytest.approx(coverage(clean, before)[1], abs=0.06)
+
+
+class Standing:
+    """Networks that see no motion."""
+
+    sources = 4
+
+    def __init__(self, seen: Sequence[str] = ()) -> None:
+        self.seen = seen
+
+    def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        return np.ones(image.shape[:2], np.float32)
+
+    def poses(self, images: Sequence[NDArray[np.uint8]]) -> FloatArray:
+        T_source_target = np.tile(np.eye(4), (4, 1, 1))
+        T_source_target[:, 2, 3] = 0.1 * np.array([2, 1, -1, -2])
+        return T_source_target
+
+    def leaks(self, names: Sequence[str]) -> list[str]:
+        return overlapping(names, self.seen)
+
+
+def test_the_command_refuses_leaks_short_drives_and_roots_without_truth(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
+    write_root(tmp_path, frames=9, step=(0.0, 0.0, 0.1))
+    with pytest.raises(DataError, match="pairs of frames that move; wanted 50"):
+        calibrate(Standing(), [tmp_path], (), False, "abc")
+    with pytest.raises(DataError, match="leak"):
+        calibrate(Standing(["kitti_odometry/00"]), [tmp_path], (), False, "abc")
+    with pytest.raises(DataError, match="no sequence with true poses"):
+        calibrate(Standing(), [tmp_path], ["77"], False, "abc")
+
+
+def test_the_command_measures_a_drive(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=40, step=(0.0, 0.0, 0.1))
+    noise, rows = calibrate(Standing(), [tmp_path], ["00"], False, "abc")
+    assert [row["recording"] for row in rows] == noise.measured_on == ["kitti_odometry/00[0:40]"]
+    assert noise.pairs == rows[0]["pairs"] > 50 and noise.pose_sha256 == "abc"
+    assert min(noise.frame) > 0

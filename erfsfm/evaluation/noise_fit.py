@@ -16,7 +16,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from erfsfm.data.recordings import Recording, discover
+from erfsfm.data.discovery import discover
+from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import Networks, refuse_leak, windows
 from erfsfm.pose_noise import FloatArray, PoseNoise, difference, pair_poses

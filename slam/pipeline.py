@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from slam.frontend.scale import rescaled, resolve_mode, scale_from_reference
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
+from slam.memory import Recall, compute_anew
 from slam.observation import Observations, Observer, read_frame
 from slam.pose_graph import PoseGraph
 from slam.se3 import FloatArray, chain, invert
@@ -65,12 +67,18 @@ class SlamPipeline:
     """From the frames of a sequence to a trajectory and a map."""
 
     def __init__(
-        self, sequence: FrameSequence, predictor: Predictor, config: SlamConfig, progress: Progress | None = None
+        self,
+        sequence: FrameSequence,
+        predictor: Predictor,
+        config: SlamConfig,
+        progress: Progress | None = None,
+        recall: Recall = compute_anew,
     ) -> None:
         self._sequence = sequence
         self._predictor = predictor
         self._config = config
         self._progress = progress or (lambda stage, done, total: None)
+        self._recall = recall
         self._watch = Stopwatch()
 
     def run(self) -> SlamResult:
@@ -163,12 +171,18 @@ class SlamPipeline:
         """One pass over the frames, gaps closed at its end."""
         total = len(self._sequence)
         examples = np.linspace(0, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
-        observer = Observer(self._predictor, self._sequence.intrinsics, self._config, self._watch, examples)
-        for index in range(total):
-            with self._watch.stage("read"):
-                frame = read_frame(self._sequence, index)
-            observer.add(index, frame)
-            self._progress("frames", index + 1, total)
+        observer = Observer(
+            self._predictor, self._sequence.intrinsics, self._config, self._watch, examples, self._recall
+        )
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as ahead:
+            following = ahead.submit(read_frame, self._sequence, 0)
+            for index in range(total):
+                with self._watch.stage("read"):
+                    frame = following.result()
+                if index + 1 < total:
+                    following = ahead.submit(read_frame, self._sequence, index + 1)
+                observer.add(index, frame)
+                self._progress("frames", index + 1, total)
         seen = observer.closed()
         for first, last in runs(seen.bridged):
             logger.warning("frames %d to %d bridged: %s", first, last, seen.bridged[first])

@@ -23,7 +23,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippets_from_trajectory,
 )
 from erfsfm.inference import DepthPosePredictor, commit
-from slam import frontend, loops
+from slam import frontend, loops, se3
 from slam.cache import CachedNetworks
 from slam.config import dump_yaml, load_config
 from slam.errors import SlamError
@@ -155,8 +155,10 @@ def _cached(networks: DepthPosePredictor, memory: Memory) -> CachedNetworks:
 
 def _code() -> str:
     """Whatever measures images: an entry names it, so that there is no version to forget."""
-    sources = fingerprint(*(Path(package.__path__[0]) for package in (frontend, loops)))
-    return f"{sources} numpy {np.__version__} opencv {cv2.__version__} scipy {scipy.__version__}"
+    folders = (Path(package.__path__[0]) for package in (frontend, loops))
+    sources = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+    versions = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
+    return " ".join((fingerprint(*sources, Path(se3.__file__)), *versions))
 
 
 def _seed(seed: int) -> None:

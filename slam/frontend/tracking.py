@@ -66,8 +66,13 @@ class CornerTracker:
                     return wider, kept_wider
             return forward, kept
 
-        settings = (config.window_px, config.wide_window_px, config.few_corners)
-        settings += (config.pyramid_levels, config.forward_backward_px)
+        settings = (
+            config.window_px,
+            config.wide_window_px,
+            config.few_corners,
+            config.pyramid_levels,
+            config.forward_backward_px,
+        )
         forward, kept = self._recall("corners found again", (first.image, second.image, points, repr(settings)), follow)
         return forward, kept
 

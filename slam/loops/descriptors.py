@@ -96,13 +96,13 @@ class FeatureExtractor:
         return points.astype(np.float32)
 
 
-def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.uint16]:
+def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
     """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``."""
     words_first, words_second = (np.ascontiguousarray(d).view(np.uint64).T for d in (first, second))  # (4, M), (4, N)
     differing = np.zeros((len(first), len(second)), np.uint16)
     for a, b in zip(words_first, words_second, strict=True):
         differing += np.bitwise_count(a[:, None] ^ b)
-    return differing
+    return differing.astype(np.float32)
 
 
 def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:

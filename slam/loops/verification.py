@@ -139,7 +139,7 @@ def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.
     """Rows of both views that are each other's nearest by Hamming distance, clearly before the second nearest."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance = hamming(first.descriptors, second.descriptors).astype(np.float32)
+    distance = hamming(first.descriptors, second.descriptors)
     rows, nearest = np.arange(len(first)), distance.argmin(axis=1)
     best = distance[rows, nearest]
     kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= config.max_hamming)

@@ -7,8 +7,9 @@ again. Arrays are kept at their own precision, so that a run that remembers and 
 from __future__ import annotations
 
 import hashlib
-import io
+import json
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,8 +28,9 @@ Given = str | NDArray[Any]
 Answer = tuple[NDArray[Any], ...]
 Recall = Callable[[str, Sequence[Given], Callable[[], Answer]], Answer]
 
-_FORMAT = b"erfsfm-slam cache 1"
+_FORMAT = b"erfsfm-slam cache 2"
 _CHECK_BYTES = 16
+_LENGTH_BYTES = 4
 _REMEMBERED_DIGESTS = 8
 
 
@@ -96,7 +98,7 @@ class Memory:
             return digest
 
     def _path(self, key: str) -> Path:
-        return self._folder / key[:2] / f"{key}.npy"
+        return self._folder / key[:2] / key
 
 
 class Recollection:
@@ -145,17 +147,18 @@ def fingerprint(*sources: Path) -> str:
 
 
 def _packed(answer: Answer) -> bytes:
-    buffer = io.BytesIO()
-    for array in answer:
-        np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
+    """Types and shapes as JSON after its length, then the bytes: NumPy's own header takes longer to read than these."""
+    header = json.dumps([(array.dtype.str, array.shape) for array in answer]).encode()
+    return b"".join((len(header).to_bytes(_LENGTH_BYTES, "little"), header, *(array.tobytes() for array in answer)))
 
 
 def _unpacked(content: bytes) -> Answer:
-    buffer = io.BytesIO(content)
-    arrays = []
-    while buffer.tell() < len(content):
-        arrays.append(np.load(buffer, allow_pickle=False))
+    start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+    arrays: list[NDArray[Any]] = []
+    for kind, shape in json.loads(content[_LENGTH_BYTES:start]):
+        array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape).copy()
+        arrays.append(array)
+        start += array.nbytes
     return tuple(arrays)
 
 

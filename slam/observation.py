@@ -21,6 +21,8 @@ from slam.frontend.refusal import Refusal
 from slam.frontend.road_motion import RoadAligner, RoadStep
 from slam.frontend.scale import RoadPlane, fit_road
 from slam.loops.descriptors import FeatureExtractor, View
+from slam.memory import Recall, compute_anew
+from slam.spool import Spool, Spooled
 from slam.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
@@ -28,11 +30,21 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What fusion needs of a frame: a thinned image ``(h, w, 3)`` and unscaled depth ``(h, w)``."""
+    """What fusion needs of a frame, on disk until then."""
 
     index: int
-    image: Image
-    depth_unscaled: DepthMap
+    spooled_image: Spooled
+    spooled_depth: Spooled
+
+    @property
+    def image(self) -> Image:
+        """Thinned, ``(h, w, 3)``."""
+        return self.spooled_image.read()
+
+    @property
+    def depth_unscaled(self) -> DepthMap:
+        """Thinned, ``(h, w)``."""
+        return self.spooled_depth.read()
 
 
 @dataclass
@@ -80,6 +92,7 @@ class Observer:
         config: SlamConfig,
         watch: Stopwatch,
         examples: Collection[int] = (),
+        recall: Recall = compute_anew,
     ) -> None:
         """Prepare for the first frame.
 
@@ -89,6 +102,7 @@ class Observer:
             config: of all parts.
             watch: told where the time goes.
             examples: frames to keep whole for the report.
+            recall: what images alone determine.
         """
         self.seen = Observations()
         self._predictor = predictor
@@ -97,13 +111,14 @@ class Observer:
         self._watch = watch
         self._examples = frozenset(examples)
         self._gate = FrameGate(config.bridging)
-        self._geometry = GeometricOdometry(config.geometry, intrinsics)
-        self._aligner = RoadAligner(config.road, intrinsics)
-        self._features = FeatureExtractor(config.loops, intrinsics)
+        self._geometry = GeometricOdometry(config.geometry, intrinsics, recall)
+        self._aligner = RoadAligner(config.road, intrinsics, recall)
+        self._features = FeatureExtractor(config.loops, intrinsics, recall)
         self._steps = config.geometry.steps if config.geometry.enabled else ()
         self._window: deque[Frame] = deque(maxlen=predictor.sources + 1)
         self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=1))
         self._unread = 0
+        self._spool = Spool()
         self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks")
 
     def add(self, index: int, frame: Frame | SequenceError) -> None:
@@ -222,4 +237,4 @@ class Observer:
         size = (max(round(width * thinned), 1), max(round(height * thinned), 1))
         small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-        self.seen.keyframes.append(Keyframe(frame.index, image, small))
+        self.seen.keyframes.append(Keyframe(frame.index, self._spool.put(image), self._spool.put(small)))

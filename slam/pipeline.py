@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from slam.frontend.scale import rescaled, resolve_mode, scale_from_reference
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
+from slam.memory import Recall, compute_anew
 from slam.observation import Observations, Observer, read_frame
 from slam.pose_graph import PoseGraph
 from slam.se3 import FloatArray, chain, invert
@@ -79,6 +81,7 @@ class SlamPipeline:
         config: SlamConfig,
         progress: Progress | None = None,
         noise: PoseNoise | None = None,
+        recall: Recall = compute_anew,
     ) -> None:
         """Prepare a run.
 
@@ -88,6 +91,7 @@ class SlamPipeline:
             config: of all parts.
             progress: told the stage, and how much of it is done.
             noise: of the snippet poses; None measures it against image geometry alone.
+            recall: remembers what images alone determine.
         """
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
@@ -96,6 +100,7 @@ class SlamPipeline:
         self._predictor = predictor
         self._config = config
         self._progress = progress or (lambda stage, done, total: None)
+        self._recall = recall
         self._watch = Stopwatch()
 
     def run(self) -> SlamResult:
@@ -188,12 +193,18 @@ class SlamPipeline:
         """One pass over the frames, gaps closed at its end."""
         total = len(self._sequence)
         examples = np.linspace(0, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
-        observer = Observer(self._predictor, self._sequence.intrinsics, self._config, self._watch, examples)
-        for index in range(total):
-            with self._watch.stage("read"):
-                frame = read_frame(self._sequence, index)
-            observer.add(index, frame)
-            self._progress("frames", index + 1, total)
+        observer = Observer(
+            self._predictor, self._sequence.intrinsics, self._config, self._watch, examples, self._recall
+        )
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as ahead:
+            following = ahead.submit(read_frame, self._sequence, 0)
+            for index in range(total):
+                with self._watch.stage("read"):
+                    frame = following.result()
+                if index + 1 < total:
+                    following = ahead.submit(read_frame, self._sequence, index + 1)
+                observer.add(index, frame)
+                self._progress("frames", index + 1, total)
         seen = observer.closed()
         for first, last in runs(seen.bridged):
             logger.warning("frames %d to %d bridged: %s", first, last, seen.bridged[first])

@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from erfsfm import __version__
@@ -22,6 +23,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippets_from_trajectory,
 )
 from erfsfm.inference import DepthPosePredictor, commit
+from slam import frontend, loops, se3
 from slam.cache import CachedNetworks
 from slam.config import dump_yaml, load_config
 from slam.errors import SlamError
@@ -31,6 +33,7 @@ from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.refusal import Refusal
 from slam.map_metrics import accuracy_median_m, completeness, pose_similarity, visible_surface
+from slam.memory import Memory, Recollection, compute_anew, fingerprint
 from slam.networks import NetworkPredictor
 from slam.pipeline import Progress, SlamPipeline, SlamResult
 from slam.places import PLACES, Places
@@ -89,7 +92,7 @@ def run_slam(
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: told of (stage, done, total).
         command: recorded in the metrics.
-        cache: folder that keeps the networks' answers; None asks them anew.
+        cache: folder that keeps the networks' answers and what images alone determine; None asks anew.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
 
     Returns:
@@ -103,7 +106,9 @@ def run_slam(
     settings = load_config(config, overrides)
     recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
     networks = DepthPosePredictor.from_weights(weights, device)
-    predictor = NetworkPredictor(networks if cache is None else _cached(networks, cache))
+    memory = None if cache is None else Memory(cache)
+    predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory))
+    recall = compute_anew if memory is None else Recollection(memory, _code()).recall
     provenance = Provenance(
         version=__version__,
         commit=commit(),
@@ -121,7 +126,7 @@ def run_slam(
     with _logging_to(folder.path / "run.log"):
         try:
             _seed(seed)
-            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise)
+            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall)
             result = _run(folder, pipeline, recording, provenance, settings.output.report)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
@@ -142,10 +147,18 @@ def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, erro
             write_report(folder, [], None, None)
 
 
-def _cached(networks: DepthPosePredictor, folder: Path) -> CachedNetworks:
-    """The networks with a folder of their answers; GPU and CPU answer a little differently and share none."""
+def _cached(networks: DepthPosePredictor, memory: Memory) -> CachedNetworks:
+    """The networks with a memory of their answers; GPU and CPU answer a little differently and share none."""
     network = networks.record.network.model_dump_json()
-    return CachedNetworks(networks, f"{networks.sha256} {network} {networks.device.type}", folder)
+    return CachedNetworks(networks, f"{networks.sha256} {network} {networks.device.type}", memory)
+
+
+def _code() -> str:
+    """Whatever measures images: an entry names it, so that there is no version to forget."""
+    folders = (Path(package.__path__[0]) for package in (frontend, loops))
+    sources = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+    versions = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
+    return " ".join((fingerprint(*sources, Path(se3.__file__)), *versions))
 
 
 def _seed(seed: int) -> None:

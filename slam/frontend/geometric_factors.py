@@ -6,7 +6,7 @@ ratio of learned to triangulated depth; perspective-n-point against learned dept
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from slam.frontend.epipolar import (
 )
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
+from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray, invert, make
 
 ESSENTIAL_SOURCE = "essential"
@@ -65,10 +66,11 @@ class Motion:
 class GeometricOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
 
-    def __init__(self, config: GeometryConfig, intrinsics: Intrinsics) -> None:
+    def __init__(self, config: GeometryConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._tracker = CornerTracker(config)
+        self._recall = recall
+        self._tracker = CornerTracker(config, recall)
 
     def measure(
         self,
@@ -126,7 +128,7 @@ class GeometricOdometry:
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
-        two_view = estimate_two_view(rays_previous, rays_current, self._intrinsics.fx, self._config.inlier_px)
+        two_view = self._two_view(rays_previous, rays_current)
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
             return None
         parallax = parallax_px(rays_previous, rays_current, two_view.R_current_previous, self._intrinsics)
@@ -144,6 +146,16 @@ class GeometricOdometry:
         structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
         sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))
         return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction)
+
+    def _two_view(self, rays_previous: FloatArray, rays_current: FloatArray) -> TwoView | None:
+        focal_px, inlier_px = self._intrinsics.fx, self._config.inlier_px
+
+        def estimate() -> Answer:
+            found = estimate_two_view(rays_previous, rays_current, focal_px, inlier_px)
+            return () if found is None else astuple(found)
+
+        known = self._recall("two views", (rays_previous, rays_current, repr((focal_px, inlier_px))), estimate)
+        return TwoView(*known) if known else None
 
     def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""

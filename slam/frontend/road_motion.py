@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam.config import RoadConfig
 from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.refusal import Refusal
+from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
@@ -42,9 +43,10 @@ class RoadStep:
 class RoadAligner:
     """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it."""
 
-    def __init__(self, config: RoadConfig, intrinsics: Intrinsics) -> None:
+    def __init__(self, config: RoadConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
+        self._recall = recall
         self._top_row, self._rows, self._columns, self._rays = _region(intrinsics, config)
         self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
         self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
@@ -62,11 +64,8 @@ class RoadAligner:
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions.append(T_unit[:3, 3])
-        before, now = self._layers(previous), self._layers(current)
-        expected, tilt = self._expected(), float(np.deg2rad(self._config.tilt_sigma_deg))
-        plane = self._search(before[0], now[0], T_unit, expected)
-        for layer_before, layer_now in zip(before, now, strict=True):
-            plane, likeness = self._refine(layer_before, layer_now, T_unit, plane, expected, tilt)
+        expected = self._expected()
+        plane, likeness = self._aligned(previous, current, T_unit, expected)
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
@@ -76,6 +75,26 @@ class RoadAligner:
             return Refusal(f"the road looks different in both images (correlation {likeness:.2f})")
         sigma_share = float(np.hypot(self._config.sigma_share, self._config.tilt_gain * deviation))
         return RoadStep(length, sigma_share, normal)
+
+    def _aligned(
+        self, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """The plane ``m`` ``(3,)`` that aligns the road, and how alike both views of it are then."""
+        config = self._config
+
+        def align() -> Answer:
+            before, now = self._layers(previous), self._layers(current)
+            plane = self._search(before[0], now[0], T_unit, expected)
+            for layer_before, layer_now in zip(before, now, strict=True):
+                plane, likeness = self._refine(
+                    layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
+                )
+            return plane, np.array(likeness)
+
+        settings = (self._intrinsics, config.far_heights, config.half_width_heights, config.points)
+        given = (previous.image, current.image, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
+        plane, likeness = self._recall("road aligned", given, align)
+        return plane, float(likeness)
 
     def _expected(self) -> FloatArray:
         """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.

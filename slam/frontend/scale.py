@@ -7,6 +7,7 @@ ray, and the ray is free of noise, so the fit is not biased by the depth's error
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -60,12 +61,12 @@ def fit_road(depth_unscaled: DepthMap, intrinsics: Intrinsics, config: ScaleConf
         intrinsics: the camera, pixels.
         config: trapezoid, tolerances and the largest tilt.
     """
-    rows, columns = _trapezoid(intrinsics, config)
+    rows, columns, all_rays = _trapezoid(intrinsics, config)
     inverse_depth = 1.0 / np.maximum(depth_unscaled[rows, columns].astype(np.float64), 1e-9)
     usable = np.isfinite(inverse_depth) & (inverse_depth < 1e8)
     if usable.sum() < 50:
         return Refusal("the depth before the car is not usable")
-    rays = _rays(intrinsics, columns, rows)[usable]  # (P, 3)
+    rays = all_rays[usable]  # (P, 3)
     inverse_depth = inverse_depth[usable]
     scaled_normal = _ransac(rays, inverse_depth, config)
     if scaled_normal is None:
@@ -151,8 +152,12 @@ def rescaled(relative_pose: RelativePose, scale: float) -> RelativePose:
     return replace(relative_pose, T_from_to=T_from_to, sigmas=sigmas)
 
 
-def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns ``(P,)`` of about ``_POINTS`` pixels; the horizon is taken at cy (a level camera)."""
+@functools.lru_cache(maxsize=4)
+def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Rows, columns ``(P,)`` and rays ``(P, 3)`` of about ``_POINTS`` pixels.
+
+    The horizon is taken at cy (a level camera).
+    """
     horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
     shares = (config.road_top_share, config.road_bottom_share)
     top_row, bottom_row = (horizon + share * (bottom - horizon) for share in shares)
@@ -169,7 +174,8 @@ def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.
         columns.append(across)
         rows.append(np.full(len(across), row))
     empty = [np.empty(0, dtype=np.int64)]
-    return np.concatenate(rows or empty), np.concatenate(columns or empty)
+    v, u = np.concatenate(rows or empty), np.concatenate(columns or empty)
+    return v, u, _rays(intrinsics, u, v)
 
 
 def _rays(intrinsics: Intrinsics, u: NDArray[np.int64], v: NDArray[np.int64]) -> FloatArray:
@@ -208,6 +214,7 @@ def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray, 
     for _ in range(_REWEIGHTINGS):
         predicted = np.maximum(rays @ plane, 1e-9)
         residual = inverse_depth / predicted - 1.0
-        weights = 1.0 / (predicted * np.sqrt(1.0 + (residual / (0.5 * sigma)) ** 2))
-        plane = np.linalg.lstsq(rays * weights[:, None], inverse_depth * weights, rcond=None)[0]
+        weights = 1.0 / (predicted**2 * (1.0 + (residual / (0.5 * sigma)) ** 2))
+        weighted = rays * weights[:, None]
+        plane = np.linalg.solve(weighted.T @ rays, weighted.T @ inverse_depth)
     return plane

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam.config import GeometryConfig
 from slam.frames import Frame, Image
+from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray
 
 _REMEMBERED = 4
@@ -32,8 +33,9 @@ class Tracks:
 class CornerTracker:
     """Follows corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
 
-    def __init__(self, config: GeometryConfig) -> None:
+    def __init__(self, config: GeometryConfig, recall: Recall = compute_anew) -> None:
         self._config = config
+        self._recall = recall
         self._seen: OrderedDict[int, _Seen] = OrderedDict()
         self._named = 0
 
@@ -43,16 +45,36 @@ class CornerTracker:
         if first.corners is None:
             self._fill(first, _no_corners())
         assert first.corners is not None
-        forward, kept = self._follow(first, second, first.corners.pixels, self._config.window_px)
-        if kept.sum() < self._config.few_corners:
-            alike = _Seen(second.image, _exposed_like(second.grey, first.grey))
-            wider, kept_wider = self._follow(first, alike, first.corners.pixels, self._config.wide_window_px)
-            if kept_wider.sum() > kept.sum():
-                forward, kept = wider, kept_wider
+        forward, kept = self._found_again(first, second, first.corners.pixels)
         names = first.corners.names[kept]
         if second.corners is None:
             self._fill(second, _Corners(forward[kept], names))
         return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
+
+    def _found_again(
+        self, first: _Seen, second: _Seen, points: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Where points ``(M, 2)`` went and which can be believed, sought wider where they are few."""
+        config = self._config
+
+        def follow() -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+            forward, kept = self._follow(first, second, points, config.window_px)
+            if kept.sum() < config.few_corners:
+                alike = _Seen(second.image, _exposed_like(second.grey, first.grey))
+                wider, kept_wider = self._follow(first, alike, points, config.wide_window_px)
+                if kept_wider.sum() > kept.sum():
+                    return wider, kept_wider
+            return forward, kept
+
+        settings = (
+            config.window_px,
+            config.wide_window_px,
+            config.few_corners,
+            config.pyramid_levels,
+            config.forward_backward_px,
+        )
+        forward, kept = self._recall("corners found again", (first.image, second.image, points, repr(settings)), follow)
+        return forward, kept
 
     def _see(self, frame: Frame) -> _Seen:
         seen = self._seen.get(frame.index)
@@ -70,17 +92,25 @@ class CornerTracker:
         pixels, names = arrived.pixels, arrived.names
         room = config.max_corners - len(pixels)
         if room > 0:
-            free = np.full(seen.grey.shape, 255, np.uint8)
-            for u, v in np.rint(pixels).astype(int).tolist():
-                cv2.circle(free, (u, v), int(config.corner_spacing_px), 0, -1)
-            corners = cv2.goodFeaturesToTrack(
-                seen.grey, room, config.corner_quality, config.corner_spacing_px, mask=free, blockSize=5
+            settings = (room, config.corner_quality, config.corner_spacing_px)
+            (fresh,) = self._recall(
+                "fresh corners", (seen.image, pixels, repr(settings)), lambda: (self._fresh(seen.grey, pixels, room),)
             )
-            fresh = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
             pixels = np.concatenate([pixels, fresh])
             names = np.concatenate([names, self._named + np.arange(len(fresh))])
             self._named += len(fresh)
         seen.corners = _Corners(pixels, names)
+
+    def _fresh(self, grey: NDArray[np.uint8], pixels: NDArray[np.float32], room: int) -> NDArray[np.float32]:
+        """At most ``room`` corners ``(M, 2)`` away from those known."""
+        config = self._config
+        free = np.full(grey.shape, 255, np.uint8)
+        for u, v in np.rint(pixels).astype(int).tolist():
+            cv2.circle(free, (u, v), int(config.corner_spacing_px), 0, -1)
+        corners = cv2.goodFeaturesToTrack(
+            grey, room, config.corner_quality, config.corner_spacing_px, mask=free, blockSize=5
+        )
+        return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
     def _follow(
         self, first: _Seen, second: _Seen, points: NDArray[np.float32], side: int

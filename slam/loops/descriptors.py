@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import LoopsConfig
-from slam.frames import DepthMap, Frame, Intrinsics
+from slam.frames import DepthMap, Frame, Image, Intrinsics
+from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 
 Descriptors = NDArray[np.uint8]
@@ -43,9 +44,10 @@ class View:
 class FeatureExtractor:
     """Takes the features of frames of one sequence, the strongest of each part of the image."""
 
-    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics) -> None:
+    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
+        self._recall = recall
         self._orb = cv2.ORB.create(
             nfeatures=_DETECTED_PER_KEPT * config.max_features,
             nlevels=6,
@@ -62,15 +64,22 @@ class FeatureExtractor:
             height_unscaled: camera height in the same unit; where known, depths farther than
                 ``max_depth_heights`` of it are not trusted.
         """
-        grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        settings = (self._config.max_features, self._config.corner_contrast)
+        pixels, descriptors = self._recall(
+            "features", (frame.image, repr(settings)), lambda: self._features(frame.image)
+        )
+        points = self._points(pixels, depth_unscaled, height_unscaled)
+        return View(frame.index, pixels, descriptors, points)
+
+    def _features(self, image: Image) -> Answer:
+        """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found = self._orb.detect(grey, None)
         chosen = [found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)]
         chosen, descriptors = self._orb.compute(grey, chosen)
         if not chosen:
-            return View(frame.index, np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), _no_points(0))
-        pixels = np.array([keypoint.pt for keypoint in chosen], np.float32)  # (M, 2)
-        points = self._points(pixels, depth_unscaled, height_unscaled)
-        return View(frame.index, pixels, descriptors, points)
+            return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+        return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors
 
     def _points(
         self, pixels: NDArray[np.float32], depth: DepthMap, height_unscaled: float | None
@@ -88,21 +97,12 @@ class FeatureExtractor:
 
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:
-    """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``.
-
-    One matrix product of signs; its sums are whole numbers, so no order of summation changes them.
-    """
-    agreement = _signs(first) @ _signs(second).T
-    distance: NDArray[np.float32] = np.float32(4 * first.shape[1]) - np.float32(0.5) * agreement
-    return distance
-
-
-def _signs(descriptors: Descriptors) -> NDArray[np.float32]:
-    return np.float32(2.0) * np.unpackbits(descriptors, axis=1) - np.float32(1.0)
-
-
-def _no_points(count: int) -> NDArray[np.float32]:
-    return np.full((count, 3), np.nan, np.float32)
+    """Differing bits ``(M, N)`` of every pair of descriptors ``(M, 32)`` and ``(N, 32)``."""
+    words_first, words_second = (np.ascontiguousarray(d).view(np.uint64).T for d in (first, second))  # (4, M), (4, N)
+    differing = np.zeros((len(first), len(second)), np.uint16)
+    for a, b in zip(words_first, words_second, strict=True):
+        differing += np.bitwise_count(a[:, None] ^ b)
+    return differing.astype(np.float32)
 
 
 def _strongest_per_cell(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> NDArray[np.intp]:

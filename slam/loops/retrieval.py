@@ -19,7 +19,7 @@ from slam.se3 import FloatArray
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
 _BLOCK = 256
-_BLOCK_DESCRIPTORS = 2000
+_BLOCK_DESCRIPTORS = 200  # fit the processor's cache
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from slam.cache import CachedNetworks
 from slam.errors import SlamError
 from slam.frames import Image
+from slam.memory import Memory
 
 
 class Counting:
@@ -44,10 +45,10 @@ def entries(folder: Path) -> list[Path]:
 
 def test_a_second_run_asks_nothing_and_hears_the_same(tmp_path: Path) -> None:
     networks, images = Counting(), pictures()
-    first = CachedNetworks(networks, "weights", tmp_path)
+    first = CachedNetworks(networks, "weights", Memory(tmp_path))
     heard = [first.disparity(images[0]), first.poses(images)]
     assert (networks.asked, first.asked, first.found) == (2, 2, 0)
-    second = CachedNetworks(networks, "weights", tmp_path)
+    second = CachedNetworks(networks, "weights", Memory(tmp_path))
     copies = [image.copy() for image in images]
     for before, again in zip(heard, [second.disparity(copies[0]), second.poses(copies)], strict=True):
         np.testing.assert_array_equal(before, again)
@@ -57,7 +58,7 @@ def test_a_second_run_asks_nothing_and_hears_the_same(tmp_path: Path) -> None:
 
 def test_every_difference_is_another_entry(tmp_path: Path) -> None:
     networks, images = Counting(), pictures()
-    cached = CachedNetworks(networks, "weights", tmp_path)
+    cached = CachedNetworks(networks, "weights", Memory(tmp_path))
     cached.disparity(images[0])
     cached.poses(images)
     touched = images[0].copy()
@@ -65,7 +66,7 @@ def test_every_difference_is_another_entry(tmp_path: Path) -> None:
     cached.disparity(touched)
     cached.disparity(images[0].reshape(8, 6, 3))
     cached.poses(images[::-1])
-    CachedNetworks(networks, "other weights", tmp_path).disparity(images[0])
+    CachedNetworks(networks, "other weights", Memory(tmp_path)).disparity(images[0])
     assert networks.asked == len(entries(tmp_path)) == 6
 
 
@@ -74,20 +75,20 @@ def test_a_broken_entry_is_computed_and_written_again(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     networks, image = Counting(), pictures()[0]
-    expected = CachedNetworks(networks, "weights", tmp_path).disparity(image)
+    expected = CachedNetworks(networks, "weights", Memory(tmp_path)).disparity(image)
     (path,) = entries(tmp_path)
     whole = path.read_bytes()
     flipped = whole[:-1] + bytes([whole[-1] ^ 1])
     path.write_bytes({"half": whole[: len(whole) // 2], "empty": b"", "flipped": flipped}[damage])
     with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(CachedNetworks(networks, "weights", tmp_path).disparity(image), expected)
+        np.testing.assert_array_equal(CachedNetworks(networks, "weights", Memory(tmp_path)).disparity(image), expected)
     assert networks.asked == 2 and "damaged" in caplog.text
     assert entries(tmp_path) == [path] and path.read_bytes() == whole
 
 
 def test_an_image_changed_in_place_is_not_hidden_by_a_new_array(tmp_path: Path) -> None:
     """Digests are remembered by object: a new array in the same place must not inherit one."""
-    cached = CachedNetworks(Counting(), "weights", tmp_path)
+    cached = CachedNetworks(Counting(), "weights", Memory(tmp_path))
     for seed in range(20):
         image = pictures(1, seed)[0]
         np.testing.assert_array_equal(cached.disparity(image), image[..., 0].astype(np.float32) / 7)
@@ -96,7 +97,7 @@ def test_an_image_changed_in_place_is_not_hidden_by_a_new_array(tmp_path: Path) 
 def test_a_folder_that_cannot_be_made_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SlamError, match=r"no cache can be made in .*file/cache"):
-        CachedNetworks(Counting(), "weights", tmp_path / "file" / "cache")
+        CachedNetworks(Counting(), "weights", Memory(tmp_path / "file" / "cache"))
 
 
 def test_a_disk_that_fills_up_ends_the_keeping_and_not_the_run(
@@ -106,7 +107,7 @@ def test_a_disk_that_fills_up_ends_the_keeping_and_not_the_run(
         raise OSError(28, "No space left on device")
 
     networks, images = Counting(), pictures()
-    cached = CachedNetworks(networks, "weights", tmp_path)
+    cached = CachedNetworks(networks, "weights", Memory(tmp_path))
     monkeypatch.setattr(Path, "write_bytes", full)
     for image in images:
         cached.disparity(image)

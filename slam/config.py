@@ -57,7 +57,10 @@ class GeometryConfig(Section):
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")
-    min_inliers: int = Field(default=40, ge=8, description="fewer refuse the measurement")
+    clear_share: float = Field(default=0.75, ge=0, le=1, description="share of inliers that ends the search")
+    depth_sigma_share: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
+    habit_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the direction around the usual one")
+    min_inliers: int = Field(default=20, ge=8, description="fewer refuse the measurement")
     still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
     min_parallax_px: float = Field(
         default=0.8, gt=0, description="median motion that a rotation must leave unexplained"

@@ -98,6 +98,7 @@ class LengthConfig(Section):
     learned_sigma: float = Field(default=0.1, gt=0, description="of a length by learned depth")
     unit_walk_sigma: float = Field(default=0.01, gt=0, description="how far learned depth's unit walks in a step")
     unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
+    max_contradiction: float = Field(default=2.5, gt=1, description="largest factor from the length by learned depth")
     outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")
 
 

@@ -86,6 +86,7 @@ class RoadConfig(Section):
     tilt_sigma_deg: float = Field(default=0.1, gt=0, description="tilt to expect against the direction of motion")
     max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="a plane tilted by more is not the road")
     min_likeness: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
+    min_gain: float = Field(default=0.15, ge=0, le=1, description="least share of an unmoved image's error explained")
     sigma_share: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma for a radian of unexpected tilt")
 

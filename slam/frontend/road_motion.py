@@ -74,6 +74,9 @@ class RoadAligner:
             return Refusal(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
         if likeness < self._config.min_likeness:
             return Refusal(f"the road looks different in both images (correlation {likeness:.2f})")
+        standing = _correlation(before[-1][self._rows, self._columns, 0], now[-1][self._rows, self._columns, 0])
+        if 1.0 - likeness > (1.0 - self._config.min_gain) * (1.0 - standing):
+            return Refusal(f"what is before the car stands still in the image (correlation {standing:.2f})")
         sigma_share = float(np.hypot(self._config.sigma_share, self._config.tilt_gain * deviation))
         return RoadStep(length, sigma_share, normal)
 

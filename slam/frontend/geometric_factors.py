@@ -25,7 +25,7 @@ ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MAD_TO_SIGMA = 1.4826
-_MIN_RATIOS = 20
+_MIN_RATIOS = 8
 _LEARNED_SIGMA_SHARE = 0.1
 _LEARNED_LENGTH_SHARE = 0.05
 # neighbouring corners err together: the covariance of independent ones is widened by this

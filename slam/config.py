@@ -52,7 +52,7 @@ class GeometryConfig(Section):
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners")
     window_px: int = Field(default=11, ge=5, le=63, description="side of the tracking window")
     wide_window_px: int = Field(default=31, ge=5, le=63, description="its side where few corners could be followed")
-    few_corners: int = Field(default=100, ge=0, description="fewer are few: they are sought again, exposure made alike")
+    few_corners: int = Field(default=60, ge=0, description="fewer are few: they are sought again, exposure made alike")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
@@ -86,7 +86,7 @@ class RoadConfig(Section):
     tilt_sigma_deg: float = Field(default=0.1, gt=0, description="tilt to expect against the direction of motion")
     max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="a plane tilted by more is not the road")
     min_likeness: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
-    min_gain: float = Field(default=0.15, ge=0, le=1, description="least share of an unmoved image's error explained")
+    min_gain: float = Field(default=0.25, ge=0, le=1, description="least share of an unmoved image's error explained")
     sigma_share: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma for a radian of unexpected tilt")
 

@@ -51,13 +51,16 @@ class GeometryConfig(Section):
     corner_quality: float = Field(default=0.003, gt=0, lt=1, description="share of the best corner's strength")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners")
     window_px: int = Field(default=11, ge=5, le=63, description="side of the tracking window")
-    wide_window_px: int = Field(default=21, ge=5, le=63, description="its side where few corners could be followed")
+    wide_window_px: int = Field(default=31, ge=5, le=63, description="its side where few corners could be followed")
     few_corners: int = Field(default=60, ge=0, description="fewer are few: they are sought again, exposure made alike")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")
-    min_inliers: int = Field(default=40, ge=8, description="fewer refuse the measurement")
+    clear_share: float = Field(default=0.75, ge=0, le=1, description="share of inliers that ends the search")
+    depth_sigma_share: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
+    habit_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the direction around the usual one")
+    min_inliers: int = Field(default=20, ge=8, description="fewer refuse the measurement")
     still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
     min_parallax_px: float = Field(
         default=0.8, gt=0, description="median motion that a rotation must leave unexplained"
@@ -87,6 +90,7 @@ class RoadConfig(Section):
     tilt_sigma_deg: float = Field(default=0.1, gt=0, description="tilt to expect against the direction of motion")
     max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="a plane tilted by more is not the road")
     min_likeness: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
+    min_gain: float = Field(default=0.25, ge=0, le=1, description="least share of an unmoved image's error explained")
     sigma_share: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma for a radian of unexpected tilt")
 
@@ -99,6 +103,7 @@ class LengthConfig(Section):
     learned_sigma: float = Field(default=0.1, gt=0, description="of a length by learned depth")
     unit_walk_sigma: float = Field(default=0.01, gt=0, description="how far learned depth's unit walks in a step")
     unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
+    max_contradiction: float = Field(default=2.5, gt=1, description="largest factor from the length by learned depth")
     outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")
 
 

@@ -6,7 +6,7 @@ ratio of learned to triangulated depth; perspective-n-point against learned dept
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,24 +15,18 @@ from scipy.spatial.transform import Rotation
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
 from slam.frontend.drive_noise import StepNoise
-from slam.frontend.epipolar import (
-    Structure,
-    TwoView,
-    estimate_two_view,
-    parallax_px,
-    rotation_between,
-    triangulated_depth,
-)
+from slam.frontend.epipolar import Structure, parallax_px, rotation_between, triangulated_depth
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
-from slam.memory import Answer, Recall, compute_anew
+from slam.frontend.two_view import Matches, TwoView, TwoViewEstimator
+from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray, invert, make
 
 ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MAD_TO_SIGMA = 1.4826
-_MIN_RATIOS = 20
+_MIN_RATIOS = 8
 _LEARNED_SIGMA_SHARE = 0.1
 _LEARNED_LENGTH_SHARE = 0.05
 # neighbouring corners err together: the covariance of independent ones is widened by this
@@ -69,8 +63,8 @@ class GeometricOdometry:
     def __init__(self, config: GeometryConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._recall = recall
         self._tracker = CornerTracker(config, recall)
+        self._two_views = TwoViewEstimator(config, intrinsics.fx, recall)
 
     def measure(
         self,
@@ -91,18 +85,19 @@ class GeometricOdometry:
         tracks = self._tracker.track(previous, current)
         if len(tracks.previous) < self._config.min_inliers:
             return Refusal(f"only {len(tracks.previous)} corners could be followed")
-        depth = self._trusted(_sample(depth_previous_unscaled, tracks.previous), height_unscaled)
+        learned = _sample(depth_previous_unscaled, tracks.previous)
+        depth = self._trusted(learned, height_unscaled)
         step = (previous.index, current.index)
         return (
             self._still(step, tracks, depth)
-            or self._by_essential(step, tracks, depth)
+            or self._by_essential(step, tracks, learned, depth)
             or (self._by_points(step, tracks, depth))
         )
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
         farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
-        return np.where(np.isfinite(depth) & (depth > 0) & (depth < farthest), depth, np.nan)
+        return np.where(depth < farthest, depth, np.nan)
 
     def _rays(self, pixels: FloatArray) -> FloatArray:
         camera = self._intrinsics
@@ -120,7 +115,9 @@ class GeometricOdometry:
         rotation = np.deg2rad(self._config.rotation_floor_deg)
         return Motion(RelativePose(*step, np.eye(4), np.repeat([rotation, translation], 3), STILL_SOURCE))
 
-    def _by_essential(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
+    def _by_essential(
+        self, step: tuple[int, int], tracks: Tracks, learned: FloatArray, depth: FloatArray
+    ) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         rays_previous, rays_current = self._rays(tracks.previous), self._rays(tracks.current)
         # an essential matrix of a pure rotation invents a translation: only believe one that is needed
@@ -128,41 +125,32 @@ class GeometricOdometry:
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
-        two_view = self._two_view(rays_previous, rays_current)
+        two_view = self._two_views.estimate(Matches(rays_previous, rays_current, learned))
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
             return None
-        parallax = parallax_px(rays_previous, rays_current, two_view.R_current_previous, self._intrinsics)
-        triangulated = triangulated_depth(rays_previous, rays_current, two_view)
+        heading = two_view.heading
+        parallax = parallax_px(rays_previous, rays_current, heading.R_current_previous, self._intrinsics)
+        triangulated = triangulated_depth(rays_previous, rays_current, heading)
         solid = two_view.inliers & (triangulated > 0) & (parallax > self._config.min_point_parallax_px)
         measures = solid & np.isfinite(depth)
         if measures.sum() < _MIN_RATIOS:
             return None
         sigma_share = self._config.inlier_px / np.maximum(parallax, 1e-9)
         length, spread = _length(depth[measures] / triangulated[measures], sigma_share[measures])
-        T_previous_current = invert(make(two_view.R_current_previous, length * two_view.direction))
+        T_previous_current = invert(make(heading.R_current_previous, length * heading.direction))
         rotation, direction = self._essential_sigmas(two_view)
-        depth_current = triangulated * (rays_previous @ two_view.R_current_previous[2]) + two_view.direction[2]
+        depth_current = triangulated * (rays_previous @ heading.R_current_previous[2]) + heading.direction[2]
         solid &= depth_current > 0
         structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
         sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))
         return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction)
-
-    def _two_view(self, rays_previous: FloatArray, rays_current: FloatArray) -> TwoView | None:
-        focal_px, inlier_px = self._intrinsics.fx, self._config.inlier_px
-
-        def estimate() -> Answer:
-            found = estimate_two_view(rays_previous, rays_current, focal_px, inlier_px)
-            return () if found is None else astuple(found)
-
-        known = self._recall("two views", (rays_previous, rays_current, repr((focal_px, inlier_px))), estimate)
-        return TwoView(*known) if known else None
 
     def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
         own = np.sqrt(np.diag(two_view.covariance))
         rotation = np.hypot(own[:3], np.deg2rad(self._config.rotation_floor_deg))
         floor = np.deg2rad(self._config.direction_floor_deg)
-        return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.direction**2, 0.0)))
+        return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.heading.direction**2, 0.0)))
 
     def _by_points(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | Refusal:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
@@ -218,11 +206,12 @@ def _sigmas(
 
 
 def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
-    """Depth at the nearest pixel of each point."""
+    """Depth at the nearest pixel of each point, NaN where there is none."""
     height, width = depth.shape
     u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
     v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    return np.asarray(depth[v, u].astype(np.float64))
+    sampled = depth[v, u].astype(np.float64)
+    return np.where(np.isfinite(sampled) & (sampled > 0), sampled, np.nan)
 
 
 def _length(ratios: FloatArray, triangulation_sigma_share: FloatArray) -> tuple[float, float]:

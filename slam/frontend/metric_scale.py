@@ -81,6 +81,9 @@ def find_scale(
     else:
         track = scale_track(measured.planes, height, believed, config)
     evidence = gather_evidence(measured.motions, absolute, track)
+    if not isinstance(believed, Refusal):
+        # a car ahead that is taken for the road, for seconds on end, would outvote everything else
+        evidence = evidence.without_contradicted(lengths.max_contradiction)
     solved = solve_lengths(evidence, lengths)
     per_frame = track * np.append(solved.unit_correction, solved.unit_correction[-1])
     misfit = np.abs(evidence.absolute - np.log(solved.length))

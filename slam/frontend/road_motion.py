@@ -65,7 +65,7 @@ class RoadAligner:
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions.append(T_unit[:3, 3])
         expected = self._expected()
-        plane, likeness = self._aligned(previous, current, T_unit, expected)
+        plane, likeness, standing = self._aligned(previous, current, T_unit, expected)
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
@@ -73,13 +73,15 @@ class RoadAligner:
             return Refusal(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
         if likeness < self._config.min_likeness:
             return Refusal(f"the road looks different in both images (correlation {likeness:.2f})")
+        if 1.0 - likeness > (1.0 - self._config.min_gain) * (1.0 - standing):
+            return Refusal(f"what is before the car stands still in the image (correlation {standing:.2f})")
         sigma_share = float(np.hypot(self._config.sigma_share, self._config.tilt_gain * deviation))
         return RoadStep(length, sigma_share, normal)
 
     def _aligned(
         self, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
-    ) -> tuple[FloatArray, float]:
-        """The plane ``m`` ``(3,)`` that aligns the road, and how alike both views of it are then."""
+    ) -> tuple[FloatArray, float, float]:
+        """The plane ``m`` ``(3,)`` that aligns the road, how alike both views of it are then, and as they are."""
         config = self._config
 
         def align() -> Answer:
@@ -89,12 +91,13 @@ class RoadAligner:
                 plane, likeness = self._refine(
                     layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
                 )
-            return plane, np.array(likeness)
+            standing = _correlation(before[-1][self._rows, self._columns, 0], now[-1][self._rows, self._columns, 0])
+            return plane, np.array([likeness, standing])
 
         settings = (self._intrinsics, config.far_heights, config.half_width_heights, config.points)
         given = (previous.image, current.image, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
-        plane, likeness = self._recall("road aligned", given, align)
-        return plane, float(likeness)
+        plane, alike = self._recall("road aligned", given, align)
+        return plane, float(alike[0]), float(alike[1])
 
     def _expected(self) -> FloatArray:
         """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.

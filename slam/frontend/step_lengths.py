@@ -12,7 +12,7 @@ so that one robust sparse least squares holds the whole drive (``docs/design/000
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -48,6 +48,11 @@ class StepEvidence:
     def empty(cls, steps: int) -> StepEvidence:
         """Nothing measured yet."""
         return cls(*(np.full(steps, np.nan) for _ in range(5)))
+
+    def without_contradicted(self, factor: float) -> StepEvidence:
+        """The same without absolute lengths that are more than ``factor`` times longer or shorter than learned ones."""
+        contradicted = np.abs(self.absolute - self.learned) > np.log(factor)
+        return replace(self, absolute=np.where(contradicted, np.nan, self.absolute))
 
 
 @dataclass(frozen=True)

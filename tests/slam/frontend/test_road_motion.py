@@ -70,6 +70,17 @@ def test_a_car_ahead_does_not_shorten_the_step(texture):
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.05)
 
 
+def test_a_car_that_covers_the_road_is_refused(texture):
+    """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    car = np.random.default_rng(0).integers(0, 255, (90, 300, 3), np.uint8)
+    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
+    for frame in frames:
+        frame.image[92:182, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
+    refusal = RoadAligner(CONFIG, CAMERA).measure(*frames, step)
+    assert isinstance(refusal, Refusal) and "stands still" in refusal.reason
+
+
 def test_what_is_no_road_is_refused_with_a_reason(texture):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)

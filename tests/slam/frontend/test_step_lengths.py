@@ -52,6 +52,15 @@ def test_a_quarter_of_wrong_roads_does_not_matter():
     np.testing.assert_allclose(solve_lengths(measured, CONFIG).length, TRUE, rtol=0.05)
 
 
+def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
+    road = noisy(0.03)
+    road[: STEPS // 2] += np.log(0.1)
+    measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.1, seed=2), **ratios(0.003))
+    solved = solve_lengths(measured.without_contradicted(CONFIG.max_contradiction), CONFIG)
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.08)
+    assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
+
+
 def test_learned_depth_bridges_a_gap_in_the_unit_that_it_was_seen_to_have():
     """Steps 80 to 119 have neither road nor ratio, and learned lengths are 30 % short all along."""
     gap = (np.arange(STEPS) >= 80) & (np.arange(STEPS) < 120)

@@ -1,0 +1,250 @@
+"""The motion between two views that corners, learned depth and the drive so far agree on.
+
+Corners alone can be misled: when most of what stands out in an image is a car that turns with the camera, its corners
+and the distant ones lie on the epipolar lines of a motion that neither of them made (``docs/design/0010``). Two judges
+tell it from the true one. A motion says how far each corner shifts along its epipolar line, and so does learned depth;
+and a vehicle moves the way it has moved.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam.config import GeometryConfig
+from slam.frontend.epipolar import Heading, cross, heading_by_essential, heading_by_points, triangulated_depth
+from slam.memory import Answer, Recall, compute_anew
+from slam.se3 import FloatArray
+
+_ITERATIONS = 10
+_MAD_TO_SIGMA = 1.4826
+_LEAST_POINTS = 8
+_REMEMBERED = 100
+_LEAST_REMEMBERED = 10
+_RESECTION_PX = 2.0
+# along its line a corner is an inlier within this many sigmas
+_ALONG_SIGMAS = 2.5
+# an outlier costs as much as this half-squared residual
+_OUTLIER_COST = 3.0
+
+
+@dataclass(frozen=True)
+class Matches:
+    """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN."""
+
+    rays_previous: FloatArray
+    rays_current: FloatArray
+    depth_previous: FloatArray
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """A ``heading`` with its noise and support.
+
+    ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians.
+    ``inliers`` ``(M,)`` marks the corners that fit it and their learned depth.
+    """
+
+    heading: Heading
+    covariance: FloatArray
+    inliers: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Belief:
+    """What a drive has shown so far: error of learned depth as a share, axis of motion ``(3,)`` and its sigma."""
+
+    depth_share: float
+    axis: FloatArray
+    axis_sigma: float
+
+
+class TwoViewEstimator:
+    """Estimates the motions of one drive, one after the other."""
+
+    def __init__(self, config: GeometryConfig, focal_px: float, recall: Recall = compute_anew) -> None:
+        self._config = config
+        self._focal_px = focal_px
+        self._recall = recall
+        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._depth_shares: deque[float] = deque(maxlen=_REMEMBERED)
+        self._last: Heading | None = None
+
+    def estimate(self, matches: Matches) -> TwoView | None:
+        """Rotation and direction of the next motion; None where corners agree on none."""
+        first, second = matches.rays_previous, matches.rays_current
+        proposed = self._proposed(first, second, self._config.inlier_px / self._focal_px)
+        belief = self._belief(matches, proposed)
+        candidates = [self._refined(matches, proposed, belief)]
+        if candidates[0] is None or candidates[0].inliers.mean() < self._config.clear_share:
+            by_points = heading_by_points(first, second, matches.depth_previous, _RESECTION_PX / self._focal_px)
+            candidates += [self._refined(matches, other, belief) for other in (by_points, self._last)]
+        found = [candidate for candidate in candidates if candidate is not None]
+        if not found:
+            return None
+        best = max(found, key=lambda candidate: _support(candidate, belief))
+        self._last = best.heading
+        self._directions.append(best.heading.direction)
+        self._depth_shares.append(self._depth_share(matches, best.heading))
+        return best
+
+    def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
+        def propose() -> Answer:
+            found = heading_by_essential(first, second, tolerance)
+            return () if found is None else (found.R_current_previous, found.direction)
+
+        known = self._recall("motion by consensus", (first, second, repr(tolerance)), propose)
+        return Heading(*known) if known else None
+
+    def _belief(self, matches: Matches, proposed: Heading | None) -> _Belief:
+        """Until the drive has shown how learned depth errs, the proposed motion tells."""
+        shares = list(self._depth_shares) or ([] if proposed is None else [self._depth_share(matches, proposed)])
+        share = max(self._config.depth_sigma_share, float(np.nanmedian([*shares, self._config.depth_sigma_share])))
+        if len(self._directions) < _LEAST_REMEMBERED:
+            return _Belief(share, np.zeros(3), np.inf)
+        directions = np.array(self._directions)
+        axis = np.median(directions, axis=0)
+        axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
+        spread = _MAD_TO_SIGMA * float(np.median(np.arccos(np.clip(directions @ axis, -1.0, 1.0))))
+        return _Belief(share, axis, float(np.hypot(np.deg2rad(self._config.habit_sigma_deg), spread)))
+
+    def _depth_share(self, matches: Matches, heading: Heading) -> float:
+        """By how much learned depth differs from that of the corners near their epipolar lines, scale aside."""
+        ratios = self._ratios(matches, heading)
+        if len(ratios) < _LEAST_POINTS:
+            return np.nan
+        return _MAD_TO_SIGMA * float(np.median(np.abs(ratios - np.median(ratios))))
+
+    def _ratios(self, matches: Matches, heading: Heading) -> FloatArray:
+        """Logarithms of learned over triangulated depth, of corners near their lines that shift along them."""
+        distance = _sampson(matches.rays_previous, matches.rays_current, heading)[0] * self._focal_px
+        depth = triangulated_depth(matches.rays_previous, matches.rays_current, heading)
+        turned = _image(matches.rays_previous @ heading.R_current_previous.T)
+        shift_px = np.linalg.norm(matches.rays_current[:, :2] - turned, axis=1) * self._focal_px
+        usable = (np.abs(distance) < self._config.inlier_px) & (depth > 0) & (shift_px > 1.0)
+        usable &= np.isfinite(matches.depth_previous)
+        return np.asarray(np.log(matches.depth_previous[usable] / depth[usable]))
+
+    def _refined(self, matches: Matches, start: Heading | None, belief: _Belief) -> TwoView | None:
+        if start is None:
+            return None
+
+        def refine() -> Answer:
+            found = self._fitted(matches, start, belief)
+            if found is None:
+                return ()
+            return found.heading.R_current_previous, found.heading.direction, found.covariance, found.inliers
+
+        settings = repr((belief.depth_share, belief.axis_sigma, self._config.inlier_px, self._focal_px))
+        corners = (matches.rays_previous, matches.rays_current, matches.depth_previous)
+        begin = (start.R_current_previous, start.direction, belief.axis)
+        known = self._recall("motion by all", (*corners, *begin, settings), refine)
+        return TwoView(Heading(known[0], known[1]), known[2], known[3].astype(bool)) if known else None
+
+    def _fitted(self, matches: Matches, start: Heading, belief: _Belief) -> TwoView | None:
+        """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
+
+        Across its epipolar line a corner has the noise of the image, along it that of learned depth.
+        """
+        ratios = self._ratios(matches, start)
+        if len(ratios) < _LEAST_POINTS:
+            return None
+        heading, length = start, float(np.exp(np.median(ratios)))
+        known = np.isfinite(matches.depth_previous)
+        for iteration in range(_ITERATIONS):
+            across, by_motion, tangent = _sampson(matches.rays_previous, matches.rays_current, heading)
+            across, by_motion = across * self._focal_px, by_motion * self._focal_px
+            along, by_all, shift_px = _along(matches, heading, length, tangent, self._focal_px)
+            near = np.abs(across) < self._config.inlier_px
+            sigma_along = np.hypot(1.0, belief.depth_share * shift_px)
+            inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
+            if inliers.sum() < _LEAST_POINTS:
+                return None
+            sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(across[near]))), 1e-3 * self._config.inlier_px)
+            weights = inliers / (1.0 + (across / (2.0 * sigma)) ** 2)
+            weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
+            weights = weights / sigma**2
+            normal = by_all.T @ (weights_along[:, None] * by_all) + 1e-9 * np.eye(6)
+            normal[:5, :5] += by_motion.T @ (weights[:, None] * by_motion)
+            gradient = by_all.T @ (weights_along * along)
+            gradient[:5] += by_motion.T @ (weights * across)
+            astray = heading.direction - np.copysign(1.0, belief.axis @ heading.direction) * belief.axis
+            normal[3:5, 3:5] += np.eye(2) / belief.axis_sigma**2
+            gradient[3:5] += tangent.T @ astray / belief.axis_sigma**2
+            step = -np.linalg.solve(normal, gradient)
+            if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < 1e-6:
+                break
+            direction = heading.direction + tangent @ step[3:5]
+            R_current_previous = Rotation.from_rotvec(step[:3]).as_matrix() @ heading.R_current_previous
+            heading = Heading(R_current_previous, direction / np.linalg.norm(direction))
+            length = max(length + float(step[5]), 0.2 * length)
+        lift = np.zeros((6, 5))
+        lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent
+        return TwoView(heading, lift @ np.linalg.inv(normal)[:5, :5] @ lift.T, inliers)
+
+
+def _support(candidate: TwoView, belief: _Belief) -> float:
+    """Inliers, less what a motion off the usual axis costs; forwards and backwards are alike."""
+    cosine = abs(float(belief.axis @ candidate.heading.direction))
+    astray = float(np.arccos(min(cosine, 1.0))) / belief.axis_sigma
+    return float(candidate.inliers.sum()) - 0.5 * astray**2 / _OUTLIER_COST
+
+
+def _along(
+    matches: Matches, heading: Heading, length: float, tangent: FloatArray, focal_px: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How far corners lie along their lines from where learned depth puts them ``(M,)``, pixels.
+
+    Also the Jacobian ``(M, 6)`` by rotation, direction and length, and the shift that learned depth expects ``(M,)``.
+    """
+    R, direction = heading.R_current_previous, heading.direction
+    inverse_depth = np.nan_to_num(1.0 / matches.depth_previous)
+    turned = matches.rays_previous @ R.T
+    points = turned + length * inverse_depth[:, None] * direction  # over depth
+    expected = _image(points)
+    shift = (expected - _image(turned)) * focal_px
+    shift_px = np.linalg.norm(shift, axis=1)
+    line = shift / np.maximum(shift_px, 1e-9)[:, None]
+    along = ((expected - matches.rays_current[:, :2]) * line).sum(axis=1) * focal_px
+    by_point = np.column_stack([line, -(line * expected).sum(axis=1)]) * (focal_px / _ahead(points))[:, None]
+    by_direction = (length * inverse_depth)[:, None] * (by_point @ tangent)
+    by_length = inverse_depth * (by_point @ direction)
+    return along, np.column_stack([cross(turned, by_point), by_direction, by_length]), shift_px
+
+
+def _image(points: FloatArray) -> FloatArray:
+    return np.asarray(points[:, :2] / _ahead(points)[:, None])
+
+
+def _ahead(points: FloatArray) -> FloatArray:
+    """z of points ``(M, 3)``, kept off zero."""
+    return np.asarray(np.maximum(points[:, 2], 1e-6))
+
+
+def _sampson(
+    rays_previous: FloatArray, rays_current: FloatArray, heading: Heading
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sampson distances ``(M,)``, their Jacobian ``(M, 5)`` and the tangent ``(3, 2)`` of the direction.
+
+    The gradient's norm is held fixed in the Jacobian, as in reweighted least squares.
+    """
+    R, direction = heading.R_current_previous, heading.direction
+    turned = rays_previous @ R.T
+    lines_current = cross(direction, turned)  # E x
+    across = cross(rays_current, direction)
+    lines_previous = across @ R  # E^T x'
+    algebraic = (rays_current * lines_current).sum(axis=1)
+    gradient = np.sqrt((lines_current[:, :2] ** 2).sum(axis=1) + (lines_previous[:, :2] ** 2).sum(axis=1))
+    gradient = np.maximum(gradient, 1e-9)
+    axis = np.eye(3)[np.abs(direction).argmin()]
+    first = cross(direction, axis)
+    first = first / np.linalg.norm(first)
+    tangent = np.stack([first, cross(direction, first)], axis=1)
+    by_rotation = cross(turned, across)
+    by_direction = cross(turned, rays_current) @ tangent
+    jacobian = np.concatenate([by_rotation, by_direction], axis=1) / gradient[:, None]
+    return algebraic / gradient, jacobian, tangent

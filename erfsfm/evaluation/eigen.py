@@ -18,9 +18,10 @@ from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import CAP_M, Networks, refuse_leak
-from erfsfm.evaluation.raw_drives import RawFrame, displacements, lidar_depth
+from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
 
 _STILL_M = 0.1
+_FLAT_ROAD_M = 20.0
 
 
 class RawNetworks(Networks, Protocol):
@@ -71,8 +72,8 @@ def eigen_protocol(
     ============  ================================  ====================================
 
     Returns:
-        Rows ``gt-median`` and ``pose``; ``pose`` multiplies depth by the mean over a window's sources of true
-        over predicted distance.
+        Rows ``gt-median`` and ``pose`` of the networks; ``pose`` multiplies depth by the mean over a window's sources
+        of true over predicted distance. Then ``gt-median`` of what knows nothing: a flat road, and 20 m above it.
 
     Raises:
         DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
@@ -80,6 +81,7 @@ def eigen_protocol(
     frames = read_split(split, root)
     leak = refuse_leak(networks, [frame.name for frame in frames], allow_leak)
     errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
+    flat: list[DepthErrors] = []
     for frame in frames:
         image = _read(frame.image_path())
         truth = lidar_depth(frame, image.shape[:2], fidelity)
@@ -90,11 +92,14 @@ def eigen_protocol(
                 f"the LiDAR of {frame.drive} frame {frame.index} hits nothing under {CAP_M:g} m in the crop"
             )
         errors["gt-median"].append(found)
+        road = _compare(flat_road_depth(frame, image.shape[:2], _FLAT_ROAD_M), truth, "median", fidelity)
+        flat += [road] if road is not None else []
         scale = _scale_of_motion(networks, frame, fidelity)
         by_motion = _compare(guess, truth, scale, fidelity) if scale is not None else None
         if by_motion is not None:
             errors["pose"].append(by_motion)
-    return [_row(scaling, found, len(frames), leak) for scaling, found in errors.items()]
+    rows = [_row("networks", scaling, found, len(frames), leak) for scaling, found in errors.items()]
+    return [*rows, _row("flat road", "gt-median", flat, len(frames), leak=False)]
 
 
 def _root_of_dates(root: Path) -> Path:
@@ -135,8 +140,8 @@ def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity)
     return float(np.mean(true / np.maximum(predicted, 1e-12)))
 
 
-def _row(scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool) -> dict[str, Any]:
-    row: dict[str, Any] = {"method": "networks", "scaling": scaling}
+def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, leak: bool) -> dict[str, Any]:
+    row: dict[str, Any] = {"method": method, "scaling": scaling}
     if not errors:
         return row | {
             "abs_rel": None,

@@ -18,6 +18,8 @@ from erfsfm.config import Fidelity
 from erfsfm.data.kitti_raw import ASPECT_TOLERANCE, CALIBRATION, FloatArray, read_calibration, velocity
 from erfsfm.errors import DataError
 
+CAMERA_HEIGHT_M = 1.65  # of KITTI's car
+
 _FRAME = re.compile(
     r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
     r"(?:/image_0(?P<camera>[23])/data/(?P<file>\d+)(?:\.\w+)?|\s+(?P<frame>\d+)(?:\s+(?P<side>[lr]))?)"
@@ -183,18 +185,41 @@ def _nearest(
     return depth
 
 
+def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -> NDArray[np.float32]:
+    """z-depth in metres ``(H, W)`` of a flat road under a level camera, and ``farthest_m`` where that is farther.
+
+    Raises:
+        DataError: the calibration is missing or incomplete, or of another camera.
+    """
+    camera = _rectified_camera(frame, size)
+    below_horizon = np.arange(1, size[0] + 1) - camera[1, 2]
+    depth = camera[1, 1] * CAMERA_HEIGHT_M / np.maximum(below_horizon, 1e-9)
+    return np.repeat(np.minimum(depth, farthest_m).astype(np.float32)[:, None], size[1], axis=1)
+
+
 def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     """LiDAR points to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
     camera = read_calibration(date / CALIBRATION)
     velodyne = read_calibration(date / "calib_velo_to_cam.txt")
     try:
-        full_width, full_height = camera[f"S_rect_0{frame.camera}"]
-        P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)
         R_rect, T_cam_velo = np.eye(4), np.eye(4)
         R_rect[:3, :3] = camera["R_rect_00"].reshape(3, 3)
         T_cam_velo[:3, :3] = velodyne["R"].reshape(3, 3)
         T_cam_velo[:3, 3] = velodyne["T"]
+    except (KeyError, ValueError) as error:
+        raise DataError(f"the calibration in {date} is incomplete: {error}") from error
+    projection: FloatArray = _rectified_camera(frame, size) @ R_rect @ T_cam_velo
+    return projection
+
+
+def _rectified_camera(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
+    """Points of the rectified camera 0 to pixels that count from one, ``(3, 4)``, at the image's size."""
+    date = frame.folder.parent
+    camera = read_calibration(date / CALIBRATION)
+    try:
+        full_width, full_height = camera[f"S_rect_0{frame.camera}"]
+        P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)
     except (KeyError, ValueError) as error:
         raise DataError(f"the calibration in {date} is incomplete: {error}") from error
     scale_y, scale_x = size[0] / full_height, size[1] / full_width
@@ -205,8 +230,8 @@ def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
         )
     # half a pixel stays half a pixel when pixels grow: u' = (u - 1/2) s + 1/2, counting from one
     resize = np.array([[scale_x, 0, (1 - scale_x) / 2], [0, scale_y, (1 - scale_y) / 2], [0, 0, 1]])
-    projection: FloatArray = resize @ P_rect @ R_rect @ T_cam_velo
-    return projection
+    rectified: FloatArray = resize @ P_rect
+    return rectified
 
 
 def _seconds(stamp: str) -> float:

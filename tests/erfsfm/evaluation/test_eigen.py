@@ -59,18 +59,19 @@ def split(tmp_path: Path) -> str:
 def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: str) -> None:
     root = write_drive(tmp_path / "raw")
     oracle = Oracle()
-    median, pose = eigen_protocol(oracle, root, split, fidelity, allow_leak=False)
+    median, pose, flat = eigen_protocol(oracle, root, split, fidelity, allow_leak=False)
     assert (median["scaling"], pose["scaling"]) == ("gt-median", "pose")
     for row in (median, pose):
         assert row["scale"] == pytest.approx(2, rel=1e-5)
         assert row["abs_rel"] == pytest.approx(0, abs=1e-5)
         assert (row["images"], row["left_out"], row["leak"]) == (3, 0, False)
+    assert flat["method"] == "flat road" and flat["abs_rel"] > 0.05
     assert set(oracle.asked) == {(32, 64, 3) if fidelity == "paper" else (64, 96, 3)}
 
 
 def test_a_wrong_unit_of_motion_is_seen_in_one_row_alone(tmp_path: Path, write_drive: Write, split: str) -> None:
     root = write_drive(tmp_path / "raw", speed=12.0)
-    median, pose = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
+    median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert median["abs_rel"] == pytest.approx(0, abs=1e-5)
     assert pose["abs_rel"] == pytest.approx(0.2, abs=1e-5)
 
@@ -85,7 +86,7 @@ def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, s
 
 def test_a_car_that_stands(tmp_path: Path, write_drive: Write, split: str) -> None:
     root = write_drive(tmp_path / "raw", speed=0.0)
-    median, pose = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
+    median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert (median["images"], pose["images"], pose["abs_rel"]) == (3, 0, None)
     assert "stands still" in pose["abs_rel_reason"]
     pose = eigen_protocol(Oracle(), root, split, "paper", allow_leak=False)[1]

@@ -268,12 +268,12 @@ def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: Modul
 
 
 def test_a_section_takes_the_place_of_its_older_self(page: ModuleType) -> None:
-    text = page.with_section("", "## Speed\n\nold\n")
+    text = page.with_section("", "## Speed\n\nsuperseded\n")
     text = page.with_section(text, "## Accuracy\n\nnumbers\n")
     text = page.with_section(text, "## Speed\n\nnew\n")
     assert text.startswith(page.PAGE)
     assert text.index("numbers") < text.index("new")
-    assert "old" not in text
+    assert "superseded" not in text
     assert text.count("## Speed") == 1
 
 

@@ -193,11 +193,12 @@ Commit {commits}; seeds {seeds}; {len(outcomes)} runs, {failed} failed; {at_a_ti
 
 
 def with_section(page: str, new: str) -> str:
-    """The page with a section in place of the one of the same title, sections in the order of ``TABLES``."""
+    """The page with a section in place of the one of the same title, in the order of ``TABLES``; others come last."""
     _, *old = re.split(r"(?m)^(?=## )", page)
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
     order = [f"## {mode.capitalize()}" for mode in TABLES]
-    return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=order.index))])
+    place = {title: number for number, title in enumerate(order)}
+    return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
 
 
 def _stage(o: Outcome, stage: str) -> float:

@@ -344,7 +344,7 @@ def test_initial_weights_hand_on_their_leak_record(
 
 def test_initial_weights_of_another_network(small: Small, world: Path, tmp_path: Path) -> None:
     first = train(configure(small, [world], training={"steps": 1}), tmp_path / "first", device="cpu")
-    wider = configure(small, [world], network={"pose_width": 0.25})
+    wider = configure(small, [world], network={"pose_width": 0.375})
     with pytest.raises(ConfigError, match="of another network"):
         train(wider.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
 

@@ -21,6 +21,7 @@ FloatArray = NDArray[np.float64]
 
 CALIBRATION = "calib_cam_to_cam.txt"
 ASPECT_TOLERANCE = 0.01
+CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
 _DRIVE = re.compile(r"(?P<name>\d{4}_\d\d_\d\d_drive_\d{4})_(?P<kind>sync|extract)")
 _COLOUR, _GREY = ("02", "03"), ("00", "01")
 _VELOCITY = [6, 7, 10]  # north, east, up in m/s (oxts/dataformat.txt)

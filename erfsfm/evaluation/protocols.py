@@ -99,7 +99,8 @@ def pose_protocol(
         if T_world_camera is None:
             raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
         leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, partly=recording != whole)
+        shown = whole.name if recording == whole else recording.frames_name
+        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
     return rows
 
 
@@ -109,7 +110,7 @@ def _pose_rows(
     T_world_camera: NDArray[np.float64],
     fidelity: Fidelity,
     leak: bool,
-    partly: bool,
+    shown: str,
 ) -> list[dict[str, Any]]:
     length = networks.sources + 1
     if length != 5:
@@ -120,7 +121,6 @@ def _pose_rows(
     predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in windows(networks, recording)])
     straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
-    shown = recording.frames_name if partly else recording.name
     rows = []
     for name, guess in (("networks", predicted), ("straight constant motion", straight)):
         errors = snippet_errors(guess, true, fidelity=fidelity)

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
-from erfsfm.data.kitti_raw import ASPECT_TOLERANCE, CALIBRATION, FloatArray, read_calibration, velocity
+from erfsfm.data.kitti_raw import ASPECT_TOLERANCE, CALIBRATION, CAMERA_HEIGHT_M, FloatArray, read_calibration, velocity
 from erfsfm.errors import DataError
-
-CAMERA_HEIGHT_M = 1.65  # of KITTI's car
 
 _FRAME = re.compile(
     r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
@@ -191,7 +189,7 @@ def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -
     Raises:
         DataError: the calibration is missing or incomplete, or of another camera.
     """
-    camera = _rectified_camera(frame, size)
+    camera = _rectified_camera(read_calibration(frame.folder.parent / CALIBRATION), frame, size)
     below_horizon = np.arange(1, size[0] + 1) - camera[1, 2]
     depth = camera[1, 1] * CAMERA_HEIGHT_M / np.maximum(below_horizon, 1e-9)
     return np.repeat(np.minimum(depth, farthest_m).astype(np.float32)[:, None], size[1], axis=1)
@@ -209,14 +207,13 @@ def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
         T_cam_velo[:3, 3] = velodyne["T"]
     except (KeyError, ValueError) as error:
         raise DataError(f"the calibration in {date} is incomplete: {error}") from error
-    projection: FloatArray = _rectified_camera(frame, size) @ R_rect @ T_cam_velo
+    projection: FloatArray = _rectified_camera(camera, frame, size) @ R_rect @ T_cam_velo
     return projection
 
 
-def _rectified_camera(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
+def _rectified_camera(camera: dict[str, FloatArray], frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     """Points of the rectified camera 0 to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
-    camera = read_calibration(date / CALIBRATION)
     try:
         full_width, full_height = camera[f"S_rect_0{frame.camera}"]
         P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -81,8 +81,9 @@ def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
 class Observer:
     """Watches the frames of one sequence in time order.
 
-    The networks compute in a second thread while corners and road are measured in the first; a frame is finished
-    before the next begins, so that results do not depend on which of them is faster.
+    The networks compute in a second thread while corners are measured in the first, and the road of a step in a third
+    while the next frame is watched. What depends on another waits for it, so that results do not depend on which of
+    them is faster.
     """
 
     def __init__(
@@ -120,6 +121,8 @@ class Observer:
         self._unread = 0
         self._spool = Spool()
         self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks")
+        self._roads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="road")
+        self._asked_road: tuple[int, Future[RoadStep | Refusal]] | None = None
 
     def add(self, index: int, frame: Frame | SequenceError) -> None:
         """Watch the next frame, or learn that there is no image of it.
@@ -150,6 +153,7 @@ class Observer:
         Raises:
             SlamError: no snippet of usable frames.
         """
+        self._finish_road()
         seen = self.seen
         closed = bridge(
             len(seen.roads),
@@ -184,7 +188,11 @@ class Observer:
         if len(self._window) == self._window.maxlen:
             asked_snippet = self._networks.submit(lambda: self._predictor.snippet(list(self._window)))
         with self._watch.stage("geometry"):
-            self._measure_geometry(frame)
+            moved = self._measure_geometry(frame)
+        with self._watch.stage("road"):
+            self._finish_road()
+        if moved is not None and self._config.road.enabled:
+            self._ask_road(moved, frame)
         with self._watch.stage("depth network"):
             depth = asked_depth.result()
         with self._watch.stage("road"):
@@ -200,8 +208,9 @@ class Observer:
             with self._watch.stage("pose network"):
                 seen.snippets.append(asked_snippet.result())
 
-    def _measure_geometry(self, current: Frame) -> None:
-        """Steps from earlier frames, by the depth of the earlier one."""
+    def _measure_geometry(self, current: Frame) -> tuple[Frame, Motion] | None:
+        """Steps from earlier frames, by the depth of the earlier one; the frame before where its step has structure."""
+        moved = None
         for step in self._steps:
             if len(self._recent) < step:
                 continue
@@ -214,16 +223,26 @@ class Observer:
             self.seen.geometric.append(measured.relative_pose)
             if measured.structure is not None and current.index == previous.index + 1:
                 self.seen.motions[previous.index] = measured
-                self._measure_road(previous, current, measured)
+                moved = previous, measured
+        return moved
 
-    def _measure_road(self, previous: Frame, current: Frame, motion: Motion) -> None:
-        if not self._config.road.enabled:
+    def _ask_road(self, moved: tuple[Frame, Motion], current: Frame) -> None:
+        previous, motion = moved
+        T_previous_current = motion.relative_pose.T_from_to
+        asked = self._roads.submit(lambda: self._aligner.measure(previous, current, T_previous_current))
+        self._asked_road = previous.index, asked
+
+    def _finish_road(self) -> None:
+        """Wait for the road of the last step that was asked."""
+        if self._asked_road is None:
             return
-        road_step = self._aligner.measure(previous, current, motion.relative_pose.T_from_to)
+        step, asked = self._asked_road
+        self._asked_road = None
+        road_step = asked.result()
         if isinstance(road_step, Refusal):
-            logger.info("road %d -> %d refused: %s", previous.index, current.index, road_step.reason)
+            logger.info("road %d -> %d refused: %s", step, step + 1, road_step.reason)
         else:
-            self.seen.road_steps[previous.index] = road_step
+            self.seen.road_steps[step] = road_step
 
     def _keep(self, frame: Frame, depth: DepthMap) -> None:
         """Remember thinned frames for the map, and a few whole ones for the report."""

@@ -53,10 +53,21 @@ def heading_by_essential(rays_previous: FloatArray, rays_current: FloatArray, to
     )
     if E is None or E.shape != (3, 3) or int(mask.sum()) < 8:
         return None
-    _, R, direction, _ = cv2.recoverPose(
-        E, rays_previous[:, :2].copy(), rays_current[:, :2].copy(), np.eye(3), mask=mask.copy()
-    )
-    return Heading(R, direction.ravel())
+    agreeing = mask.ravel().astype(bool)
+    return _facing(E, rays_previous[agreeing], rays_current[agreeing])
+
+
+def _facing(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) -> Heading:
+    """Of the four motions of an essential matrix the one with most points before both cameras."""
+    R, R_twisted, direction = cv2.decomposeEssentialMat(E)
+    headings = [Heading(turned, sign * direction.ravel()) for turned in (R, R_twisted) for sign in (1.0, -1.0)]
+
+    def before_both(heading: Heading) -> int:
+        depth = triangulated_depth(rays_previous, rays_current, heading)
+        depth_current = depth * (rays_previous @ heading.R_current_previous[2]) + heading.direction[2]
+        return int(((depth > 0) & (depth_current > 0)).sum())
+
+    return max(headings, key=before_both)
 
 
 def heading_by_points(

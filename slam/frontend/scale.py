@@ -204,9 +204,10 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig) ->
 
 def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray, config: ScaleConfig) -> NDArray[np.bool_]:
     """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
-    predicted = planes @ rays.T
-    relative = np.abs(predicted / inverse_depth - 1.0)
-    return np.asarray(relative < config.inlier_share_of_depth)
+    over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
+    relative = planes.astype(np.float32) @ over_measured
+    relative -= 1.0
+    return np.asarray(np.abs(relative, out=relative) < config.inlier_share_of_depth)
 
 
 def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray, sigma: float) -> FloatArray:

@@ -22,6 +22,7 @@ from slam.frontend.road_motion import RoadAligner, RoadStep
 from slam.frontend.scale import RoadPlane, fit_road
 from slam.loops.descriptors import FeatureExtractor, View
 from slam.memory import Recall, compute_anew
+from slam.networks import leave_a_core
 from slam.spool import Spool, Spooled
 from slam.timing import Stopwatch
 
@@ -120,7 +121,7 @@ class Observer:
         self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=1))
         self._unread = 0
         self._spool = Spool()
-        self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks")
+        self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=leave_a_core)
         self._roads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="road")
         self._asked_road: tuple[int, Future[RoadStep | Refusal]] | None = None
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
@@ -127,7 +128,8 @@ def run_slam(
         try:
             _seed(seed)
             pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall)
-            result = _run(folder, pipeline, recording, provenance, settings.output.report)
+            with threadpool_limits(1, "blas"):  # matrices are small: more threads would only wait for each other
+                result = _run(folder, pipeline, recording, provenance, settings.output.report)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
             return folder

@@ -65,6 +65,7 @@ SPEED = (
     Configuration("networks asked"),
     Configuration("cache filled", cache="fill"),
     Configuration("from the cache", cache="full"),
+    Configuration("from the cache, no fusion", ("mapping.enabled=false",), cache="full"),
 )
 GROWTH = Configuration("no fusion", (*QUIET, "mapping.enabled=false"))
 

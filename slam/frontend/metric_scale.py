@@ -76,16 +76,20 @@ def find_scale(
     if mode == "lidar":
         absolute |= {k: (length, lidar.translation_sigma_m / length) for k, length in metres.items() if length > 0}
     believed = scale_from_road(measured.planes, height, config)
+    frames = len(measured.planes)
     if isinstance(believed, Refusal):
-        track = np.full(len(measured.planes), _unit_by_steps(measured.motions, absolute))
+        unit_believed = np.full(frames, _unit_by_steps(measured.motions, absolute))
+    elif absolute:
+        # steps of known length tell how the unit wanders, and rain or a car ahead bends the learned road
+        unit_believed = np.full(frames, believed.value)
     else:
-        track = scale_track(measured.planes, height, believed, config)
-    evidence = gather_evidence(measured.motions, absolute, track)
+        unit_believed = scale_track(measured.planes, height, believed, config)
+    evidence = gather_evidence(measured.motions, absolute, unit_believed)
     if not isinstance(believed, Refusal):
         # a car ahead that is taken for the road, for seconds on end, would outvote everything else
         evidence = evidence.without_contradicted(lengths.max_contradiction)
     solved = solve_lengths(evidence, lengths)
-    per_frame = track * np.append(solved.unit_correction, solved.unit_correction[-1])
+    per_frame = unit_believed * np.append(solved.unit_correction, solved.unit_correction[-1])
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate, spread = believed, lengths.learned_sigma

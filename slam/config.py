@@ -69,7 +69,7 @@ class GeometryConfig(Section):
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
     rotation_floor_deg: float = Field(default=0.01, gt=0, description="least rotation sigma")
     direction_floor_deg: float = Field(default=0.05, gt=0, description="least sigma of the translation's direction")
-    length_floor_share: float = Field(default=0.005, gt=0, description="least sigma of the translation's length")
+    length_floor_share: float = Field(default=0.009, gt=0, description="least sigma of the translation's length")
     shake_rotation_share: float = Field(default=0.3, ge=0, description="rotation sigma, share of the camera's shake")
     shake_direction_share: float = Field(default=8.0, ge=0, description="sigma of the direction, likewise")
     turn_rotation_share: float = Field(default=0.01, ge=0, description="rotation sigma, share of the step's turn")

@@ -18,6 +18,8 @@ COLUMNS = (0.3, 0.7)
 AROUND = (0.3, 0.1)  # of the image's height and width, in which a pixel's neighbours lie
 LEAST_AROUND = 0.1  # share of them that is known
 LEAST_AGREEING = 0.7  # share of the known ones that lies on the road
+SIGMAS_UNDER = 2.0
+RIM_PX = 5
 NEAR = 0.2  # of the depth, within which a pixel may lie on the road: single ones are noisy
 
 
@@ -85,3 +87,18 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
     share = [cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT) for mask in (known, agreeing)]
     level = (road > 0) & (share[0] > LEAST_AROUND) & (share[1] > LEAST_AGREEING * share[0])
     return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))
+
+
+def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:
+    """Where something was measured to lie clearly under the road, with a rim around it, ``(H, W)``.
+
+    Nothing lies there: it moves as the camera does, like a car ahead, and only seems to be far away.
+
+    Args:
+        inverse_depth: ``(H, W)``.
+        sigma: of the inverse depth, ``(H, W)``.
+        road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
+    """
+    under = (road > 0) & (inverse_depth + SIGMAS_UNDER * sigma < (1 - NEAR) * road)
+    rim = np.ones((RIM_PX, RIM_PX), np.uint8)
+    return np.asarray((cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0))

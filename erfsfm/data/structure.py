@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.data.road import TOLERANCE, on_road, road_plane
+from erfsfm.data.road import NEAR, TOLERANCE, on_road, road_plane, under_road
 from erfsfm.data.two_view import TwoView, rays, two_view
 from erfsfm.files import write_atomically
 
-VERSION = 3
+VERSION = 4
 SURE = 5.0  # inverse depth over its sigma
 OUTLIER = 3.0  # sigmas from the average
 LEAST_SHARED = 100  # pixels
@@ -58,7 +58,7 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
     sure = inverse_depth > SURE * sigma
     p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
     plane = None if forward is None else road_plane(inverse_depth, sure, p, forward)
-    height = 1.0
+    height, under = 1.0, np.zeros_like(sure)
     if plane is None:
         sigma[:] = np.inf
         moved = np.array([view is not None and not view.still for view in views])
@@ -66,11 +66,15 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
     else:
         height = float(1 / np.linalg.norm(plane))
         road = p @ plane.astype(np.float32)
-        level = on_road(inverse_depth, sure, road)
+        under = under_road(inverse_depth, sigma, road)
+        sigma[under] = np.inf
+        level = on_road(inverse_depth, sure, road) & ~under
         inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     T_source_target[:, :3, 3] /= height
     with np.errstate(over="ignore"):
-        least = np.maximum((inverse_depth - sigma) * height, 0).astype(np.float16)
+        least = np.maximum(inverse_depth - sigma, 0)
+        least[under] = (1 - NEAR) * road[under]
+        least = (least * height).astype(np.float16)
         most = ((np.maximum(inverse_depth, 0) + sigma) * height).astype(np.float16)
     return Structure(T_source_target.astype(np.float32), least, most)
 

@@ -44,10 +44,12 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
         bounds: of the same size.
         log_scale: by which the disparity is larger than the measured unit says, ``(B, 1, 1, 1)``.
     """
-    known = torch.isfinite(bounds.most)
+    above_known = torch.isfinite(bounds.most)
+    known = above_known | (bounds.least > 0)
     said = disparity.log() - log_scale
     below = (bounds.least.clamp(min=1e-6).log() - said).clamp(min=0)
-    above = (said - torch.where(known, bounds.most, 1).clamp(min=1e-6).log()).clamp(min=0)
+    above = (said - torch.where(above_known, bounds.most, 1).clamp(min=1e-6).log()).clamp(min=0)
+    above = torch.where(above_known, above, 0)
     distance: Tensor = torch.where(known, below + above, 0).sum() / known.sum().clamp(min=1)
     return distance
 

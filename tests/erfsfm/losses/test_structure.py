@@ -41,6 +41,15 @@ def test_unknown_pixels_neither_count_nor_spoil_gradients():
     assert disparity.grad.count_nonzero() == 1
 
 
+def test_what_is_only_bounded_from_below_costs_where_it_is_farther():
+    disparity = torch.tensor([[[[0.05, 0.2]]]], requires_grad=True)
+    interval = Bounds(torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
+    distance = outside(disparity, interval, ZERO)
+    assert distance.item() == pytest.approx(0.6931 / 2, abs=1e-4)
+    distance.backward()
+    assert disparity.grad is not None and disparity.grad[0, 0, 0, 0] < 0 and disparity.grad[0, 0, 0, 1] == 0
+
+
 def test_nothing_known_is_no_loss():
     assert (
         outside(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0

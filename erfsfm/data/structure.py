@@ -58,7 +58,7 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
     sure = inverse_depth > SURE * sigma
     p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
     plane = None if forward is None else road_plane(inverse_depth, sure, p, forward)
-    height, under = 1.0, np.zeros_like(sure)
+    height, at_least = 1.0, np.zeros_like(inverse_depth)
     if plane is None:
         sigma[:] = np.inf
         moved = np.array([view is not None and not view.still for view in views])
@@ -67,14 +67,12 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
         height = float(1 / np.linalg.norm(plane))
         road = p @ plane.astype(np.float32)
         under = under_road(inverse_depth, sigma, road)
-        sigma[under] = np.inf
+        sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
         level = on_road(inverse_depth, sure, road) & ~under
         inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     T_source_target[:, :3, 3] /= height
     with np.errstate(over="ignore"):
-        least = np.maximum(inverse_depth - sigma, 0)
-        least[under] = (1 - NEAR) * road[under]
-        least = (least * height).astype(np.float16)
+        least = (np.maximum(inverse_depth - sigma, at_least) * height).astype(np.float16)
         most = ((np.maximum(inverse_depth, 0) + sigma) * height).astype(np.float16)
     return Structure(T_source_target.astype(np.float32), least, most)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.data import structure as module
-from erfsfm.data.road import on_road, road_plane
+from erfsfm.data.road import on_road, road_plane, under_road
 from erfsfm.data.structure import Structure, StructureCache, measure_structure
 from erfsfm.data.two_view import rays, two_view
 from slam.sequences.simulated import SimulatedStreet, SimulationOptions
@@ -105,3 +105,15 @@ def test_the_cache_measures_once_and_mends_a_broken_entry(street, tmp_path, monk
     mended = StructureCache(tmp_path).structure(images, K)
     np.testing.assert_array_equal(mended.T_source_target, fresh.T_source_target)
     assert len(entry.read_bytes()) > 1000
+
+
+def test_a_car_that_drives_along_is_no_hole_in_the_road():
+    """Ahead at our own speed it does not move in the image, as if it were infinitely far."""
+    K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
+    road = (rays(128, 416, K) @ np.array([0, 1, 0]) / 1.6).astype(np.float32)
+    inverse_depth = np.maximum(road, 0.02)
+    inverse_depth[70:90, 190:230] = 0.002
+    sigma = np.full(road.shape, 0.005, np.float32)
+    under = under_road(inverse_depth, sigma, road)
+    assert under[75:88, 192:228].all()
+    assert not under[:66].any() and not under[95:].any() and not under[:, :180].any()

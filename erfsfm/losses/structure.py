@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 SURE = 1.5  # most over least
+FARTHEST = 100.0  # camera heights: what is farther weighs no more
 STILL = 0.01  # network units: a step so short counts as no movement
 
 
@@ -39,6 +40,9 @@ class Bounds:
 def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
     """Mean log distance of a disparity from the bounds, over pixels with a bound; nothing within them.
 
+    Far surfaces are few pixels and easily blurred away by the near ones around them: a pixel weighs by the square root
+    of its depth.
+
     Args:
         disparity: inverse depth ``(B, 1, H, W)``, positive.
         bounds: of the same size.
@@ -50,7 +54,9 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
     below = (bounds.least.clamp(min=1e-6).log() - said).clamp(min=0)
     above = (said - torch.where(above_known, bounds.most, 1).clamp(min=1e-6).log()).clamp(min=0)
     above = torch.where(above_known, above, 0)
-    distance: Tensor = torch.where(known, below + above, 0).sum() / known.sum().clamp(min=1)
+    nearest = torch.where(above_known, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
+    weight = torch.where(known, nearest.rsqrt(), 0)
+    distance: Tensor = (weight * torch.where(known, below + above, 0)).sum() / weight.sum().clamp(min=1)
     return distance
 
 

@@ -28,6 +28,14 @@ logger = logging.getLogger(__name__)
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
+_THREADS = max(torch.get_num_threads() - 1, 1)
+
+
+def leave_a_core() -> None:
+    """Let networks asked in this thread compute on all cores but one, for whatever goes on beside them."""
+    torch.set_num_threads(_THREADS)
+
+
 def choose_device(choice: str) -> torch.device:
     """``auto`` is the GPU where there is one.
 

@@ -6,18 +6,10 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from erfsfm.inference import depth_at
 from slam.frames import DepthMap, Frame, Image, SnippetPoses
-
-_THREADS = max(torch.get_num_threads() - 1, 1)
-
-
-def leave_a_core() -> None:
-    """Let networks asked in this thread compute on all cores but one: images are measured on that one meanwhile."""
-    torch.set_num_threads(_THREADS)
 
 
 class Networks(Protocol):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 
+from erfsfm.inference import leave_a_core
 from slam.config import SlamConfig
 from slam.errors import SequenceError
 from slam.frames import DepthMap, Frame, Image, Intrinsics, Predictor, RelativePose, SnippetPoses
@@ -22,7 +23,6 @@ from slam.frontend.road_motion import RoadAligner, RoadStep
 from slam.frontend.scale import RoadPlane, fit_road
 from slam.loops.descriptors import FeatureExtractor, View
 from slam.memory import Recall, compute_anew
-from slam.networks import leave_a_core
 from slam.spool import Spool, Spooled
 from slam.timing import Stopwatch
 

@@ -26,8 +26,6 @@ from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_nois
 logger = logging.getLogger(__name__)
 
 DeviceChoice = Literal["auto", "cpu", "cuda"]
-
-
 _THREADS = max(torch.get_num_threads() - 1, 1)
 
 

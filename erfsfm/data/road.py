@@ -18,8 +18,8 @@ COLUMNS = (0.3, 0.7)
 AROUND = (0.3, 0.1)  # of the image's height and width, in which a pixel's neighbours lie
 LEAST_AROUND = 0.1  # share of them that is known
 LEAST_AGREEING = 0.7  # share of the known ones that lies on the road
-SIGMAS_UNDER = 2.0
-RIM_PX = 5
+SIGMAS_UNDER = 2.0  # by which what lies under the road is clearly there
+RIM_PX = 5  # side of the square that grows around it
 NEAR = 0.2  # of the depth, within which a pixel may lie on the road: single ones are noisy
 
 

@@ -48,15 +48,13 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
         bounds: of the same size.
         log_scale: by which the disparity is larger than the measured unit says, ``(B, 1, 1, 1)``.
     """
-    above_known = torch.isfinite(bounds.most)
-    known = above_known | (bounds.least > 0)
+    has_most = torch.isfinite(bounds.most)
     said = disparity.log() - log_scale
     below = (bounds.least.clamp(min=1e-6).log() - said).clamp(min=0)
-    above = (said - torch.where(above_known, bounds.most, 1).clamp(min=1e-6).log()).clamp(min=0)
-    above = torch.where(above_known, above, 0)
-    nearest = torch.where(above_known, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
-    weight = torch.where(known, nearest.rsqrt(), 0)
-    distance: Tensor = (weight * torch.where(known, below + above, 0)).sum() / weight.sum().clamp(min=1)
+    above = (said - bounds.most.clamp(min=1e-6).log()).clamp(min=0)
+    nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
+    weight = torch.where(has_most | (bounds.least > 0), nearest.rsqrt(), 0)
+    distance: Tensor = (weight * (below + above)).sum() / weight.sum().clamp(min=1)
     return distance
 
 

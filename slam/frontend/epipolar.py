@@ -64,8 +64,7 @@ def _facing(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) 
 
     def before_both(heading: Heading) -> int:
         depth = triangulated_depth(rays_previous, rays_current, heading)
-        depth_current = depth * (rays_previous @ heading.R_current_previous[2]) + heading.direction[2]
-        return int(((depth > 0) & (depth_current > 0)).sum())
+        return int(((depth > 0) & (depth_in_current(rays_previous, depth, heading) > 0)).sum())
 
     return max(headings, key=before_both)
 
@@ -130,6 +129,11 @@ def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, head
     across = cross(rays_current, rays_previous @ heading.R_current_previous.T)
     along = -cross(rays_current, heading.direction)
     return np.asarray((across * along).sum(axis=1) / np.maximum((across**2).sum(axis=1), 1e-18))
+
+
+def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, heading: Heading) -> FloatArray:
+    """z-depth ``(M,)`` in the current camera of points at ``depth_previous`` ``(M,)``, both in the motion's length."""
+    return np.asarray(depth_previous * (rays_previous @ heading.R_current_previous[2]) + heading.direction[2])
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -15,7 +15,13 @@ from scipy.spatial.transform import Rotation
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
 from slam.frontend.drive_noise import StepNoise
-from slam.frontend.epipolar import Structure, parallax_px, rotation_between, triangulated_depth
+from slam.frontend.epipolar import (
+    Structure,
+    depth_in_current,
+    parallax_px,
+    rotation_between,
+    triangulated_depth,
+)
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.two_view import Matches, TwoView, TwoViewEstimator
@@ -139,7 +145,7 @@ class GeometricOdometry:
         length, spread = _length(depth[measures] / triangulated[measures], sigma_share[measures])
         T_previous_current = invert(make(heading.R_current_previous, length * heading.direction))
         rotation, direction = self._essential_sigmas(two_view)
-        depth_current = triangulated * (rays_previous @ heading.R_current_previous[2]) + heading.direction[2]
+        depth_current = depth_in_current(rays_previous, triangulated, heading)
         solid &= depth_current > 0
         structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
         sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))

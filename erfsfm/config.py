@@ -71,6 +71,9 @@ class DataConfig(Section):
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a mirrored snippet")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest scale-crop of a snippet, per axis")
     colour_jitter: float = Field(default=0.0, ge=0, le=0.5, description="largest change of brightness, contrast, gamma")
+    weather: float = Field(
+        default=0.0, ge=0, le=1, description="share of snippets shown blurred, rained on, under other exposures"
+    )
     cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images")
     workers: int = Field(default=1, ge=0, description="processes that prepare samples")
 
@@ -135,7 +138,14 @@ class TrainingConfig(Section):
     devices: int = Field(
         default=1, ge=1, description="GPUs, or processes on a CPU; batch norm is common to them on GPUs alone"
     )
+    networks: Literal["both", "depth"] = Field(
+        default="both", description="which of them learn; a pose network that does not keeps its weights"
+    )
+    optimiser: Literal["adam", "muon"] = Field(
+        default="adam", description="muon: orthogonal steps for the kernels, Adam for the rest"
+    )
     learning_rate: float = Field(default=2e-4, gt=0)
+    kernel_rate: float = Field(default=1.0, gt=0, description="multiple of it for the kernels under muon")
     offset_rate: float = Field(
         default=1.0, gt=0, le=1, description="share of it for what predicts deformable offsets: fast ones run away"
     )

@@ -25,6 +25,7 @@ from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import FrameRange, overlapping
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.structure import StructureCache
+from erfsfm.data.weather import weathered
 from erfsfm.errors import DataError
 
 logger = logging.getLogger(__name__)
@@ -101,7 +102,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         camera = recording.camera.resized(network.width, network.height)
         if not self._config.teacher.weights:
             images, _, varied, _ = augment(images, [], camera, self._config.data, network.fidelity, rng)
-            return as_tensors(images, varied.K)
+            return self._shown(as_tensors(images, varied.K), images, rng)
         seen = self._structures.structure(images, camera.K)
         bounds = [seen.least.astype(np.float32), seen.most.astype(np.float32)]
         images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
@@ -109,6 +110,15 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
         sample["T_source_target"] = torch.from_numpy(T_source_target)
         sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
+        return self._shown(sample, images, rng)
+
+    def _shown(
+        self, sample: dict[str, Tensor], images: list[NDArray[np.uint8]], rng: np.random.Generator
+    ) -> dict[str, Tensor]:
+        """With weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them."""
+        share = self._config.data.weather
+        if share > 0:
+            sample["shown"] = _stacked(weathered(images, rng) if rng.random() < share else images)
         return sample
 
 
@@ -156,9 +166,14 @@ def load_window(cache: ImageCache, snippet: Snippet, length: int, height: int, w
 def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:
     """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour in [0, 1]."""
     middle = len(images) // 2
-    stacked = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255  # (N+1, 3, H, W)
+    stacked = _stacked(images)
     sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
     return {"target": stacked[middle], "sources": sources, "K": torch.from_numpy(K)}
+
+
+def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
+    """Colour in [0, 1], ``(N + 1, 3, H, W)``."""
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
 
 
 def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Self
 
 import lightning
 import numpy as np
@@ -20,6 +20,7 @@ from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
 from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
@@ -38,6 +39,7 @@ class SelfSupervision(lightning.LightningModule):
         unlooked = config.loss.model_copy(update={"photometric_weight": 0.0})
         self._alone = config.model_copy(update={"loss": unlooked})
         self.depth_net, self.pose_net = build_networks(config.network)
+        self.pose_net.requires_grad_(config.training.networks == "both")
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
@@ -49,7 +51,9 @@ class SelfSupervision(lightning.LightningModule):
             TrainingError: so it is.
         """
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
-        snippets = SnippetBatch(batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds)
+        snippets = SnippetBatch(
+            batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
+        )
         outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
         if not torch.isfinite(outcome.total):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
@@ -81,8 +85,15 @@ class SelfSupervision(lightning.LightningModule):
             return self._alone
         return self._warm_up if self.global_step < self.config.loss.warm_up_steps else self.config
 
+    def train(self, mode: bool = True) -> Self:
+        """Training mode, but for a network that does not learn: its norms would drift."""
+        super().train(mode)
+        if self.config.training.networks == "depth":
+            self.pose_net.eval()
+        return self
+
     def configure_optimizers(self) -> Any:
-        """Adam on both networks; the schedule counts steps."""
+        """Adam or Muon on what learns; the schedule counts steps."""
         training = self.config.training
         offsets = [
             parameter
@@ -92,11 +103,18 @@ class SelfSupervision(lightning.LightningModule):
             for parameter in branch.parameters()
         ]
         slow = {id(parameter) for parameter in offsets}
-        groups: list[dict[str, Any]] = [
-            {"params": [p for p in self.parameters() if id(p) not in slow]},
-            {"params": offsets, "lr": training.learning_rate * training.offset_rate},
-        ]
-        optimiser = torch.optim.Adam(groups, lr=training.learning_rate, betas=(0.9, 0.999))
+        rest = [p for p in self.parameters() if id(p) not in slow]
+        groups: list[dict[str, Any]] = [{"params": offsets, "lr": training.learning_rate * training.offset_rate}]
+        optimiser: torch.optim.Optimizer
+        if training.optimiser == "muon":
+            kernels = [p for p in rest if is_matrix(p)]
+            fast = training.learning_rate * training.kernel_rate
+            groups.insert(0, {"params": kernels, "lr": fast, "orthogonal": True})
+            groups.insert(0, {"params": [p for p in rest if not is_matrix(p)]})
+            optimiser = Muon(groups, lr=training.learning_rate)
+        else:
+            groups.insert(0, {"params": rest})
+            optimiser = torch.optim.Adam(groups, lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimiser, lambda step: learning_rate_factor(training.schedule, min(step / training.steps, 1))
         )

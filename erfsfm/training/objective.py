@@ -32,6 +32,7 @@ class SnippetBatch:
 
     What classical geometry measured, where it was asked (`erfsfm.data.structure`): ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
+    Where the networks see them otherwise: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order.
     """
 
     target: Tensor
@@ -39,6 +40,15 @@ class SnippetBatch:
     K: Tensor
     T_source_target: Tensor | None = None
     bounds: Bounds | None = None
+    shown: Tensor | None = None
+
+    def seen(self) -> tuple[Tensor, list[Tensor]]:
+        """Target and sources as the networks see them, in [-1, 1]."""
+        if self.shown is None:
+            return to_network_range(self.target), [to_network_range(source) for source in self.sources.unbind(dim=1)]
+        images = [to_network_range(image) for image in self.shown.unbind(dim=1)]
+        target = images.pop(len(images) // 2)
+        return target, images
 
 
 @dataclass(frozen=True)
@@ -95,8 +105,7 @@ class _Prediction:
         if not depth_net.training:
             raise ValueError("the objective needs the depth network in training mode")
         precise = batch.target.dtype
-        sources = [to_network_range(source) for source in batch.sources.unbind(dim=1)]
-        target = to_network_range(batch.target)
+        target, sources = batch.seen()
         disparities = [disparity.to(precise) for disparity in depth_net(target)]
         masks: list[Tensor] | None = None
         if config.network.masks:

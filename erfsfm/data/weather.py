@@ -1,0 +1,78 @@
+"""Bad weather over a snippet, after it was measured: exposure that jumps, motion blur, rain."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Images = list[NDArray[np.uint8]]
+Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
+
+_EACH = 0.6  # chance of each of the three
+_EXPOSURES = 6  # pictures that make a blurred one
+
+
+def weathered(images: Images, rng: np.random.Generator) -> Images:
+    """The same views, worse seen; the structure in them stays where it is.
+
+    Args:
+        images: ``(H, W, 3)`` uint8 each, in time order.
+        rng: the only source of chance.
+    """
+    exposure, blur, rain = rng.random(3) < _EACH
+    seen: Pictures = [np.asarray(image / 255, dtype=np.float32) for image in images]
+    if blur:
+        seen = _blurred(seen, rng)
+    if exposure:
+        seen = _exposed(seen, rng)
+    if rain:
+        seen = _rained_on(seen, rng)
+    return [np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8) for image in seen]
+
+
+def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """As a camera sees that drives and turns while its shutter is open."""
+    height, width = images[0].shape[:2]
+    approach = float(rng.uniform(0, 0.08))
+    turn = float(rng.normal(0, 0.01)) * width
+    rise = float(rng.normal(0, 0.005)) * height
+    centre = np.array([width - 1, height - 1]) / 2
+    moves = []
+    for share in np.linspace(-0.5, 0.5, _EXPOSURES):
+        zoom = 1 + share * approach
+        shift = (1 - zoom) * centre + share * np.array([turn, rise])
+        moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))
+    border = cv2.BORDER_REPLICATE
+    blurred = [
+        np.mean([cv2.warpAffine(image, move, (width, height), borderMode=border) for move in moves], axis=0)
+        for image in images
+    ]
+    return [np.asarray(image, dtype=np.float32) for image in blurred]
+
+
+def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """Another gain and gamma, and from some frame on another again."""
+    jump = int(rng.integers(len(images) + 1))
+    before, after = ((float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.7, 1.4))) for _ in range(2))
+    chosen = [before if k < jump else after for k in range(len(images))]
+    return [np.float32(gain) * np.power(image, np.float32(gamma)) for image, (gain, gamma) in zip(images, chosen)]
+
+
+def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
+    """A grey veil for the whole snippet, and streaks that no two frames share."""
+    height, width = images[0].shape[:2]
+    veil, grey = float(rng.uniform(0, 0.35)), float(rng.uniform(0.3, 0.8))
+    density, strength = float(rng.uniform(0.001, 0.01)), float(rng.uniform(0.1, 0.5))
+    length = max(3, int(height * rng.uniform(0.04, 0.14)))
+    slant = float(rng.uniform(-0.4, 0.4))
+    streak = np.zeros((length, length), np.float32)
+    rows = np.arange(length)
+    streak[rows, np.clip(np.rint(length / 2 + slant * (rows - length / 2)), 0, length - 1).astype(int)] = 1
+    wet = []
+    for image in images:
+        drops = (rng.random((height, width)) < density).astype(np.float32)
+        cover = np.minimum(cv2.filter2D(drops, -1, streak), 1)[..., None] * np.float32(strength)
+        hazy = image + np.float32(veil) * (np.float32(grey) - image)
+        wet.append(hazy + cover * (np.float32(0.9) - hazy))
+    return wet

@@ -239,8 +239,14 @@ def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, re
         raise TrainingError(f"{output} holds a run already: go on with --resume or choose another --output")
     done_steps = 0
     if resume:
-        if load_experiment(written).network != config.network:
+        begun = load_experiment(written)
+        if begun.network != config.network:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
+        if begun.training.optimiser != config.training.optimiser:
+            raise ConfigError(
+                f"{written} began with training.optimiser {begun.training.optimiser}, whose state another cannot take "
+                f"over; got {config.training.optimiser}: resume with the same one, or start anew from its weights"
+            )
         done_steps = _steps_of(checkpoint)
     output.mkdir(parents=True, exist_ok=True)
     write_atomically(written, lambda path: path.write_text(dump_yaml(config)))

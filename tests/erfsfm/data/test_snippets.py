@@ -111,6 +111,20 @@ def test_workers_change_nothing(coded: Path, workers: int) -> None:
     assert all(equal(a, b) for a, b in zip(alone, shared))
 
 
+def test_weather_is_shown_to_the_networks_and_changes_nothing_else(coded: Path) -> None:
+    clear = SnippetDraws(discover(coded), experiment(), 20)
+    wet = SnippetDraws(discover(coded), experiment(weather=0.5), 20)
+    changed = 0
+    for number in range(20):
+        sample, shown = clear.draw(number), wet.draw(number)
+        assert "shown" not in sample
+        assert all(torch.equal(sample[name], shown[name]) for name in sample)
+        seen = shown["shown"]
+        assert seen.shape == (3, 3, 32, 48)
+        changed += not torch.equal(seen, torch.stack([sample["sources"][0], sample["target"], sample["sources"][1]]))
+    assert 3 <= changed <= 16
+
+
 def test_resuming_sees_what_it_would_have_seen(coded: Path) -> None:
     whole = batches(coded, 0)
     for workers in (0, 2):

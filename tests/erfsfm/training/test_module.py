@@ -1,4 +1,5 @@
 import pytest
+import torch
 
 from erfsfm.config import ExperimentConfig, NetworkConfig, TrainingConfig
 from erfsfm.networks.deformable import DeformableConv2d
@@ -18,3 +19,39 @@ def test_what_predicts_offsets_learns_at_its_own_rate():
     for layer in layers:
         assert rates[id(layer.offset.weight)] == rates[id(layer.modulator.bias)] == pytest.approx(1e-4)
         assert rates[id(layer.kernel.weight)] == 1e-3
+
+
+def test_muon_takes_every_parameter_once_and_kernels_at_their_own_rate():
+    network = NetworkConfig(depth="erf-depthnet-dfcv2", pose="erf-posenet-dfc", depth_width=0.25, pose_width=0.25)
+    training = TrainingConfig(optimiser="muon", learning_rate=1e-3, kernel_rate=4, offset_rate=0.1)
+    module = SelfSupervision(ExperimentConfig(network=network, training=training))
+    groups = module.configure_optimizers()["optimizer"].param_groups
+    placed = [id(p) for group in groups for p in group["params"]]
+    assert sorted(placed) == sorted(id(p) for p in module.parameters())
+    kernels = {id(p) for group in groups if group["orthogonal"] for p in group["params"]}
+    assert {group["lr"] for group in groups if group["orthogonal"]} == {4e-3}
+    assert id(module.depth_net.iconvs[0][0].weight) in kernels
+    assert id(module.depth_net.heads[0].weight) not in kernels
+    layer = next(layer for layer in module.modules() if isinstance(layer, DeformableConv2d))
+    assert id(layer.offset.weight) not in kernels and id(layer.kernel.weight) in kernels
+
+
+def test_a_pose_network_that_does_not_learn_stays_as_it_is_also_its_norms():
+    network = NetworkConfig(
+        depth="depthnet", pose="posenet", depth_width=0.0625, pose_width=0.125, normalisation="batch", sources=2
+    )
+    module = SelfSupervision(ExperimentConfig(network=network, training=TrainingConfig(networks="depth")))
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    module.train()
+    assert module.depth_net.training and not module.pose_net.training
+    K = torch.tensor([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]).expand(2, 3, 3)
+    batch = {"target": torch.rand(2, 3, 32, 64), "sources": torch.rand(2, 2, 3, 32, 64), "K": K}
+    optimiser = module.configure_optimizers()["optimizer"]
+    module.log = module.log_dict = lambda *_, **__: None
+    module._trainer = None
+    module.training_step(batch, 0).backward()
+    optimiser.step()
+    changed = {
+        name.split(".")[0] for name, value in module.state_dict().items() if not torch.equal(value, before[name])
+    }
+    assert changed == {"depth_net"}

@@ -114,6 +114,29 @@ def test_what_it_returns(batch: SnippetBatch, plane) -> None:
     assert float(inner.max()) < 0.03, "warped[:, k] is source k seen from the target"
 
 
+def test_networks_see_what_is_shown_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane) -> None:
+    seen: list[Tensor] = []
+
+    class Watching(FixedDepth):
+        def forward(self, image: Tensor) -> list[Tensor]:
+            seen.append(image)
+            return super().forward(image)
+
+    class WatchingPose(FixedPose):
+        def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
+            seen.extend([target, *sources])
+            return super().forward(target, sources)
+
+    shown = torch.rand(2, 3, 3, 64, 96, dtype=torch.float64)
+    clear = judge(batch, experiment(), 1 / plane.distance, true_poses())
+    nets = Watching(1 / plane.distance), WatchingPose(true_poses())
+    wet = evaluate_objective(*nets, replace(batch, shown=shown), experiment())
+    assert float(wet.total.detach()) == float(clear.total)
+    assert len(seen) == 4
+    expected = [shown[:, 1], shown[:, 1], shown[:, 0], shown[:, 2]]
+    assert all(torch.equal(image, 2 * part - 1) for image, part in zip(seen, expected))
+
+
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
 def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: str) -> None:
     for factor in (0.9, 1.1):

@@ -143,8 +143,10 @@ def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
     assert not same(tmp_path / "a", tmp_path / "c")
 
 
-@pytest.mark.parametrize("schedule", ["constant", "cosine"])
-@pytest.mark.parametrize("normalisation", ["none", "batch"])
+@pytest.mark.parametrize(
+    "schedule, normalisation, optimiser",
+    [("constant", "none", "adam"), ("cosine", "batch", "adam"), ("cosine", "batch", "muon")],
+)
 def test_resume_ends_with_the_very_same_weights(
     small: Small,
     world: Path,
@@ -153,10 +155,11 @@ def test_resume_ends_with_the_very_same_weights(
     monkeypatch: pytest.MonkeyPatch,
     schedule: str,
     normalisation: str,
+    optimiser: str,
 ) -> None:
     """Interrupted at step 5 of 6; the last checkpoint is of step 4, where there also was a validation."""
     small["network"]["normalisation"] = normalisation
-    training = {"steps": 6, "schedule": schedule, "learning_rate": 1e-3, "gradient_clip": 1.0}
+    training = {"steps": 6, "schedule": schedule, "learning_rate": 1e-3, "gradient_clip": 1.0, "optimiser": optimiser}
     config = configure(small, [world, held_out], training=training)
     train(config, tmp_path / "whole", device="cpu")
     interrupted(monkeypatch, config, tmp_path / "cut", 5)
@@ -453,6 +456,13 @@ def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
     network = config.network.model_copy(update={"pose": "erf-posenet-dilated"})
     with pytest.raises(ConfigError, match="networks"):
         train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
+
+
+def test_resume_with_another_optimiser(cut: tuple[ExperimentConfig, Path]) -> None:
+    config, output = cut
+    training = config.training.model_copy(update={"optimiser": "muon"})
+    with pytest.raises(ConfigError, match=r"began with training\.optimiser adam"):
+        train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
 
 
 class Malice:

@@ -41,13 +41,20 @@ class RoadStep:
 
 
 class RoadAligner:
-    """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it."""
+    """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it.
+
+    A car ahead hides most of a long strip of road and stands still in the image. Where the long strip is refused, a
+    short and wide one is asked, which ends before such a car; it is less sure.
+    """
 
     def __init__(self, config: RoadConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
         self._recall = recall
-        self._top_row, self._rows, self._columns, self._rays = _region(intrinsics, config)
+        long = _Shape(config.far_heights, config.half_width_heights, config.sigma_share)
+        near = _Shape(config.near_heights, config.near_half_width_heights, config.near_sigma_share)
+        self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
+        self._strips = [_strip(intrinsics, shape, config.points) for shape in (long, near)]
         self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
         self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
 
@@ -59,13 +66,23 @@ class RoadAligner:
             current: the next frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
         """
-        if len(self._rays) < self._config.min_points:
-            return Refusal("the image shows too little of the road")
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
         self._directions.append(T_unit[:3, 3])
         expected = self._expected()
-        plane, likeness, standing = self._aligned(previous, current, T_unit, expected)
+        long, near = self._strips
+        measured = self._measured_on(long, previous, current, T_unit, expected)
+        if isinstance(measured, RoadStep):
+            return measured
+        nearby = self._measured_on(near, previous, current, T_unit, expected)
+        return nearby if isinstance(nearby, RoadStep) else measured
+
+    def _measured_on(
+        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+    ) -> RoadStep | Refusal:
+        if len(strip.rays) < self._config.min_points:
+            return Refusal("the image shows too little of the road")
+        plane, likeness, standing = self._aligned(strip, previous, current, T_unit, expected)
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
@@ -75,26 +92,26 @@ class RoadAligner:
             return Refusal(f"the road looks different in both images (correlation {likeness:.2f})")
         if 1.0 - likeness > (1.0 - self._config.min_gain) * (1.0 - standing):
             return Refusal(f"what is before the car stands still in the image (correlation {standing:.2f})")
-        sigma_share = float(np.hypot(self._config.sigma_share, self._config.tilt_gain * deviation))
-        return RoadStep(length, sigma_share, normal)
+        return RoadStep(length, float(np.hypot(strip.shape.sigma_share, self._config.tilt_gain * deviation)), normal)
 
     def _aligned(
-        self, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> tuple[FloatArray, float, float]:
         """The plane ``m`` ``(3,)`` that aligns the road, how alike both views of it are then, and as they are."""
         config = self._config
 
         def align() -> Answer:
             before, now = self._layers(previous), self._layers(current)
-            plane = self._search(before[0], now[0], T_unit, expected)
+            plane = self._search(strip, before[0], now[0], T_unit, expected)
             for layer_before, layer_now in zip(before, now, strict=True):
                 plane, likeness = self._refine(
-                    layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
+                    strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
                 )
-            standing = _correlation(before[-1][self._rows, self._columns, 0], now[-1][self._rows, self._columns, 0])
+            rows, columns = strip.rows - self._top_row, strip.columns
+            standing = _correlation(before[-1][rows, columns, 0], now[-1][rows, columns, 0])
             return plane, np.array([likeness, standing])
 
-        settings = (self._intrinsics, config.far_heights, config.half_width_heights, config.points)
+        settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
         given = (previous.image, current.image, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
         plane, alike = self._recall("road aligned", given, align)
         return plane, float(alike[0]), float(alike[1])
@@ -130,10 +147,10 @@ class RoadAligner:
             cv2.remap(layer, u.astype(np.float32)[:, None], v.astype(np.float32)[:, None], cv2.INTER_LINEAR)
         ).reshape(len(u), 3)
 
-    def _search(self, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
+    def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
         """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
-        rays = self._rays[::3]
-        seen = now[self._rows[::3], self._columns[::3], 0]
+        rays = strip.rays[::3]
+        seen = now[strip.rows[::3] - self._top_row, strip.columns[::3], 0]
         turned, shift = rays @ T_unit[:3, :3].T, np.outer(rays @ normal, T_unit[:3, 3])
         costs = []
         for length in _LENGTHS_HEIGHTS:
@@ -143,6 +160,7 @@ class RoadAligner:
 
     def _refine(
         self,
+        strip: _Strip,
         before: _Layer,
         now: _Layer,
         T_unit: FloatArray,
@@ -152,17 +170,17 @@ class RoadAligner:
     ) -> tuple[FloatArray, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
         camera, t = self._intrinsics, T_unit[:3, 3]
-        turned = self._rays @ T_unit[:3, :3].T
-        seen = now[self._rows, self._columns, 0]
+        turned = strip.rays @ T_unit[:3, :3].T
+        seen = now[strip.rows - self._top_row, strip.columns, 0]
         across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
-            points = _ahead(turned + np.outer(self._rays @ plane, t))
+            points = _ahead(turned + np.outer(strip.rays @ plane, t))
             values = self._sampled(before, points)
             residual = values[:, 0] - seen
             depth = points[:, 2]
             slope_u = camera.fx * (t[0] - points[:, 0] / depth * t[2]) / depth
             slope_v = camera.fy * (t[1] - points[:, 1] / depth * t[2]) / depth
-            jacobian = (values[:, 1] * slope_u + values[:, 2] * slope_v)[:, None] * self._rays
+            jacobian = (values[:, 1] * slope_u + values[:, 2] * slope_v)[:, None] * strip.rays
             sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 0.3)
             weighted = jacobian / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2))[:, None]
             prior = across / (tilt * float(np.linalg.norm(plane))) ** 2
@@ -174,17 +192,34 @@ class RoadAligner:
         return plane, _correlation(values[:, 0], seen)
 
 
-def _region(intrinsics: Intrinsics, config: RoadConfig) -> tuple[int, NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """First row used, then rows, columns ``(P,)`` from there and rays ``(P, 3)`` of a strip of a level road."""
-    top = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-    v, u = np.mgrid[top : intrinsics.height, : intrinsics.width]
+@dataclass(frozen=True)
+class _Shape:
+    """How far a strip of road reaches, half its width, in camera heights, and the least sigma of a length by it."""
+
+    far_heights: float
+    half_width_heights: float
+    sigma_share: float
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Pixels ``(P,)`` of the image that see a strip of a level road, and their rays ``(P, 3)``."""
+
+    shape: _Shape
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    rays: FloatArray
+
+
+def _strip(intrinsics: Intrinsics, shape: _Shape, points: int) -> _Strip:
+    v, u = np.mgrid[: intrinsics.height, : intrinsics.width]
     x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
     depth_heights = 1.0 / np.maximum(y, 1e-6)
-    strip = (depth_heights < config.far_heights) & (np.abs(x * depth_heights) < config.half_width_heights)
-    step = max(round(float(np.sqrt(strip.sum() / config.points))), 1)
-    rows, columns = np.nonzero(strip & (v % step == 0) & (u % step == 0))
+    seen = (depth_heights < shape.far_heights) & (np.abs(x * depth_heights) < shape.half_width_heights)
+    step = max(round(float(np.sqrt(seen.sum() / points))), 1)
+    rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
     rays = np.stack([x[rows, columns], y[rows, columns], np.ones(len(rows))], axis=1)
-    return top, rows, columns, rays
+    return _Strip(shape, rows, columns, rays)
 
 
 def _ahead(points: FloatArray) -> FloatArray:

@@ -81,6 +81,20 @@ def test_a_car_that_covers_the_road_is_refused(texture):
     assert isinstance(refusal, Refusal) and "stands still" in refusal.reason
 
 
+def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    car = np.random.default_rng(0).integers(0, 255, (76, 300, 3), np.uint8)
+    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
+    for frame in frames:
+        frame.image[92:168, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
+    road = RoadAligner(CONFIG, CAMERA).measure(*frames, step)
+    assert isinstance(road, RoadStep)
+    assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
+    assert road.sigma_share >= CONFIG.near_sigma_share
+    long_only = RoadConfig(near_heights=0.1)
+    assert isinstance(RoadAligner(long_only, CAMERA).measure(*frames, step), Refusal)
+
+
 def test_what_is_no_road_is_refused_with_a_reason(texture):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)

@@ -7,7 +7,6 @@ variation. A run that resumes at step k therefore sees exactly what it would hav
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +19,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import augment
 from erfsfm.data.discovery import discover
+from erfsfm.data.image_cache import ImageCache
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import FrameRange, overlapping
@@ -39,30 +39,6 @@ class Snippet:
     first: int
 
 
-class ImageCache:
-    """The most recently decoded frames, up to a size in bytes."""
-
-    def __init__(self, limit_mb: int) -> None:
-        self._limit = limit_mb * 2**20
-        self._bytes = 0
-        self._images: OrderedDict[tuple[int, int], NDArray[np.uint8]] = OrderedDict()
-
-    def image(self, recording: Recording, index: int, height: int, width: int) -> NDArray[np.uint8]:
-        """One frame at ``height x width``, decoded at most once while it stays in the cache."""
-        key = (id(recording), index)
-        cached = self._images.get(key)
-        if cached is not None:
-            self._images.move_to_end(key)
-            return cached
-        image = recording.image(index, height, width)
-        self._images[key] = image
-        self._bytes += image.nbytes
-        while self._bytes > self._limit:
-            _, oldest = self._images.popitem(last=False)
-            self._bytes -= oldest.nbytes
-        return image
-
-
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     """Random snippets from draw number ``first_draw`` to ``draws``, whole batches dealt out to devices and workers."""
 
@@ -73,7 +49,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        self._cache = ImageCache(config.data.cache_mb)
+        self._cache = ImageCache(config.data.cache_mb, config.network.height, config.network.width)
         self._structures = StructureCache(config.teacher.cache)
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
@@ -98,7 +74,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         network = self._config.network
         first = int(rng.integers(len(recording) - network.sources))
         snippet = Snippet(recording, first)
-        images = load_window(self._cache, snippet, network.sources + 1, network.height, network.width)
+        images = load_window(self._cache, snippet, network.sources + 1)
         camera = recording.camera.resized(network.width, network.height)
         if not self._config.teacher.weights:
             images, _, varied, _ = augment(images, [], camera, self._config.data, network.fidelity, rng)
@@ -131,7 +107,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 
     def __init__(self, recordings: Sequence[Recording], config: ExperimentConfig) -> None:
         self._network = config.network
-        self._cache = ImageCache(config.data.cache_mb)
+        self._cache = ImageCache(config.data.cache_mb, self._network.height, self._network.width)
         length = config.network.sources + 1
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
@@ -144,7 +120,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
     def __getitem__(self, item: int) -> dict[str, Tensor]:
         snippet, network = self._snippets[item], self._network
         recording, length = snippet.recording, network.sources + 1
-        images = load_window(self._cache, snippet, length, network.height, network.width)
+        images = load_window(self._cache, snippet, length)
         sample = as_tensors(images, recording.camera.resized(network.width, network.height).K)
         middle = snippet.first + network.sources // 2
         depth = recording.true_depth(middle)
@@ -158,9 +134,9 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         return sample
 
 
-def load_window(cache: ImageCache, snippet: Snippet, length: int, height: int, width: int) -> list[NDArray[np.uint8]]:
+def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
     """The images of a snippet at the networks' size, in time order."""
-    return [cache.image(snippet.recording, snippet.first + k, height, width) for k in range(length)]
+    return [cache.image(snippet.recording, snippet.first + k) for k in range(length)]
 
 
 def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:

@@ -19,7 +19,6 @@ from torch.utils.data import DataLoader
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import (
-    ImageCache,
     SnippetDraws,
     ValidationSnippets,
     as_tensors,
@@ -224,34 +223,6 @@ def test_as_tensors_puts_the_target_apart() -> None:
     sample = as_tensors(images, np.eye(3, dtype=np.float32))
     assert float(sample["target"].mean()) == pytest.approx(0.4)
     assert sample["sources"].mean(dim=(1, 2, 3)).tolist() == pytest.approx([0, 0.2, 0.6, 0.8])
-
-
-def test_cache_decodes_once_while_there_is_room(coded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = discover(coded)[0]
-    decoded: list[int] = []
-    original = type(recording).image
-
-    def counting(self: Any, index: int, height: int, width: int) -> Any:
-        decoded.append(index)
-        return original(self, index, height, width)
-
-    monkeypatch.setattr(type(recording), "image", counting)
-    roomy, none = ImageCache(10), ImageCache(0)
-    for cache in (roomy, none):
-        for index in (0, 1, 0, 1):
-            assert (cache.image(recording, index, 32, 48) == original(recording, index, 32, 48)).all()
-    assert decoded == [0, 1, 0, 1, 0, 1]
-
-
-def test_cache_forgets_the_oldest(coded: Path) -> None:
-    recording = discover(coded)[0]
-    cache = ImageCache(1)  # holds 2 images of 512 x 256 x 3 bytes
-    first = cache.image(recording, 0, 256, 512)
-    second = cache.image(recording, 1, 256, 512)
-    assert cache.image(recording, 0, 256, 512) is first
-    cache.image(recording, 2, 256, 512)
-    assert cache.image(recording, 0, 256, 512) is first
-    assert cache.image(recording, 1, 256, 512) is not second
 
 
 # validation

@@ -69,14 +69,11 @@ class GeometryConfig(Section):
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
     rotation_floor_deg: float = Field(default=0.01, gt=0, description="least rotation sigma")
     direction_floor_deg: float = Field(default=0.05, gt=0, description="least sigma of the translation's direction")
-    length_floor_share: float = Field(default=0.009, gt=0, description="least sigma of the translation's length")
     shake_rotation_share: float = Field(default=0.3, ge=0, description="rotation sigma, share of the camera's shake")
     shake_direction_share: float = Field(default=8.0, ge=0, description="sigma of the direction, likewise")
     turn_rotation_share: float = Field(default=0.01, ge=0, description="rotation sigma, share of the step's turn")
-    turn_length_share: float = Field(default=0.27, ge=0, description="sigma of a length, share per radian of turn")
     jolt_rotation_share: float = Field(default=0.2, ge=0, description="rotation sigma, share of the jump to neighbours")
     jolt_direction_share: float = Field(default=0.5, ge=0, description="sigma of the direction, likewise")
-    length_spread_share: float = Field(default=0.6, ge=0, description="sigma of a length, share of the road's spread")
 
 
 class RoadConfig(Section):

@@ -230,7 +230,7 @@ class SlamPipeline:
     def _measure(self, seen: Observations, lidar: LidarPath | None, scale: Scale) -> list[RelativePose]:
         """All relative poses with their noise, in the mode's unit."""
         by_corners = {step: m.relative_pose.T_from_to for step, m in seen.motions.items()}
-        drive = drive_noise(by_corners, scale.length_spread, self._config.geometry)
+        drive = drive_noise(by_corners, self._config.geometry)
         geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
         networks = self._by_networks(seen)
         if self._config.frontend.use == "bridge":
@@ -254,7 +254,8 @@ class SlamPipeline:
         """A geometric measurement with its step's length, or by learned depth where the step has none."""
         step = measured.from_index
         if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
-            return seen.motions[step].with_length(float(scale.lengths[step]), drive[step])
+            length, sigma_share = float(scale.lengths[step]), float(scale.length_sigmas[step])
+            return seen.motions[step].with_length(length, sigma_share, drive[step])
         return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

@@ -25,24 +25,20 @@ _THIRD_DIFFERENCE = np.sqrt(20.0)
 
 @dataclass(frozen=True)
 class StepNoise:
-    """Sigmas to add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians, ``length`` as a share.
+    """Sigmas to add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians.
 
     The direction is of the earlier camera as the later one sees it, where GTSAM perturbs; along it there is no error.
     """
 
     rotation: FloatArray
     direction: FloatArray
-    length: float
 
 
-def drive_noise(
-    T_previous_current: Mapping[int, FloatArray], length_spread: float, config: GeometryConfig
-) -> dict[int, StepNoise]:
+def drive_noise(T_previous_current: Mapping[int, FloatArray], config: GeometryConfig) -> dict[int, StepNoise]:
     """The noise of each step of a drive.
 
     Args:
         T_previous_current: steps that corners measured, by their first frame; lengths are not looked at.
-        length_spread: relative sigma of single measurements of length.
         config: the shares.
     """
     turned = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
@@ -54,9 +50,7 @@ def drive_noise(
         rotation.append(config.jolt_rotation_share * jolt(turned, k))
         aside = config.shake_direction_share * np.linalg.norm(shake) * np.sqrt(np.maximum(1.0 - along[k] ** 2, 0.0))
         direction = np.hypot(aside, config.jolt_direction_share * jolt(along, k))
-        length = [config.length_floor_share, config.length_spread_share * length_spread]
-        length.append(config.turn_length_share * float(np.linalg.norm(turn)))
-        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction, float(np.linalg.norm(length)))
+        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction)
     return noise
 
 

@@ -51,15 +51,21 @@ class Motion:
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
 
-    def with_length(self, length: float, noise: StepNoise) -> RelativePose:
-        """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there."""
+    def with_length(self, length: float, sigma_share: float, noise: StepNoise) -> RelativePose:
+        """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there.
+
+        Args:
+            length: in the unit wanted.
+            sigma_share: its relative sigma.
+            noise: of rotation and direction, beside the corners' own.
+        """
         if self.direction_sigmas is None:
             raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
         rotation = np.hypot(self.relative_pose.sigmas[:3], noise.rotation)
         direction = np.hypot(self.direction_sigmas, noise.direction)
-        sigmas = _sigmas(T_previous_current, rotation, direction, noise.length)
+        sigmas = _sigmas(T_previous_current, rotation, direction, sigma_share)
         return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas)
 
 

@@ -29,15 +29,15 @@ logger = logging.getLogger(__name__)
 class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in the mode's unit.
 
-    ``lengths`` ``(N - 1,)`` are those of the steps between frames, NaN where only the networks measured them;
-    ``length_spread`` is the relative sigma of single measurements of them.
+    ``lengths`` ``(N - 1,)`` are those of the steps between frames, NaN where only the networks measured them, and
+    ``length_sigmas`` ``(N - 1,)`` their relative sigmas.
     """
 
     mode: ScaleMode
     estimate: ScaleEstimate | Refusal
     per_frame: FloatArray
     lengths: FloatArray
-    length_spread: float
+    length_sigmas: FloatArray
 
     def in_unit_of(self, other: ScaleEstimate | Refusal) -> Scale:
         """The same lengths times an estimate that was made in this unit; unchanged by a refusal."""
@@ -92,13 +92,13 @@ def find_scale(
     per_frame = unit_believed * np.append(solved.unit_correction, solved.unit_correction[-1])
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
-    estimate, spread = believed, lengths.learned_sigma
+    estimate = believed
     if used >= config.min_frames:
         spread = _MAD_TO_SIGMA * float(np.nanmedian(misfit))
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(believed, Refusal):
         logger.warning("no scale (%s): lengths stay in the networks' unit", believed.reason)
-    return Scale(mode, estimate, per_frame, solved.length, spread)
+    return Scale(mode, estimate, per_frame, solved.length, solved.sigma_share)
 
 
 def _height_by_lidar(metres: Mapping[int, float], road_steps: Mapping[int, RoadStep]) -> float | None:

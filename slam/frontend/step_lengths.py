@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
 
 from slam.config import LengthConfig
@@ -57,12 +57,13 @@ class StepEvidence:
 
 @dataclass(frozen=True)
 class StepLengths:
-    """``length`` ``(S,)`` of each step, NaN where nothing measured it, and the factor ``unit_correction`` ``(S,)``.
+    """``length`` ``(S,)`` of each step and its relative sigma ``sigma_share`` ``(S,)``, NaN where nothing measured it.
 
-    The correction times the believed unit of learned depth is its unit near that step.
+    The factor ``unit_correction`` ``(S,)`` times the believed unit of learned depth is its unit near that step.
     """
 
     length: FloatArray
+    sigma_share: FloatArray
     unit_correction: FloatArray
 
 
@@ -133,11 +134,33 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     state, weights = np.zeros(2 * steps), np.ones(len(target))
     for iteration in range(_ITERATIONS):
         weighted = A.multiply(weights[:, None]).T.tocsr()
-        state = np.atleast_1d(spsolve((weighted @ A + idle).tocsc(), weighted @ target))
+        information = (weighted @ A + idle).tocsc()
+        state = np.atleast_1d(spsolve(information, weighted @ target))
         residual = np.abs(A @ state - target)
         robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
-    return StepLengths(np.where(measured, np.exp(state[:steps]), np.nan), np.exp(state[steps:]))
+    known = np.where(measured, 1.0, np.nan)
+    sigmas = marginal_sigmas(information, steps)
+    return StepLengths(known * np.exp(state[:steps]), known * sigmas, np.exp(state[steps:]))
+
+
+def marginal_sigmas(information: csc_array, steps: int) -> FloatArray:
+    """Sigma ``(S,)`` of every length that an information matrix ``(2 S, 2 S)`` of lengths, then units, leaves.
+
+    Only neighbours are tied to each other, so what all steps before and all steps after say of one are two chains of
+    2x2 Schur complements.
+    """
+    main, neighbour = information.diagonal(), information.diagonal(1)
+    own = np.zeros((steps, 2, 2))
+    own[:, 0, 0], own[:, 1, 1] = main[:steps], main[steps:]
+    own[:, 0, 1] = own[:, 1, 0] = information.diagonal(steps)
+    tie = np.zeros((steps, 2, 2))  # of a step and the next
+    tie[:-1, 0, 0], tie[:-1, 1, 1] = neighbour[: steps - 1], neighbour[steps:]
+    before, after = own.copy(), own.copy()
+    for k in range(1, steps):
+        before[k] -= tie[k - 1] @ np.linalg.inv(before[k - 1]) @ tie[k - 1]
+        after[-k - 1] -= tie[-k - 1] @ np.linalg.inv(after[-k]) @ tie[-k - 1]
+    return np.asarray(np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0]))
 
 
 @dataclass(frozen=True)

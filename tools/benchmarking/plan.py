@@ -50,7 +50,6 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no noise from the drive": (
         "geometry.shake_rotation_share=0",
         "geometry.shake_direction_share=0",
-        "geometry.length_spread_share=0",
     ),
     "no bridging": ("bridging.enabled=false",),
     "network factors on every step": ("frontend.use=always",),

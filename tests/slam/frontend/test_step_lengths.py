@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from scipy.sparse import csc_array
 
 from slam.config import LengthConfig
 from slam.frontend.epipolar import Structure
-from slam.frontend.step_lengths import StepEvidence, length_ratio, solve_lengths
+from slam.frontend.step_lengths import StepEvidence, length_ratio, marginal_sigmas, solve_lengths
 
 CONFIG = LengthConfig()
 STEPS = 200
@@ -104,3 +105,55 @@ def test_ratio_of_lengths_from_common_points():
     assert ratio[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
     again = length_ratio(structure(names + 5, depth + 2.0, depth / 2.0), later)
     assert again is not None and again[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
+
+
+def test_sigmas_are_those_of_the_whole_system() -> None:
+    """The chains of small complements say what inverting everything says."""
+    rng = np.random.default_rng(0)
+    steps = 7
+    rows = [np.eye(2 * steps)]
+    for k in range(steps):
+        for a, b in ((k, steps + k), (k, k + 1), (steps + k, steps + k + 1)):
+            if b < 2 * steps and (a >= steps or b != steps or a == k == 0):
+                row = np.zeros(2 * steps)
+                row[a], row[b] = rng.normal(size=2)
+                rows.append(row[None])
+    A = np.concatenate([row for row in rows if not (np.abs(row[:, steps - 1]) * np.abs(row[:, steps])).any()])
+    information = A.T @ A
+    expected = np.sqrt(np.diag(np.linalg.inv(information))[:steps])
+    banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))
+    assert (information[(banded != 0) & (banded != 1) & (banded != steps)] == 0).all()
+    np.testing.assert_allclose(marginal_sigmas(csc_array(information), steps), expected, rtol=1e-9)
+
+
+def test_sigmas_say_how_far_lengths_err() -> None:
+    """Also in the middle of a gap of the road, where only triangulation and learned depth go on."""
+    errors, sigmas = [], []
+    for seed in range(20):
+        road = noisy(0.06, seed=100 + seed)
+        road[60:100] = np.nan
+        rng = np.random.default_rng(seed)
+        chained = np.full(STEPS, np.nan)
+        chained[1:] = np.diff(np.log(TRUE)) + 0.01 * rng.normal(size=STEPS - 1)
+        measured = evidence(
+            absolute=road,
+            absolute_sigma=np.full(STEPS, 0.06),
+            ratio=chained,
+            ratio_sigma=np.full(STEPS, 0.01 / CONFIG.ratio_widening),
+            learned=noisy(0.1, seed=200 + seed),
+        )
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        errors.append(np.log(solved.length / TRUE))
+        sigmas.append(solved.sigma_share)
+    ratio = np.abs(errors) / np.array(sigmas)
+    assert 0.75 < np.sqrt((ratio**2).mean()) < 1.25
+    assert 0.75 < np.sqrt((ratio[:, 70:90] ** 2).mean()) < 1.25
+    assert np.mean(sigmas, axis=0)[80] > 1.5 * np.mean(sigmas, axis=0)[30]
+
+
+def test_a_step_that_nothing_measured_has_no_sigma() -> None:
+    road = noisy(0.06)
+    road[50:60] = np.nan
+    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06)), CONFIG)
+    np.testing.assert_array_equal(np.isnan(solved.sigma_share), np.isnan(solved.length))
+    assert np.isnan(solved.length[50:60]).all() and np.isfinite(solved.length[:50]).all()

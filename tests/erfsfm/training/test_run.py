@@ -26,8 +26,9 @@ from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.training.keeper import decisive, licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
-from erfsfm.training.run import decisive, licence_of, train
+from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]
 

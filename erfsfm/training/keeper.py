@@ -1,0 +1,126 @@
+"""Which weights of a run are kept, and what is written beside them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+
+import erfsfm
+from erfsfm.checkpoint import Model, ModelRecord, commit, read_record, save_model
+from erfsfm.data.splits import merge
+from erfsfm.training.module import SelfSupervision
+
+logger = logging.getLogger(__name__)
+
+
+class WeightKeeper(Callback):
+    """Writes weights that can be used at once: the latest, the best and those with the best poses.
+
+    How long the last improvement is ago follows from the step in the best ones' record, so that a run
+    that is killed and resumed stops where it would have stopped.
+    """
+
+    def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
+        self._output = output
+        self._seen = seen
+        self._command = command
+        self.validates = validates
+        self._best = {output: math.inf, output / "best_pose": math.inf}
+        self._best_step = 0
+        for folder in self._best:
+            if (folder / "model.yaml").is_file():
+                record = read_record(folder / "model.yaml")
+                self._best[folder] = self._measures(record.metrics)[folder]
+                if math.isfinite(self._best[folder]):
+                    self._best_step = max(self._best_step, record.step)
+        self._saved_step = -1
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Keep what was just validated; end the run where the last improvement is too long ago."""
+        if trainer.sanity_checking or not isinstance(module, SelfSupervision):
+            return
+        improved = self._improved(module.validation_metrics)
+        if improved:
+            self._best_step = trainer.global_step
+        if trainer.is_global_zero:
+            self.save(module, trainer.global_step)
+        self._best |= improved
+        training = module.config.training
+        if training.patience and trainer.global_step - self._best_step >= training.patience * training.validate_every:
+            trainer.should_stop = True
+            logger.info(
+                "stopped at step %d: no validation since step %d was better", trainer.global_step, self._best_step
+            )
+
+    def on_exception(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
+    ) -> None:
+        """Keep the weights so far, if they are numbers."""
+        numbers = all(torch.isfinite(weights).all() for weights in module.parameters())
+        if isinstance(module, SelfSupervision) and trainer.is_global_zero and trainer.global_step > 0 and numbers:
+            save_model(self._output / "last", self._model(module, trainer.global_step))
+
+    def save(self, module: SelfSupervision, step: int) -> None:
+        """Write ``last/``; and the folders whose measure is the best so far.
+
+        Without validation the last is the best.
+        """
+        if step == self._saved_step:
+            return
+        self._saved_step = step
+        model = self._model(module, step)
+        save_model(self._output / "last", model)
+        folders = set(self._improved(module.validation_metrics))
+        if not self.validates or not (self._output / "model.yaml").is_file():
+            folders.add(self._output)
+        for folder in folders:
+            save_model(folder, model)
+
+    def _model(self, module: SelfSupervision, step: int) -> Model:
+        record = ModelRecord(
+            network=module.config.network,
+            trained_on=self._seen,
+            licence=licence_of(self._seen),
+            step=step,
+            metrics=module.validation_metrics,
+            version=erfsfm.__version__,
+            commit=commit(),
+            command=self._command,
+        )
+        return Model(record, module.depth_net, module.pose_net)
+
+    def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
+        """What each folder's weights are judged by; less is better."""
+        pose = metrics.get("snippet_ate", math.inf)
+        return {self._output: decisive(metrics), self._output / "best_pose": pose if math.isfinite(pose) else math.inf}
+
+    def _improved(self, metrics: dict[str, float]) -> dict[Path, float]:
+        return {folder: value for folder, value in self._measures(metrics).items() if value < self._best[folder]}
+
+    def state_dict(self) -> dict[str, list[str]]:
+        """What was seen survives a resume, also with other data."""
+        return {"seen": self._seen}
+
+    def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
+        """Add what the run had seen before it was interrupted."""
+        self._seen = merge([*self._seen, *state_dict.get("seen", [])])
+
+
+def decisive(metrics: dict[str, float]) -> float:
+    """What a validation is judged by: true depth where it has it, else the photometric error; less is better."""
+    value = metrics.get("abs_rel", metrics.get("photometric", math.inf))
+    return value if math.isfinite(value) else math.inf
+
+
+def licence_of(seen: list[str]) -> str:
+    """Licence that weights inherit from what they saw."""
+    if all(name.startswith("simulated/") for name in seen):
+        return "MIT"
+    if any(name.startswith(("kitti", "folder/kitti", "folder/karlsruhe")) for name in seen):
+        return "CC BY-NC-SA 3.0 (trained on KITTI)"
+    return "unknown: depends on the training data"

@@ -40,6 +40,7 @@ class SelfSupervision(lightning.LightningModule):
         self._alone = config.model_copy(update={"loss": unlooked})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.pose_net.requires_grad_(config.training.networks == "both")
+        self.train()  # Lightning keeps the modes that modules come with
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0

@@ -134,6 +134,20 @@ def test_five_frames_are_validated_by_the_snippet_protocol(small: Small, held_ou
     assert {"snippet_ate", "snippet_re"} <= metrics.keys()
 
 
+def test_a_pose_network_that_does_not_learn_is_written_as_it_came(
+    small: Small, world: Path, held_out: Path, tmp_path: Path
+) -> None:
+    small["network"]["normalisation"] = "batch"
+    first = train(configure(small, [world, held_out]), tmp_path / "first", device="cpu")
+    config = configure(small, [world, held_out], training={"networks": "depth", "learning_rate": 1e-3})
+    second = train(config.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
+    before, after = load_model(first), load_model(second / "last")
+    poses = zip(before.pose_net.state_dict().values(), after.pose_net.state_dict().values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in poses), "its norms as well"
+    depths = zip(before.depth_net.parameters(), after.depth_net.parameters(), strict=True)
+    assert not any(torch.equal(a, b) for a, b in depths if a.numel() > 1)
+
+
 def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
     config = configure(small, [world], training={"steps": 2})
     for name in ("a", "b"):

@@ -67,7 +67,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
 
-        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `Structure`.
+        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `Structure`. With
+        weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
         """
         rng = np.random.default_rng([self._config.training.seed, number])
         recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
@@ -76,22 +77,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         snippet = Snippet(recording, first)
         images = load_window(self._cache, snippet, network.sources + 1)
         camera = recording.camera.resized(network.width, network.height)
-        if not self._config.teacher.weights:
-            images, _, varied, _ = augment(images, [], camera, self._config.data, network.fidelity, rng)
-            return self._shown(as_tensors(images, varied.K), images, rng)
-        seen = self._structures.structure(images, camera.K)
-        bounds = [seen.least.astype(np.float32), seen.most.astype(np.float32)]
+        seen = self._structures.structure(images, camera.K) if self._config.teacher.weights else None
+        bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
         images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
         sample = as_tensors(images, varied.K)
-        T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
-        sample["T_source_target"] = torch.from_numpy(T_source_target)
-        sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
-        return self._shown(sample, images, rng)
-
-    def _shown(
-        self, sample: dict[str, Tensor], images: list[NDArray[np.uint8]], rng: np.random.Generator
-    ) -> dict[str, Tensor]:
-        """With weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them."""
+        if seen is not None:
+            T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
+            sample["T_source_target"] = torch.from_numpy(T_source_target)
+            sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
         share = self._config.data.weather
         if share > 0:
             sample["shown"] = _stacked(weathered(images, rng) if rng.random() < share else images)

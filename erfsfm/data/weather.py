@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Images = list[NDArray[np.uint8]]
+from erfsfm.data.augmentation import Images
+
 Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
 
 _EACH = 0.6  # chance of each of the three
-_EXPOSURES = 6  # pictures that make a blurred one
+_BLUR_SAMPLES = 6  # pictures that make a blurred one
 
 
 def weathered(images: Images, rng: np.random.Generator) -> Images:
@@ -39,7 +40,7 @@ def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
     rise = float(rng.normal(0, 0.005)) * height
     centre = np.array([width - 1, height - 1]) / 2
     moves = []
-    for share in np.linspace(-0.5, 0.5, _EXPOSURES):
+    for share in np.linspace(-0.5, 0.5, _BLUR_SAMPLES):
         zoom = 1 + share * approach
         shift = (1 - zoom) * centre + share * np.array([turn, rise])
         moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))

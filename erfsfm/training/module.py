@@ -105,17 +105,15 @@ class SelfSupervision(lightning.LightningModule):
         ]
         slow = {id(parameter) for parameter in offsets}
         rest = [p for p in self.parameters() if id(p) not in slow]
-        groups: list[dict[str, Any]] = [{"params": offsets, "lr": training.learning_rate * training.offset_rate}]
+        slowly: dict[str, Any] = {"params": offsets, "lr": training.learning_rate * training.offset_rate}
         optimiser: torch.optim.Optimizer
         if training.optimiser == "muon":
-            kernels = [p for p in rest if is_matrix(p)]
-            fast = training.learning_rate * training.kernel_rate
-            groups.insert(0, {"params": kernels, "lr": fast, "orthogonal": True})
-            groups.insert(0, {"params": [p for p in rest if not is_matrix(p)]})
-            optimiser = Muon(groups, lr=training.learning_rate)
+            others: dict[str, Any] = {"params": [p for p in rest if not is_matrix(p)]}
+            kernels: dict[str, Any] = {"params": [p for p in rest if is_matrix(p)], "orthogonal": True}
+            kernels["lr"] = training.learning_rate * training.kernel_rate
+            optimiser = Muon([others, kernels, slowly], lr=training.learning_rate)
         else:
-            groups.insert(0, {"params": rest})
-            optimiser = torch.optim.Adam(groups, lr=training.learning_rate, betas=(0.9, 0.999))
+            optimiser = torch.optim.Adam([{"params": rest}, slowly], lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimiser, lambda step: learning_rate_factor(training.schedule, min(step / training.steps, 1))
         )

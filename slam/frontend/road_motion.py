@@ -54,7 +54,7 @@ class RoadAligner:
         long = _Shape(config.far_heights, config.half_width_heights, config.sigma_share)
         near = _Shape(config.near_heights, config.near_half_width_heights, config.near_sigma_share)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-        self._strips = [_strip(intrinsics, shape, config.points) for shape in (long, near)]
+        self._strips = [_strip(intrinsics, self._top_row, shape, config.points) for shape in (long, near)]
         self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
         self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
 
@@ -107,8 +107,7 @@ class RoadAligner:
                 plane, likeness = self._refine(
                     strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
                 )
-            rows, columns = strip.rows - self._top_row, strip.columns
-            standing = _correlation(before[-1][rows, columns, 0], now[-1][rows, columns, 0])
+            standing = _correlation(*(layers[-1][strip.rows, strip.columns, 0] for layers in (before, now)))
             return plane, np.array([likeness, standing])
 
         settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
@@ -150,7 +149,7 @@ class RoadAligner:
     def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
         """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
         rays = strip.rays[::3]
-        seen = now[strip.rows[::3] - self._top_row, strip.columns[::3], 0]
+        seen = now[strip.rows[::3], strip.columns[::3], 0]
         turned, shift = rays @ T_unit[:3, :3].T, np.outer(rays @ normal, T_unit[:3, 3])
         costs = []
         for length in _LENGTHS_HEIGHTS:
@@ -171,7 +170,7 @@ class RoadAligner:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
         camera, t = self._intrinsics, T_unit[:3, 3]
         turned = strip.rays @ T_unit[:3, :3].T
-        seen = now[strip.rows - self._top_row, strip.columns, 0]
+        seen = now[strip.rows, strip.columns, 0]
         across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
             points = _ahead(turned + np.outer(strip.rays @ plane, t))
@@ -203,7 +202,7 @@ class _Shape:
 
 @dataclass(frozen=True)
 class _Strip:
-    """Pixels ``(P,)`` of the image that see a strip of a level road, and their rays ``(P, 3)``."""
+    """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(P, 3)``."""
 
     shape: _Shape
     rows: NDArray[np.int64]
@@ -211,8 +210,8 @@ class _Strip:
     rays: FloatArray
 
 
-def _strip(intrinsics: Intrinsics, shape: _Shape, points: int) -> _Strip:
-    v, u = np.mgrid[: intrinsics.height, : intrinsics.width]
+def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> _Strip:
+    v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
     x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
     depth_heights = 1.0 / np.maximum(y, 1e-6)
     seen = (depth_heights < shape.far_heights) & (np.abs(x * depth_heights) < shape.half_width_heights)

@@ -38,6 +38,15 @@ def render(T_road_camera: np.ndarray, texture: np.ndarray, index: int, car_ahead
     return Frame(index, 0.1 * index, np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
 
 
+def behind_a_car(texture: np.ndarray, rows: int) -> list[Frame]:
+    """A step of 1 m; all that the camera shows in so many rows below the horizon drives as fast as it does."""
+    car = np.random.default_rng(0).integers(0, 255, (rows, 300, 3), np.uint8)
+    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
+    for frame in frames:
+        frame.image[92 : 92 + rows, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
+    return frames
+
+
 def pitched(pitch_deg: float) -> np.ndarray:
     return se3.from_rotation_vector(np.deg2rad([pitch_deg, 0.0, 0.0]), np.zeros(3))
 
@@ -73,20 +82,13 @@ def test_a_car_ahead_does_not_shorten_the_step(texture):
 def test_a_car_that_covers_the_road_is_refused(texture):
     """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    car = np.random.default_rng(0).integers(0, 255, (90, 300, 3), np.uint8)
-    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
-    for frame in frames:
-        frame.image[92:182, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
-    refusal = RoadAligner(CONFIG, CAMERA).measure(*frames, step)
+    refusal = RoadAligner(CONFIG, CAMERA).measure(*behind_a_car(texture, rows=90), step)
     assert isinstance(refusal, Refusal) and "stands still" in refusal.reason
 
 
 def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    car = np.random.default_rng(0).integers(0, 255, (76, 300, 3), np.uint8)
-    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
-    for frame in frames:
-        frame.image[92:168, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
+    frames = behind_a_car(texture, rows=76)
     road = RoadAligner(CONFIG, CAMERA).measure(*frames, step)
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)

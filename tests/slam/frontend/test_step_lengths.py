@@ -111,14 +111,12 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     """The chains of small complements say what inverting everything says."""
     rng = np.random.default_rng(0)
     steps = 7
-    rows = [np.eye(2 * steps)]
-    for k in range(steps):
-        for a, b in ((k, steps + k), (k, k + 1), (steps + k, steps + k + 1)):
-            if b < 2 * steps and (a >= steps or b != steps or a == k == 0):
-                row = np.zeros(2 * steps)
-                row[a], row[b] = rng.normal(size=2)
-                rows.append(row[None])
-    A = np.concatenate([row for row in rows if not (np.abs(row[:, steps - 1]) * np.abs(row[:, steps])).any()])
+    pairs = [(k, steps + k) for k in range(steps)]
+    pairs += [(first + k, first + k + 1) for first in (0, steps) for k in range(steps - 1)]
+    ties = np.zeros((len(pairs), 2 * steps))
+    for row, pair in zip(ties, pairs):
+        row[list(pair)] = rng.normal(size=2)
+    A = np.concatenate([np.eye(2 * steps), ties])
     information = A.T @ A
     expected = np.sqrt(np.diag(np.linalg.inv(information))[:steps])
     banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))

@@ -16,12 +16,14 @@ from slam.config import GeometryConfig
 from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
 from slam.frontend.drive_noise import StepNoise
 from slam.frontend.epipolar import (
+    Heading,
     Structure,
     depth_in_current,
     parallax_px,
     rotation_between,
     triangulated_depth,
 )
+from slam.frontend.foresight import Foresight
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.two_view import Matches, TwoView, TwoViewEstimator
@@ -50,6 +52,7 @@ class Motion:
     relative_pose: RelativePose
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
+    two_view: TwoView | None = None
 
     def with_length(self, length: float, sigma_share: float, noise: StepNoise) -> RelativePose:
         """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there.
@@ -77,6 +80,7 @@ class GeometricOdometry:
         self._intrinsics = intrinsics
         self._tracker = CornerTracker(config, recall)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, recall)
+        self._last: tuple[Heading, float] | None = None
 
     def measure(
         self,
@@ -94,17 +98,24 @@ class GeometricOdometry:
             height_unscaled: camera height in the same unit; where known, farther depths than
                 ``max_depth_heights`` of it are not trusted.
         """
-        tracks = self._tracker.track(previous, current)
+        adjacent = current.index == previous.index + 1
+        foresight = None
+        if adjacent and self._last is not None:
+            foresight = Foresight(*self._last, depth_previous_unscaled, self._intrinsics)
+        tracks = self._tracker.track(previous, current, foresight)
         if len(tracks.previous) < self._config.min_inliers:
             return Refusal(f"only {len(tracks.previous)} corners could be followed")
         learned = _sample(depth_previous_unscaled, tracks.previous)
         depth = self._trusted(learned, height_unscaled)
         step = (previous.index, current.index)
-        return (
+        measured = (
             self._still(step, tracks, depth)
             or self._by_essential(step, tracks, learned, depth)
             or (self._by_points(step, tracks, depth))
         )
+        if adjacent:
+            self._last = None if isinstance(measured, Refusal) else _heading_and_length(measured)
+        return measured
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
@@ -155,7 +166,7 @@ class GeometricOdometry:
         solid &= depth_current > 0
         structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
         sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))
-        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction)
+        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction, two_view)
 
     def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
@@ -205,6 +216,12 @@ class GeometricOdometry:
         length = float(np.linalg.norm(translation))
         floors = np.repeat([np.deg2rad(self._config.rotation_floor_deg), _LEARNED_SIGMA_SHARE * length], 3)
         return np.asarray(np.hypot(own, floors))
+
+
+def _heading_and_length(motion: Motion) -> tuple[Heading, float] | None:
+    T_current_previous = invert(motion.relative_pose.T_from_to)
+    length = float(np.linalg.norm(T_current_previous[:3, 3]))
+    return (Heading(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length) if length > 0 else None
 
 
 def _sigmas(

@@ -1,9 +1,13 @@
-"""Corners followed from image to image: Shi-Tomasi, pyramidal Lucas-Kanade, checked backwards."""
+"""Corners followed from image to image: Shi-Tomasi, pyramidal Lucas-Kanade, checked backwards.
+
+Where the next image is foreseen, corners are followed twice, as they are and through their foreseen change of shape,
+and go where their windows look more alike.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,10 +15,13 @@ from numpy.typing import NDArray
 
 from slam.config import GeometryConfig
 from slam.frames import Frame, Image
+from slam.frontend.foresight import Foresight, Grey, Pixels
 from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray
 
 _REMEMBERED = 4
+# what is left to find is small where motion was foreseen
+_FORESEEN_LEVELS = 2
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
@@ -39,32 +46,31 @@ class CornerTracker:
         self._seen: OrderedDict[int, _Seen] = OrderedDict()
         self._named = 0
 
-    def track(self, previous: Frame, current: Frame) -> Tracks:
-        """Corners of ``previous`` found again in ``current``."""
+    def track(self, previous: Frame, current: Frame, foresight: Foresight | None = None) -> Tracks:
+        """Corners of ``previous`` found again in ``current``, with what is foreseen of it, if anything."""
         first, second = self._see(previous), self._see(current)
         if first.corners is None:
             self._fill(first, _no_corners())
         assert first.corners is not None
-        forward, kept = self._found_again(first, second, first.corners.pixels)
+        forward, kept = self._found_again(first, second, first.corners.pixels, foresight)
         names = first.corners.names[kept]
         if second.corners is None:
             self._fill(second, _Corners(forward[kept], names))
         return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
 
     def _found_again(
-        self, first: _Seen, second: _Seen, points: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        self, first: _Seen, second: _Seen, points: Pixels, foresight: Foresight | None
+    ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Where points ``(M, 2)`` went and which can be believed, sought wider where they are few."""
         config = self._config
 
-        def follow() -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-            forward, kept = self._follow(first, second, points, config.window_px)
-            if kept.sum() < config.few_corners:
-                alike = _Seen(second.image, _exposed_like(second.grey, first.grey))
-                wider, kept_wider = self._follow(first, alike, points, config.wide_window_px)
-                if kept_wider.sum() > kept.sum():
-                    return wider, kept_wider
-            return forward, kept
+        def follow() -> tuple[Pixels, NDArray[np.bool_]]:
+            found = self._follow(first.grey, second.grey, points, config.window_px, foresight)
+            if found.kept.sum() < config.few_corners:
+                alike = _exposed_like(second.grey, first.grey)
+                wider = self._follow(first.grey, alike, points, config.wide_window_px, foresight)
+                found = max(found, wider, key=lambda way: way.kept.sum())
+            return found.pixels, found.kept
 
         settings = (
             config.window_px,
@@ -73,8 +79,9 @@ class CornerTracker:
             config.pyramid_levels,
             config.forward_backward_px,
         )
-        forward, kept = self._recall("corners found again", (first.image, second.image, points, repr(settings)), follow)
-        return forward, kept
+        given = (first.image, second.image, points, repr(settings), *(() if foresight is None else foresight.given))
+        pixels, kept = self._recall("corners found again", given, follow)
+        return pixels, kept
 
     def _see(self, frame: Frame) -> _Seen:
         seen = self._seen.get(frame.index)
@@ -101,7 +108,7 @@ class CornerTracker:
             self._named += len(fresh)
         seen.corners = _Corners(pixels, names)
 
-    def _fresh(self, grey: NDArray[np.uint8], pixels: NDArray[np.float32], room: int) -> NDArray[np.float32]:
+    def _fresh(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
         """At most ``room`` corners ``(M, 2)`` away from those known."""
         config = self._config
         free = np.full(grey.shape, 255, np.uint8)
@@ -112,41 +119,57 @@ class CornerTracker:
         )
         return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
-    def _follow(
-        self, first: _Seen, second: _Seen, points: NDArray[np.float32], side: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Where points ``(M, 2)`` went, and which of them can be believed: those that come back to where they were."""
-        forward, found = self._flow(first, second, points, side)
-        backward, found_back = self._flow(second, first, forward, side)
-        error = np.abs(backward - points).max(axis=1, initial=0.0)
-        height, width = second.grey.shape
-        inside = (forward >= 0).all(axis=1) & (forward <= [width - 1, height - 1]).all(axis=1)
-        return forward, found & found_back & inside & (error < self._config.forward_backward_px)
+    def _follow(self, first: Grey, second: Grey, points: Pixels, side: int, foresight: Foresight | None) -> _Found:
+        """Where points ``(M, 2)`` went, and which of them can be believed."""
+        found = self._there_and_back(first, second, points, side, self._config.pyramid_levels)
+        if foresight is not None:
+            undone = self._there_and_back(first, foresight.undone(second), points, side, _FORESEEN_LEVELS)
+            better = undone.kept & (~found.kept | (undone.unlike < found.unlike))
+            pixels = np.where(better[:, None], foresight.in_current(undone.pixels), found.pixels)
+            found = replace(found, pixels=pixels, kept=found.kept | better)
+        height, width = second.shape
+        inside = (found.pixels >= 0).all(axis=1) & (found.pixels <= [width - 1, height - 1]).all(axis=1)
+        return replace(found, kept=found.kept & inside)
 
-    def _flow(
-        self, first: _Seen, second: _Seen, points: NDArray[np.float32], side: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _there_and_back(self, first: Grey, second: Grey, points: Pixels, side: int, levels: int) -> _Found:
+        """Points ``(M, 2)`` followed forwards; kept are those that come back to where they were."""
         if len(points) == 0:
-            return points, np.zeros(0, dtype=bool)
-        moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            first.grey,
-            second.grey,
-            points.reshape(-1, 1, 2),
-            None,
-            winSize=(side, side),
-            maxLevel=self._config.pyramid_levels,
-            criteria=_CRITERIA,
-        )
-        return moved.reshape(-1, 2), status.ravel().astype(bool)
+            return _Found(points, np.zeros(0, dtype=bool), np.zeros(0, np.float32))
+
+        def flow(start: Grey, end: Grey, pixels: Pixels) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
+            moved, status, unlike = cv2.calcOpticalFlowPyrLK(
+                start,
+                end,
+                pixels.reshape(-1, 1, 2),
+                None,
+                winSize=(side, side),
+                maxLevel=levels,
+                criteria=_CRITERIA,
+            )
+            return moved.reshape(-1, 2), status.ravel().astype(bool), unlike.ravel()
+
+        forward, found, unlike = flow(first, second, points)
+        backward, found_back, _ = flow(second, first, forward)
+        error = np.abs(backward - points).max(axis=1)
+        return _Found(forward, found & found_back & (error < self._config.forward_backward_px), unlike)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where points went ``(M, 2)``, which are ``kept`` ``(M,)``, and how far their windows differ ``(M,)``."""
+
+    pixels: Pixels
+    kept: NDArray[np.bool_]
+    unlike: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class _Corners:
-    pixels: NDArray[np.float32]
+    pixels: Pixels
     names: NDArray[np.int64]
 
 
-def _exposed_like(grey: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _exposed_like(grey: Grey, other: Grey) -> Grey:
     """An image ``(H, W)`` with the grey levels of another: each level takes that of the same rank."""
     ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
     levels = np.interp(ranks, ranks_other, np.arange(256.0))
@@ -160,5 +183,5 @@ def _no_corners() -> _Corners:
 @dataclass
 class _Seen:
     image: Image
-    grey: NDArray[np.uint8]
+    grey: Grey
     corners: _Corners | None = None

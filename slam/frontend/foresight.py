@@ -1,0 +1,69 @@
+"""The next image as learned depth and the motion so far foretell it, so that corners can be followed through it.
+
+Seen from a moving car a window on the road stretches by a fifth from frame to frame, one on a near wall by a tenth. A
+tracker that only shifts windows follows whatever part of one has most texture: single corners err by half a pixel, and
+those on the road all together upwards, which looks like a camera that pitches (``docs/design/0013``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import DepthMap, Intrinsics
+from slam.frontend.epipolar import Heading
+from slam.memory import Given
+from slam.se3 import FloatArray
+
+_FARTHEST = 1e6
+_NEAREST = 1e-6
+
+Grey = NDArray[np.uint8]
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Foresight:
+    """Where the pixels of an image go by a motion of ``heading`` and ``length`` through ``depth_previous``.
+
+    ``length`` and depth ``(H, W)`` are in one unit; where there is no depth, the scene is taken to be far.
+    """
+
+    heading: Heading
+    length: float
+    depth_previous: DepthMap
+    intrinsics: Intrinsics
+
+    @property
+    def given(self) -> tuple[Given, ...]:
+        """All that it depends on but the camera, for a memory."""
+        return self.heading.R_current_previous, self.length * self.heading.direction, self.depth_previous
+
+    def undone(self, current: Grey) -> Grey:
+        """The later image ``(H, W)`` with the foreseen motion undone: what is foreseen right stands where it stood."""
+        return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+    def in_current(self, pixels: Pixels) -> Pixels:
+        """Where pixels ``(M, 2)`` of the undone image lie in the later one."""
+        if len(pixels) == 0:
+            return pixels
+        u, v = np.ascontiguousarray(pixels.T)
+        moved = cv2.remap(self._current, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved, dtype=np.float32).reshape(-1, 2)
+
+    @cached_property
+    def _current(self) -> NDArray[np.float32]:
+        """Pixels of the later image ``(H, W, 2)`` by those of the earlier one."""
+        depth = self.depth_previous
+        known = np.where(np.isfinite(depth) & (depth > 0), depth, _FARTHEST).astype(np.float64)
+        K_inverse = np.linalg.inv(self.intrinsics.K)
+        height, width = depth.shape
+        v, u = np.mgrid[:height, :width]
+        rays: FloatArray = np.stack([u, v, np.ones_like(u)], axis=-1) @ K_inverse.T
+        moved = rays @ self.heading.R_current_previous.T + (self.length / known)[..., None] * self.heading.direction
+        imaged = moved @ self.intrinsics.K.T
+        return np.asarray(imaged[..., :2] / np.maximum(imaged[..., 2:], _NEAREST), dtype=np.float32)

@@ -60,6 +60,7 @@ class GeometryConfig(Section):
     clear_share: float = Field(default=0.75, ge=0, le=1, description="share of inliers that ends the search")
     depth_sigma_share: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
     habit_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the direction around the usual one")
+    steering_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the direction that a turn tells")
     min_inliers: int = Field(default=20, ge=8, description="fewer refuse the measurement")
     still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
     min_parallax_px: float = Field(

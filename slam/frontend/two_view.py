@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
 from slam.frontend.epipolar import Heading, cross, heading_by_essential, heading_by_points, triangulated_depth
+from slam.frontend.steering import SteeredHeading, Steering
 from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 
@@ -26,6 +27,8 @@ _OVERSTEP = 1.4
 _CONVERGED = 1e-5
 _MAD_TO_SIGMA = 1.4826
 _LEAST_POINTS = 8
+# neighbouring corners err together: beside other evidence, sigmas of independent ones are widened by this
+_CORRELATION = 2.0
 _REMEMBERED = 100
 _LEAST_REMEMBERED = 10
 _RESECTION_PX = 2.0
@@ -75,6 +78,7 @@ class TwoViewEstimator:
         self._recall = recall
         self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
         self._depth_shares: deque[float] = deque(maxlen=_REMEMBERED)
+        self._steering = Steering(float(np.deg2rad(config.steering_sigma_deg)))
         self._last: Heading | None = None
 
     def estimate(self, matches: Matches) -> TwoView | None:
@@ -90,10 +94,11 @@ class TwoViewEstimator:
         if not found:
             return None
         best = max(found, key=lambda candidate: _support(candidate, belief))
-        self._last = best.heading
         self._directions.append(best.heading.direction)
         self._depth_shares.append(self._depth_share(matches, best.heading))
-        return best
+        steered = self._steering.steered(SteeredHeading(best.heading, _CORRELATION**2 * best.covariance))
+        self._last = steered.heading
+        return TwoView(steered.heading, steered.covariance / _CORRELATION**2, best.inliers)
 
     def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
         def propose() -> Answer:

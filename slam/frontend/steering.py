@@ -1,0 +1,107 @@
+"""A vehicle goes where it is steered: its direction of motion follows from its turn, up to a fraction of a degree.
+
+What corners say of a direction and of a turn is bound together: with few of them, a camera that slides to the right can
+hardly be told from one that turns to the left, and the errors of both are correlated by 0.8 (``docs/design/0013``). How
+direction and turn of this drive belong together is seen from the steps before; whatever is known of the direction then
+mends the turn. On a camera that goes anywhere the relation is loose, and says nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam.frontend.epipolar import Heading
+from slam.se3 import FloatArray
+
+_REMEMBERED = 200
+_LEAST_REMEMBERED = 20
+_REWEIGHTINGS = 4
+_STUDENT_FREEDOM = 4.0
+_WIDEST_SIGMA = np.deg2rad(20.0)
+_SIGMAS_TRIED = 24
+# how far the direction may follow a turn, before any is seen
+_SLOPE_SIGMA = 2.0
+# an innovation of so many sigmas has half its weight
+_HALF_WEIGHT_SIGMAS = 2.0
+
+
+@dataclass(frozen=True)
+class SteeredHeading:
+    """A ``heading`` and its ``covariance`` ``(6, 6)``, rotation then direction, both in the current camera, radians."""
+
+    heading: Heading
+    covariance: FloatArray
+
+
+class Steering:
+    """How the turns and directions of one drive belong together, learned from one step after the other."""
+
+    def __init__(self, least_sigma: float) -> None:
+        """Nothing seen yet.
+
+        Args:
+            least_sigma: of the direction that a turn foretells, radians.
+        """
+        self._sigmas = np.geomspace(least_sigma, max(_WIDEST_SIGMA, least_sigma), _SIGMAS_TRIED)
+        self._turns: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._covariances: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+
+    def steered(self, measured: SteeredHeading) -> SteeredHeading:
+        """A measurement and what the turns before say of it, joined; the measurement itself is then remembered.
+
+        One step of a Kalman filter, with less weight for what does not fit.
+        """
+        turn = Rotation.from_matrix(measured.heading.R_current_previous).as_rotvec()
+        joined = measured if len(self._turns) < _LEAST_REMEMBERED else self._joined(measured, turn)
+        self._turns.append(turn)
+        self._directions.append(measured.heading.direction)
+        self._covariances.append(measured.covariance[3:, 3:])
+        return joined
+
+    def _joined(self, measured: SteeredHeading, turn: FloatArray) -> SteeredHeading:
+        axis = np.median(self._directions, axis=0)
+        aside = np.linalg.svd(axis[None])[2][1:].T  # (3, 2)
+        if axis @ measured.heading.direction <= 0:  # it reverses
+            return measured
+        foretold, variance = self._foretold(aside, turn)
+        C = measured.covariance
+        to_direction = C[:, 3:] @ aside  # (6, 2)
+        innovation = foretold - aside.T @ measured.heading.direction
+        information = np.linalg.inv(aside.T @ to_direction[3:] + np.diag(variance))
+        surprise = float(innovation @ information @ innovation)
+        gain = to_direction @ information / (1.0 + surprise / _HALF_WEIGHT_SIGMAS**2)
+        mended = gain @ innovation
+        R_current_previous = Rotation.from_rotvec(mended[:3]).as_matrix() @ measured.heading.R_current_previous
+        direction = measured.heading.direction + mended[3:]
+        heading = Heading(R_current_previous, direction / np.linalg.norm(direction))
+        covariance = C - gain @ to_direction.T
+        return SteeredHeading(heading, 0.5 * (covariance + covariance.T))
+
+    def _foretold(self, aside: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both sideways components of the direction ``(2,)`` after a turn, and their variances ``(2,)``.
+
+        A line through the turns seen, fitted by reweighting; how closely directions keep to it, beside their own
+        errors, is what makes them most likely under Student's t.
+        """
+        turns = np.column_stack([np.ones(len(self._turns)), np.array(self._turns)])  # (N, 4)
+        seen = np.array(self._directions) @ aside  # (N, 2)
+        own = np.einsum("ic,nij,jc->nc", aside, np.array(self._covariances), aside)
+        lines = np.zeros((4, 2))
+        lines[0] = np.median(seen, axis=0)
+        ridge = np.diag([0.0, *(3 * [_SLOPE_SIGMA**-2.0])])
+        for _ in range(_REWEIGHTINGS):
+            squared = (seen - turns @ lines) ** 2
+            variance = self._sigmas[:, None, None] ** 2 + own
+            share = squared / variance
+            cost = np.log(variance) + (_STUDENT_FREEDOM + 1.0) * np.log1p(share / _STUDENT_FREEDOM)
+            sigma = self._sigmas[cost.sum(axis=1).argmin(axis=0)]
+            weights = 1.0 / (sigma**2 + own + squared / _HALF_WEIGHT_SIGMAS**2)
+            information = np.einsum("nc,ni,nj->cij", weights, turns, turns) + ridge
+            lines = np.linalg.solve(information, np.einsum("nc,ni,nc->ci", weights, turns, seen)[..., None])[..., 0].T
+        now = np.concatenate([[1.0], turn])
+        return now @ lines, sigma**2 + np.linalg.solve(information, np.tile(now, (2, 1))[..., None])[..., 0] @ now

@@ -68,13 +68,13 @@ class GeometryConfig(Section):
     )
     min_point_parallax_px: float = Field(default=2.0, gt=0, description="least parallax of a point measuring length")
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
-    rotation_floor_deg: float = Field(default=0.01, gt=0, description="least rotation sigma")
-    direction_floor_deg: float = Field(default=0.05, gt=0, description="least sigma of the translation's direction")
-    shake_rotation_share: float = Field(default=0.3, ge=0, description="rotation sigma, share of the camera's shake")
-    shake_direction_share: float = Field(default=8.0, ge=0, description="sigma of the direction, likewise")
-    turn_rotation_share: float = Field(default=0.01, ge=0, description="rotation sigma, share of the step's turn")
-    jolt_rotation_share: float = Field(default=0.2, ge=0, description="rotation sigma, share of the jump to neighbours")
-    jolt_direction_share: float = Field(default=0.5, ge=0, description="sigma of the direction, likewise")
+    rotation_floor_deg: float = Field(default=0.002, gt=0, description="least rotation sigma")
+    direction_floor_deg: float = Field(default=0.045, gt=0, description="least sigma of the translation's direction")
+    shake_rotation_share: float = Field(default=0.33, ge=0, description="rotation sigma, share of the camera's shake")
+    shake_direction_share: float = Field(default=8.5, ge=0, description="sigma of the direction, likewise")
+    turn_rotation_share: float = Field(default=0.015, ge=0, description="rotation sigma, share of the step's turn")
+    jolt_rotation_share: float = Field(default=0.25, ge=0, description="rotation sigma, share of the jump to neighbours")
+    jolt_direction_share: float = Field(default=1.0, ge=0, description="sigma of the direction, likewise")
 
 
 class RoadConfig(Section):
@@ -99,10 +99,10 @@ class RoadConfig(Section):
 class LengthConfig(Section):
     """Lengths of all steps at once, see ``frontend/step_lengths.py``; sigmas of logarithms."""
 
-    ratio_sigma: float = Field(default=0.003, gt=0, description="least sigma of a step over the one before")
-    ratio_widening: float = Field(default=3.0, gt=0, description="sigmas that points give, widened by this")
+    ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of a step over the one before")
+    ratio_widening: float = Field(default=1.5, gt=0, description="sigmas that points give, widened by this")
     learned_sigma: float = Field(default=0.1, gt=0, description="of a length by learned depth")
-    unit_walk_sigma: float = Field(default=0.01, gt=0, description="how far learned depth's unit walks in a step")
+    unit_walk_sigma: float = Field(default=0.007, gt=0, description="how far learned depth's unit walks in a step")
     unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
     max_contradiction: float = Field(default=2.5, gt=1, description="largest factor from the length by learned depth")
     outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")

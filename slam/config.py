@@ -73,7 +73,9 @@ class GeometryConfig(Section):
     shake_rotation_share: float = Field(default=0.33, ge=0, description="rotation sigma, share of the camera's shake")
     shake_direction_share: float = Field(default=8.5, ge=0, description="sigma of the direction, likewise")
     turn_rotation_share: float = Field(default=0.015, ge=0, description="rotation sigma, share of the step's turn")
-    jolt_rotation_share: float = Field(default=0.25, ge=0, description="rotation sigma, share of the jump to neighbours")
+    jolt_rotation_share: float = Field(
+        default=0.25, ge=0, description="rotation sigma, share of the jump to neighbours"
+    )
     jolt_direction_share: float = Field(default=1.0, ge=0, description="sigma of the direction, likewise")
 
 

@@ -123,7 +123,8 @@ class RelativePose:
     """A measured ``T_from_to`` between two frames and its noise.
 
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
-    translation in the units of the measurement. ``source`` names who measured it.
+    translation in the units of the measurement. ``source`` names who measured it. ``chain_sigmas`` ``(6,)``, where
+    errors of neighbours are alike: independent errors of these sigmas would add up along a chain as those do.
     """
 
     from_index: int
@@ -131,6 +132,12 @@ class RelativePose:
     T_from_to: FloatArray
     sigmas: FloatArray
     source: str
+    chain_sigmas: FloatArray | None = None
+
+    @property
+    def graph_sigmas(self) -> FloatArray:
+        """Sigmas ``(6,)`` for a graph, which takes the errors of its factors to be independent."""
+        return self.sigmas if self.chain_sigmas is None else self.chain_sigmas
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

@@ -24,7 +24,7 @@ def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera
     T_from_to = np.array([edge.T_from_to for edge in relative_poses]).reshape(-1, 4, 4)
     lines = [f"VERTEX_SE3:QUAT {k} {pose}" for k, pose in enumerate(_g2o_poses(T_world_camera))]
     lines += [
-        f"EDGE_SE3:QUAT {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.sigmas)}"
+        f"EDGE_SE3:QUAT {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.graph_sigmas)}"
         for edge, pose in zip(relative_poses, _g2o_poses(T_from_to), strict=True)
     ]
     text = "\n".join(lines) + "\n"

@@ -255,7 +255,8 @@ class SlamPipeline:
         step = measured.from_index
         if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
             length, sigma_share = float(scale.lengths[step]), float(scale.length_sigmas[step])
-            return seen.motions[step].with_length(length, sigma_share, drive[step])
+            chain_sigma_share = float(scale.length_chain_sigmas[step])
+            return seen.motions[step].with_length(length, sigma_share, chain_sigma_share, drive[step])
         return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

@@ -304,7 +304,8 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
 def _differ(old: RelativePose, new: RelativePose) -> bool:
     """Whether a measurement has changed by more than nothing to speak of."""
     moved = np.abs(old.T_from_to - new.T_from_to).max()
-    return bool(moved > _SAME_SHARE * new.sigmas.min() or np.abs(old.sigmas / new.sigmas - 1.0).max() > _SAME_SHARE)
+    widened = np.abs(old.graph_sigmas / new.graph_sigmas - 1.0).max()
+    return bool(moved > _SAME_SHARE * new.sigmas.min() or widened > _SAME_SHARE)
 
 
 def _anchor(pose: Any) -> Any:
@@ -312,7 +313,7 @@ def _anchor(pose: Any) -> Any:
 
 
 def _between(edge: RelativePose, kernel: str, config: PoseGraphConfig) -> Any:
-    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(edge.sigmas, dtype=np.float64))
+    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(edge.graph_sigmas, dtype=np.float64))
     if kernel != "none":
         estimators = gtsam.noiseModel.mEstimator
         huber = kernel == "huber"
@@ -327,8 +328,9 @@ def _check(edge: RelativePose) -> None:
         raise SlamError(f"{name} must link two different frames")
     if not is_se3(edge.T_from_to, tolerance=1e-5):
         raise SlamError(f"{name} is not a finite rigid transform")
-    if edge.sigmas.shape != (6,) or not (np.isfinite(edge.sigmas).all() and (edge.sigmas > 0).all()):
-        raise SlamError(f"{name} needs six positive sigmas; got {edge.sigmas}")
+    for sigmas in (edge.sigmas, edge.graph_sigmas):
+        if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+            raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
 
 
 def _pose3(T_a_b: FloatArray) -> Any:

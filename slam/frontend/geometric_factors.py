@@ -54,12 +54,15 @@ class Motion:
     direction_sigmas: FloatArray | None = None
     two_view: TwoView | None = None
 
-    def with_length(self, length: float, sigma_share: float, noise: StepNoise) -> RelativePose:
+    def with_length(
+        self, length: float, sigma_share: float, chain_sigma_share: float, noise: StepNoise
+    ) -> RelativePose:
         """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there.
 
         Args:
             length: in the unit wanted.
             sigma_share: its relative sigma.
+            chain_sigma_share: that of independent errors which add up along the steps as those of the lengths do.
             noise: of rotation and direction, beside the corners' own.
         """
         if self.direction_sigmas is None:
@@ -68,8 +71,10 @@ class Motion:
         T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
         rotation = np.hypot(self.relative_pose.sigmas[:3], noise.rotation)
         direction = np.hypot(self.direction_sigmas, noise.direction)
-        sigmas = _sigmas(T_previous_current, rotation, direction, sigma_share)
-        return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas)
+        sigmas, chain_sigmas = (
+            _sigmas(T_previous_current, rotation, direction, share) for share in (sigma_share, chain_sigma_share)
+        )
+        return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, chain_sigmas=chain_sigmas)
 
 
 class GeometricOdometry:

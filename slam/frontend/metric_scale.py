@@ -30,7 +30,8 @@ class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in the mode's unit.
 
     ``lengths`` ``(N - 1,)`` are those of the steps between frames, NaN where only the networks measured them, and
-    ``length_sigmas`` ``(N - 1,)`` their relative sigmas.
+    ``length_sigmas`` ``(N - 1,)`` their relative sigmas, ``length_chain_sigmas`` those of independent errors which add
+    up along the steps as theirs do.
     """
 
     mode: ScaleMode
@@ -38,6 +39,7 @@ class Scale:
     per_frame: FloatArray
     lengths: FloatArray
     length_sigmas: FloatArray
+    length_chain_sigmas: FloatArray
 
     def in_unit_of(self, other: ScaleEstimate | Refusal) -> Scale:
         """The same lengths times an estimate that was made in this unit; unchanged by a refusal."""
@@ -98,7 +100,7 @@ def find_scale(
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(believed, Refusal):
         logger.warning("no scale (%s): lengths stay in the networks' unit", believed.reason)
-    return Scale(mode, estimate, per_frame, solved.length, solved.sigma_share)
+    return Scale(mode, estimate, per_frame, solved.length, solved.sigma_share, solved.chain_sigma_share)
 
 
 def _height_by_lidar(metres: Mapping[int, float], road_steps: Mapping[int, RoadStep]) -> float | None:

@@ -148,8 +148,9 @@ def rescaled(relative_pose: RelativePose, scale: float) -> RelativePose:
     """A measurement in other units: translation and its sigmas times ``scale``."""
     T_from_to = relative_pose.T_from_to.copy()
     T_from_to[:3, 3] *= scale
-    sigmas = relative_pose.sigmas * np.repeat([1.0, scale], 3)
-    return replace(relative_pose, T_from_to=T_from_to, sigmas=sigmas)
+    units = np.repeat([1.0, scale], 3)
+    chain_sigmas = None if relative_pose.chain_sigmas is None else relative_pose.chain_sigmas * units
+    return replace(relative_pose, T_from_to=T_from_to, sigmas=relative_pose.sigmas * units, chain_sigmas=chain_sigmas)
 
 
 @functools.lru_cache(maxsize=4)

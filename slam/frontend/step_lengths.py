@@ -28,6 +28,7 @@ _MAD_TO_SIGMA = 1.4826
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
+_MOST_ALIKE = 0.999
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,14 @@ class StepEvidence:
 class StepLengths:
     """``length`` ``(S,)`` of each step and its relative sigma ``sigma_share`` ``(S,)``, NaN where nothing measured it.
 
+    Steps that are tied by ratios err alike. Independent errors of ``chain_sigma_share`` ``(S,)`` would add up along the
+    drive as those of the lengths do.
     The factor ``unit_correction`` ``(S,)`` times the believed unit of learned depth is its unit near that step.
     """
 
     length: FloatArray
     sigma_share: FloatArray
+    chain_sigma_share: FloatArray
     unit_correction: FloatArray
 
 
@@ -140,15 +144,21 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     known = np.where(measured, 1.0, np.nan)
-    sigmas = marginal_sigmas(information, steps)
-    return StepLengths(known * np.exp(state[:steps]), known * sigmas, np.exp(state[steps:]))
+    sigmas, alike = marginals(information, steps)
+    chain_sigmas = sigmas * np.sqrt((1.0 + alike) / (1.0 - alike))
+    return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * chain_sigmas, np.exp(state[steps:]))
 
 
-def marginal_sigmas(information: csc_array, steps: int) -> FloatArray:
-    """Sigma ``(S,)`` of every length that an information matrix ``(2 S, 2 S)`` of lengths, then units, leaves.
+def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArray]:
+    """What an information matrix ``(2 S, 2 S)`` of lengths, then units, leaves of every length.
 
     Only neighbours are tied to each other, so what all steps before and all steps after say of one are two chains of
     2x2 Schur complements.
+
+    Returns:
+        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
+        Errors whose correlation falls by a factor r from step to step have a sum of ``(1 + r) / (1 - r)`` times the
+        variance of independent ones.
     """
     main, neighbour = information.diagonal(), information.diagonal(1)
     own = np.zeros((steps, 2, 2))
@@ -160,7 +170,11 @@ def marginal_sigmas(information: csc_array, steps: int) -> FloatArray:
     for k in range(1, steps):
         before[k] -= tie[k - 1] @ np.linalg.inv(before[k - 1]) @ tie[k - 1]
         after[-k - 1] -= tie[-k - 1] @ np.linalg.inv(after[-k]) @ tie[-k - 1]
-    return np.asarray(np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0]))
+    sigmas = np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0])
+    pairs = np.block([[before[:-1], tie[:-1]], [tie[:-1], after[1:]]])  # (S - 1, 4, 4)
+    alike = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_ALIKE)
+    ends = alike[:1], alike[-1:]
+    return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], alike]) + np.concatenate([alike, ends[1]]))
 
 
 @dataclass(frozen=True)

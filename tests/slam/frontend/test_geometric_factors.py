@@ -199,21 +199,23 @@ def test_a_length_from_elsewhere_keeps_rotation_and_direction(texture):
     motion = measure(truth, texture, lambda depth: 2.0 * depth)
     assert isinstance(motion, Motion)
     length = float(np.linalg.norm(truth[:3, 3]))
-    metric = motion.with_length(length, 0.03, CALM)
+    metric = motion.with_length(length, 0.03, 0.09, CALM)
     np.testing.assert_array_equal(metric.T_from_to[:3, :3], motion.relative_pose.T_from_to[:3, :3])
     np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
     np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
     assert 0.03 <= metric.sigmas[5] < 0.035
     still = measure(np.eye(4), texture)
     with pytest.raises(ValueError, match="by still has no direction"):
-        still.with_length(1.0, 0.03, CALM)
+        still.with_length(1.0, 0.03, 0.09, CALM)
 
 
 def test_the_noise_of_the_drive_widens_what_corners_promise(texture):
     motion = measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture)
     assert isinstance(motion, Motion)
-    calm = motion.with_length(2.0, 0.03, CALM).sigmas
-    rough = motion.with_length(2.0, 0.03, StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))).sigmas
+    calm = motion.with_length(2.0, 0.03, 0.09, CALM).sigmas
+    rough = motion.with_length(
+        2.0, 0.03, 0.09, StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))
+    ).sigmas
     np.testing.assert_allclose(rough[:3], np.hypot(calm[:3], [0.01, 0.02, 0.0]))
     np.testing.assert_allclose(rough[3:5], np.hypot(calm[3:5], 2.0 * 0.05), rtol=0.01)
     assert rough[5] == pytest.approx(calm[5], rel=0.02)

@@ -57,6 +57,7 @@ class GeometryConfig(Section):
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")
+    along_px: float = Field(default=0.4, gt=0, description="noise of a corner along its line, beside learned depth's")
     clear_share: float = Field(default=0.75, ge=0, le=1, description="share of inliers that ends the search")
     depth_sigma_share: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
     habit_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the direction around the usual one")
@@ -68,7 +69,9 @@ class GeometryConfig(Section):
     )
     min_point_parallax_px: float = Field(default=2.0, gt=0, description="least parallax of a point measuring length")
     max_depth_heights: float = Field(default=30.0, gt=0, description="farthest trusted depth, in camera heights")
-    rotation_floor_deg: float = Field(default=0.002, gt=0, description="least rotation sigma")
+    rotation_floor_deg: float = Field(
+        default=0.002, gt=0, description="least rotation sigma of a motion by all corners"
+    )
     direction_floor_deg: float = Field(default=0.045, gt=0, description="least sigma of the translation's direction")
     shake_rotation_share: float = Field(default=0.33, ge=0, description="rotation sigma, share of the camera's shake")
     shake_direction_share: float = Field(default=8.5, ge=0, description="sigma of the direction, likewise")
@@ -184,7 +187,7 @@ class LoopsConfig(Section):
     agreement_deg: float = Field(default=2.0, gt=0, description="largest difference of both directions' rotations")
     agreement_share: float = Field(default=0.1, gt=0, description="of their positions, as a share of the depth")
     corner_sigma_widening: float = Field(default=1.25, gt=0, description="corners' own sigmas are widened by this")
-    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma")
+    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma of a motion by all corners")
     translation_floor_share: float = Field(default=0.0003, gt=0, description="least translation sigma, share of depth")
     length_sigma_share: float = Field(default=0.04, gt=0, description="translation sigma, share of the translation")
     max_drift_share: float = Field(default=0.3, gt=0, description="largest correction, as a share of the way between")

@@ -37,6 +37,8 @@ _MAD_TO_SIGMA = 1.4826
 _MIN_RATIOS = 8
 _LEARNED_SIGMA_SHARE = 0.1
 _LEARNED_LENGTH_SHARE = 0.05
+# least rotation sigma of a camera that stands still, or whose motion points alone determine
+_LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 # neighbouring corners err together: the covariance of independent ones is widened by this
 _CORRELATION = 2.0
 
@@ -140,8 +142,8 @@ class GeometricOdometry:
         # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
-        rotation = np.deg2rad(self._config.rotation_floor_deg)
-        return Motion(RelativePose(*step, np.eye(4), np.repeat([rotation, translation], 3), STILL_SOURCE))
+        sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
+        return Motion(RelativePose(*step, np.eye(4), sigmas, STILL_SOURCE))
 
     def _by_essential(
         self, step: tuple[int, int], tracks: Tracks, learned: FloatArray, depth: FloatArray
@@ -219,7 +221,7 @@ class GeometricOdometry:
         J = jacobian[:, :6]
         own = _CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
         length = float(np.linalg.norm(translation))
-        floors = np.repeat([np.deg2rad(self._config.rotation_floor_deg), _LEARNED_SIGMA_SHARE * length], 3)
+        floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_SIGMA_SHARE * length], 3)
         return np.asarray(np.hypot(own, floors))
 
 

@@ -147,7 +147,9 @@ class TwoViewEstimator:
                 return ()
             return found.heading.R_current_previous, found.heading.direction, found.covariance, found.inliers
 
-        settings = repr((belief.depth_share, belief.axis_sigma, self._config.inlier_px, self._focal_px))
+        settings = repr(
+            (belief.depth_share, belief.axis_sigma, self._config.inlier_px, self._config.along_px, self._focal_px)
+        )
         corners = (matches.rays_previous, matches.rays_current, matches.depth_previous)
         begin = (start.R_current_previous, start.direction, belief.axis)
         known = self._recall("motion by all", (*corners, *begin, settings), refine)
@@ -168,7 +170,7 @@ class TwoViewEstimator:
             across, by_motion = across * self._focal_px, by_motion * self._focal_px
             along, by_all, shift_px = _along(matches, heading, length, tangent, self._focal_px)
             near = np.abs(across) < self._config.inlier_px
-            sigma_along = np.hypot(1.0, belief.depth_share * shift_px)
+            sigma_along = np.hypot(self._config.along_px, belief.depth_share * shift_px)
             inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
             if inliers.sum() < _LEAST_POINTS:
                 return None

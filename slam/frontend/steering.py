@@ -9,7 +9,6 @@ mends the turn. On a camera that goes anywhere the relation is loose, and says n
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,14 +28,6 @@ _SLOPE_SIGMA = 2.0
 _HALF_WEIGHT_SIGMAS = 2.0
 
 
-@dataclass(frozen=True)
-class SteeredHeading:
-    """A ``heading`` and its ``covariance`` ``(6, 6)``, rotation then direction, both in the current camera, radians."""
-
-    heading: Heading
-    covariance: FloatArray
-
-
 class Steering:
     """How the turns and directions of one drive belong together, learned from one step after the other."""
 
@@ -51,36 +42,43 @@ class Steering:
         self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
         self._covariances: deque[FloatArray] = deque(maxlen=_REMEMBERED)
 
-    def steered(self, measured: SteeredHeading) -> SteeredHeading:
-        """A measurement and what the turns before say of it, joined; the measurement itself is then remembered.
+    def steered(self, heading: Heading, covariance: FloatArray) -> tuple[Heading, FloatArray]:
+        """A measurement joined with what the turns before say of it; the measurement itself is then remembered.
 
         One step of a Kalman filter, with less weight for what does not fit.
+
+        Args:
+            heading: measured.
+            covariance: its own ``(6, 6)``, rotation then direction, both in the current camera, radians.
+
+        Returns:
+            The same of both together.
         """
-        turn = Rotation.from_matrix(measured.heading.R_current_previous).as_rotvec()
-        joined = measured if len(self._turns) < _LEAST_REMEMBERED else self._joined(measured, turn)
+        turn = Rotation.from_matrix(heading.R_current_previous).as_rotvec()
+        joined = heading, covariance
+        if len(self._turns) >= _LEAST_REMEMBERED:
+            joined = self._joined(heading, covariance, turn)
         self._turns.append(turn)
-        self._directions.append(measured.heading.direction)
-        self._covariances.append(measured.covariance[3:, 3:])
+        self._directions.append(heading.direction)
+        self._covariances.append(covariance[3:, 3:])
         return joined
 
-    def _joined(self, measured: SteeredHeading, turn: FloatArray) -> SteeredHeading:
+    def _joined(self, heading: Heading, covariance: FloatArray, turn: FloatArray) -> tuple[Heading, FloatArray]:
         axis = np.median(self._directions, axis=0)
         aside = np.linalg.svd(axis[None])[2][1:].T  # (3, 2)
-        if axis @ measured.heading.direction <= 0:  # it reverses
-            return measured
+        if axis @ heading.direction <= 0:  # it reverses
+            return heading, covariance
         foretold, variance = self._foretold(aside, turn)
-        C = measured.covariance
-        to_direction = C[:, 3:] @ aside  # (6, 2)
-        innovation = foretold - aside.T @ measured.heading.direction
+        to_direction = covariance[:, 3:] @ aside  # (6, 2)
+        innovation = foretold - aside.T @ heading.direction
         information = np.linalg.inv(aside.T @ to_direction[3:] + np.diag(variance))
         surprise = float(innovation @ information @ innovation)
         gain = to_direction @ information / (1.0 + surprise / _HALF_WEIGHT_SIGMAS**2)
         mended = gain @ innovation
-        R_current_previous = Rotation.from_rotvec(mended[:3]).as_matrix() @ measured.heading.R_current_previous
-        direction = measured.heading.direction + mended[3:]
-        heading = Heading(R_current_previous, direction / np.linalg.norm(direction))
-        covariance = C - gain @ to_direction.T
-        return SteeredHeading(heading, 0.5 * (covariance + covariance.T))
+        R_current_previous = Rotation.from_rotvec(mended[:3]).as_matrix() @ heading.R_current_previous
+        direction = heading.direction + mended[3:]
+        left = covariance - gain @ to_direction.T
+        return Heading(R_current_previous, direction / np.linalg.norm(direction)), 0.5 * (left + left.T)
 
     def _foretold(self, aside: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Both sideways components of the direction ``(2,)`` after a turn, and their variances ``(2,)``.

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
 from slam.frontend.epipolar import Heading, cross, heading_by_essential, heading_by_points, triangulated_depth
-from slam.frontend.steering import SteeredHeading, Steering
+from slam.frontend.steering import Steering
 from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 
@@ -96,9 +96,8 @@ class TwoViewEstimator:
         best = max(found, key=lambda candidate: _support(candidate, belief))
         self._directions.append(best.heading.direction)
         self._depth_shares.append(self._depth_share(matches, best.heading))
-        steered = self._steering.steered(SteeredHeading(best.heading, _CORRELATION**2 * best.covariance))
-        self._last = steered.heading
-        return TwoView(steered.heading, steered.covariance / _CORRELATION**2, best.inliers)
+        self._last, covariance = self._steering.steered(best.heading, _CORRELATION**2 * best.covariance)
+        return TwoView(self._last, covariance / _CORRELATION**2, best.inliers)
 
     def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
         def propose() -> Answer:

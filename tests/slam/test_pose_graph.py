@@ -126,6 +126,19 @@ def test_coverage_is_honest_and_knows_the_scale():
             coverage(bad[0], truth, bad[1])
 
 
+def test_a_chain_that_errs_together_yields_to_a_loop_and_boasts_of_no_more():
+    """The graph weighs ``chain_sigmas``; coverage is that of the single factor."""
+    truth, edges, _, loops, initial = noisy_problem()
+    chained = [replace(each, chain_sigmas=4.0 * each.sigmas) for each in edges]
+    looser = [replace(each, sigmas=4.0 * each.sigmas) for each in edges]
+    solved, solved_looser, stiff = (solve([*each, *loops], initial)[1] for each in (chained, looser, edges))
+    np.testing.assert_array_equal(solved, solved_looser)
+    assert np.abs(solved - stiff).max() > 1e-3
+    assert coverage(chained, truth, 1.0) == coverage(edges, truth, 1.0)
+    with pytest.raises(SlamError, match="six positive sigmas"):
+        PoseGraph(PoseGraphConfig()).add_relative(replace(edges[0], chain_sigmas=np.zeros(6)))
+
+
 def test_coverage_tells_which_kind_of_factor_is_not_honest():
     truth, odometry, _, loops, _ = noisy_problem(count=600)
     boasting = [replace(loop, sigmas=loop.sigmas / 10) for loop in loops]

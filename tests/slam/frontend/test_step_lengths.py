@@ -118,10 +118,37 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
         row[list(pair)] = rng.normal(size=2)
     A = np.concatenate([np.eye(2 * steps), ties])
     information = A.T @ A
-    expected = np.sqrt(np.diag(np.linalg.inv(information))[:steps])
+    left = np.linalg.inv(information)[:steps, :steps]
+    expected = np.sqrt(np.diag(left))
+    alike = np.clip(np.diag(left, 1) / (expected[1:] * expected[:-1]), 0.0, 1.0)
     banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))
     assert (information[(banded != 0) & (banded != 1) & (banded != steps)] == 0).all()
-    np.testing.assert_allclose(marginals(csc_array(information), steps)[0], expected, rtol=1e-9)
+    sigmas, with_neighbours = marginals(csc_array(information), steps)
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
+    both_sides = 0.5 * (np.append(alike[0], alike) + np.append(alike, alike[-1]))
+    np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
+
+
+def test_lengths_tied_to_their_neighbours_add_up_as_they_say() -> None:
+    """Over 40 steps, errors of ``chain_sigma_share`` that are independent come to what the lengths' errors come to."""
+    middle = slice(80, 120)
+    alone, together = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        chained = np.full(STEPS, np.nan)
+        chained[1:] = np.diff(np.log(TRUE)) + 0.02 * rng.normal(size=STEPS - 1)
+        measured = evidence(
+            absolute=noisy(0.06, seed=300 + seed),
+            absolute_sigma=np.full(STEPS, 0.06),
+            ratio=chained,
+            ratio_sigma=np.full(STEPS, 0.02 / CONFIG.ratio_widening),
+        )
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        summed = np.log(solved.length / TRUE)[middle].sum()
+        alone.append(summed / np.linalg.norm(solved.sigma_share[middle]))
+        together.append(summed / np.linalg.norm(solved.chain_sigma_share[middle]))
+    assert 0.75 < np.sqrt(np.square(together).mean()) < 1.3
+    assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
 def test_sigmas_say_how_far_lengths_err() -> None:

@@ -54,6 +54,9 @@ class GeometryConfig(Section):
     wide_window_px: int = Field(default=31, ge=5, le=63, description="its side where few corners could be followed")
     few_corners: int = Field(default=60, ge=0, description="fewer are few: they are sought again, exposure made alike")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
+    foresight: bool = Field(
+        default=True, description="follow corners also through the view that learned depth and the last motion foretell"
+    )
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")

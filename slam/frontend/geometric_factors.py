@@ -107,7 +107,7 @@ class GeometricOdometry:
         """
         adjacent = current.index == previous.index + 1
         foresight = None
-        if adjacent and self._last is not None:
+        if self._config.foresight and adjacent and self._last is not None:
             foresight = Foresight(*self._last, depth_previous_unscaled, self._intrinsics)
         tracks = self._tracker.track(previous, current, foresight)
         if len(tracks.previous) < self._config.min_inliers:

@@ -43,6 +43,8 @@ ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("geometry.enabled=false",),
+    "corners followed as they are": ("geometry.foresight=false",),
+    "no direction from turns": (f"geometry.steering_sigma_deg={_NEVER}",),
     "no lengths from the road's motion": ("road.enabled=false",),
     "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
@@ -50,6 +52,9 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no noise from the drive": (
         "geometry.shake_rotation_share=0",
         "geometry.shake_direction_share=0",
+        "geometry.turn_rotation_share=0",
+        "geometry.jolt_rotation_share=0",
+        "geometry.jolt_direction_share=0",
     ),
     "no bridging": ("bridging.enabled=false",),
     "network factors on every step": ("frontend.use=always",),

@@ -54,7 +54,6 @@ class Motion:
     relative_pose: RelativePose
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
-    two_view: TwoView | None = None
 
     def with_length(
         self, length: float, sigma_share: float, chain_sigma_share: float, noise: StepNoise
@@ -173,7 +172,7 @@ class GeometricOdometry:
         solid &= depth_current > 0
         structure = Structure(tracks.names[solid], triangulated[solid], depth_current[solid], sigma_share[solid])
         sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_SHARE))
-        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction, two_view)
+        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), structure, direction)
 
     def _essential_sigmas(self, two_view: TwoView) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""

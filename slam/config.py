@@ -190,7 +190,7 @@ class LoopsConfig(Section):
     agreement_deg: float = Field(default=2.0, gt=0, description="largest difference of both directions' rotations")
     agreement_share: float = Field(default=0.1, gt=0, description="of their positions, as a share of the depth")
     corner_sigma_widening: float = Field(default=1.25, gt=0, description="corners' own sigmas are widened by this")
-    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma of a motion by all corners")
+    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma")
     translation_floor_share: float = Field(default=0.0003, gt=0, description="least translation sigma, share of depth")
     length_sigma_share: float = Field(default=0.04, gt=0, description="translation sigma, share of the translation")
     max_drift_share: float = Field(default=0.3, gt=0, description="largest correction, as a share of the way between")

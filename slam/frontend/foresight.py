@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.epipolar import Heading
 from slam.memory import Given
-from slam.se3 import FloatArray
 
 _FARTHEST = 1e6
 _NEAREST = 1e-6
@@ -40,8 +39,9 @@ class Foresight:
 
     @property
     def given(self) -> tuple[Given, ...]:
-        """All that it depends on but the camera, for a memory."""
-        return self.heading.R_current_previous, self.length * self.heading.direction, self.depth_previous
+        """All that it depends on, for a memory."""
+        moved = self.length * self.heading.direction
+        return self.heading.R_current_previous, moved, self.depth_previous, repr(self.intrinsics)
 
     def undone(self, current: Grey) -> Grey:
         """The later image ``(H, W)`` with the foreseen motion undone: what is foreseen right stands where it stood."""
@@ -57,13 +57,14 @@ class Foresight:
 
     @cached_property
     def _current(self) -> NDArray[np.float32]:
-        """Pixels of the later image ``(H, W, 2)`` by those of the earlier one."""
+        """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
         depth = self.depth_previous
-        known = np.where(np.isfinite(depth) & (depth > 0), depth, _FARTHEST).astype(np.float64)
-        K_inverse = np.linalg.inv(self.intrinsics.K)
+        near = 1.0 / np.where(np.isfinite(depth) & (depth > 0), depth, _FARTHEST).astype(np.float64)
+        K = self.intrinsics.K
+        turned = K @ self.heading.R_current_previous @ np.linalg.inv(K)
+        moved = self.length * K @ self.heading.direction
         height, width = depth.shape
-        v, u = np.mgrid[:height, :width]
-        rays: FloatArray = np.stack([u, v, np.ones_like(u)], axis=-1) @ K_inverse.T
-        moved = rays @ self.heading.R_current_previous.T + (self.length / known)[..., None] * self.heading.direction
-        imaged = moved @ self.intrinsics.K.T
-        return np.asarray(imaged[..., :2] / np.maximum(imaged[..., 2:], _NEAREST), dtype=np.float32)
+        u, v = np.arange(width), np.arange(height)[:, None]
+        x, y, z = (row[0] * u + row[1] * v + row[2] + shift * near for row, shift in zip(turned, moved, strict=True))
+        ahead = np.maximum(z, _NEAREST)
+        return np.stack([x / ahead, y / ahead], axis=-1, dtype=np.float32, casting="same_kind")

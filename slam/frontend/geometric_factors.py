@@ -26,7 +26,7 @@ from slam.frontend.epipolar import (
 from slam.frontend.foresight import Foresight
 from slam.frontend.refusal import Refusal
 from slam.frontend.tracking import CornerTracker, Tracks
-from slam.frontend.two_view import Matches, TwoView, TwoViewEstimator
+from slam.frontend.two_view import CORNER_CORRELATION, Matches, TwoView, TwoViewEstimator
 from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray, invert, make
 
@@ -39,8 +39,6 @@ _LEARNED_SIGMA_SHARE = 0.1
 _LEARNED_LENGTH_SHARE = 0.05
 # least rotation sigma of a camera that stands still, or whose motion points alone determine
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
-# neighbouring corners err together: the covariance of independent ones is widened by this
-_CORRELATION = 2.0
 
 
 @dataclass(frozen=True)
@@ -218,7 +216,7 @@ class GeometricOdometry:
         residual = (projected.reshape(-1, 2) - pixels).ravel()
         sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 0.1)
         J = jacobian[:, :6]
-        own = _CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
+        own = CORNER_CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
         length = float(np.linalg.norm(translation))
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_SIGMA_SHARE * length], 3)
         return np.asarray(np.hypot(own, floors))
@@ -261,4 +259,4 @@ def _length(ratios: FloatArray, triangulation_sigma_share: FloatArray) -> tuple[
     centre = float(logarithms[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
     deviation = _MAD_TO_SIGMA * float(np.median(np.abs(logarithms - centre)))
     # learned depth errs in patches, not pixels: count one independent measurement in ten
-    return float(np.exp(centre)), _CORRELATION * deviation / float(np.sqrt(max(len(ratios) / 10.0, 1.0)))
+    return float(np.exp(centre)), CORNER_CORRELATION * deviation / float(np.sqrt(max(len(ratios) / 10.0, 1.0)))

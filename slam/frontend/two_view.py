@@ -27,8 +27,6 @@ _OVERSTEP = 1.4
 _CONVERGED = 1e-5
 _MAD_TO_SIGMA = 1.4826
 _LEAST_POINTS = 8
-# neighbouring corners err together: beside other evidence, sigmas of independent ones are widened by this
-_CORRELATION = 2.0
 _REMEMBERED = 100
 _LEAST_REMEMBERED = 10
 _RESECTION_PX = 2.0
@@ -36,6 +34,8 @@ _RESECTION_PX = 2.0
 _ALONG_SIGMAS = 2.5
 # an outlier costs as much as this half-squared residual
 _OUTLIER_COST = 3.0
+# neighbouring corners err together: beside other evidence, sigmas of independent ones are widened by this
+CORNER_CORRELATION = 2.0
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class TwoViewEstimator:
         best = max(found, key=lambda candidate: _support(candidate, belief))
         self._directions.append(best.heading.direction)
         self._depth_shares.append(self._depth_share(matches, best.heading))
-        self._last, covariance = self._steering.steered(best.heading, _CORRELATION**2 * best.covariance)
-        return TwoView(self._last, covariance / _CORRELATION**2, best.inliers)
+        self._last, covariance = self._steering.steered(best.heading, CORNER_CORRELATION**2 * best.covariance)
+        return TwoView(self._last, covariance / CORNER_CORRELATION**2, best.inliers)
 
     def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
         def propose() -> Answer:

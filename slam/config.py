@@ -57,6 +57,9 @@ class GeometryConfig(Section):
     foresight: bool = Field(
         default=True, description="follow corners also through the view that learned depth and the last motion foretell"
     )
+    span_steps: int = Field(
+        default=2, ge=1, le=3, description="turns are also measured across so many steps at once; 1: they are not"
+    )
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import cv2
+import numpy as np
 
 from erfsfm.inference import leave_a_core
 from slam.config import SlamConfig
@@ -21,8 +22,10 @@ from slam.frontend.inspection import FrameGate
 from slam.frontend.refusal import Refusal
 from slam.frontend.road_motion import RoadAligner, RoadStep
 from slam.frontend.scale import RoadPlane, fit_road
+from slam.frontend.spans import Span
 from slam.loops.descriptors import FeatureExtractor, View
 from slam.memory import Recall, compute_anew
+from slam.se3 import chain
 from slam.spool import Spool, Spooled
 from slam.timing import Stopwatch
 
@@ -52,13 +55,15 @@ class Keyframe:
 class Observations:
     """What one pass over the frames saw, in the networks' unit of length.
 
-    ``motions`` and ``road_steps`` hold what geometry and the road measured of the step from a frame to the next.
+    ``motions`` and ``road_steps`` hold what geometry and the road measured of the step from a frame to the next,
+    ``spans`` the turns across several steps.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
     geometric: list[RelativePose] = field(default_factory=list)
     motions: dict[int, Motion] = field(default_factory=dict)
     road_steps: dict[int, RoadStep] = field(default_factory=dict)
+    spans: list[Span] = field(default_factory=list)
     refusals: list[tuple[int, int, str]] = field(default_factory=list)
     roads: list[RoadPlane | Refusal] = field(default_factory=list)
     views: list[View] = field(default_factory=list)
@@ -118,7 +123,9 @@ class Observer:
         self._features = FeatureExtractor(config.loops, intrinsics, recall)
         self._steps = config.geometry.steps if config.geometry.enabled else ()
         self._window: deque[Frame] = deque(maxlen=predictor.sources + 1)
-        self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(maxlen=max(self._steps, default=1))
+        self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(
+            maxlen=max(*self._steps, config.geometry.span_steps, 1)
+        )
         self._unread = 0
         self._spool = Spool()
         self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=leave_a_core)
@@ -190,6 +197,7 @@ class Observer:
             asked_snippet = self._networks.submit(lambda: self._predictor.snippet(list(self._window)))
         with self._watch.stage("geometry"):
             moved = self._measure_geometry(frame)
+            self._measure_span(frame)
         with self._watch.stage("road"):
             self._finish_road()
         if moved is not None and self._config.road.enabled:
@@ -226,6 +234,18 @@ class Observer:
                 self.seen.motions[previous.index] = measured
                 moved = previous, measured
         return moved
+
+    def _measure_span(self, current: Frame) -> None:
+        """The turn across the last steps, where each of them was measured."""
+        wanted = self._config.geometry.span_steps
+        steps = range(current.index - wanted, current.index)
+        if wanted < 2 or len(self._recent) < wanted or not all(step in self.seen.motions for step in steps):
+            return
+        first, depth_first, _ = self._recent[-wanted]
+        T_first_current = chain(np.array([self.seen.motions[step].relative_pose.T_from_to for step in steps]))[-1]
+        span = self._geometry.measure_span(first, current, depth_first, T_first_current)
+        if span is not None:
+            self.seen.spans.append(span)
 
     def _ask_road(self, moved: tuple[Frame, Motion], current: Frame) -> None:
         previous, motion = moved

@@ -26,6 +26,7 @@ from slam.frontend.network_factors import (
     without_measured,
 )
 from slam.frontend.scale import rescaled, resolve_mode, scale_from_reference
+from slam.frontend.spans import Turn, steadied
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
@@ -138,6 +139,7 @@ class SlamPipeline:
     def measure(self, mode: ScaleMode, observations: Observations) -> Measurements:
         """What the front end makes of the observations: lengths, factors, dead reckoning."""
         T_network = chain_raw(observations.snippets, len(self._sequence))
+        observations = _steadied(observations)
         lidar = self._follow_lidar()
         scale = self._find_scale(mode, observations, lidar, T_network)
         factors = self._measure(observations, lidar, scale)
@@ -287,3 +289,17 @@ class SlamPipeline:
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)
+
+
+def _steadied(seen: Observations) -> Observations:
+    """The same with turns mended by those across several steps."""
+    turns = {
+        step: Turn(invert(motion.relative_pose.T_from_to)[:3, :3], motion.relative_pose.sigmas[:3])
+        for step, motion in seen.motions.items()
+    }
+    motions = {step: seen.motions[step].with_turn(R) for step, R in steadied(turns, seen.spans).items()}
+    geometric = [
+        motions[g.from_index].relative_pose if g.to_index == g.from_index + 1 and g.from_index in motions else g
+        for g in seen.geometric
+    ]
+    return replace(seen, motions=motions, geometric=geometric)

@@ -25,6 +25,7 @@ from slam.frontend.epipolar import (
 )
 from slam.frontend.foresight import Foresight
 from slam.frontend.refusal import Refusal
+from slam.frontend.spans import Span
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.two_view import CORNER_CORRELATION, Matches, TwoView, TwoViewEstimator
 from slam.memory import Recall, compute_anew
@@ -52,6 +53,11 @@ class Motion:
     relative_pose: RelativePose
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
+
+    def with_turn(self, R_current_previous: FloatArray) -> Motion:
+        """The same way seen from the current camera, with another turn ``(3, 3)``."""
+        T_current_previous = make(R_current_previous, invert(self.relative_pose.T_from_to)[:3, 3])
+        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=invert(T_current_previous)))
 
     def with_length(
         self, length: float, sigma_share: float, chain_sigma_share: float, noise: StepNoise
@@ -118,8 +124,35 @@ class GeometricOdometry:
             or (self._by_points(step, tracks, depth))
         )
         if adjacent:
-            self._last = None if isinstance(measured, Refusal) else _heading_and_length(measured)
+            self._last = (
+                None if isinstance(measured, Refusal) else _heading_and_length(measured.relative_pose.T_from_to)
+            )
         return measured
+
+    def measure_span(
+        self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
+    ) -> Span | None:
+        """The turn between frames some steps apart, both measured already; None where too few corners tell.
+
+        Args:
+            first: the earlier frame.
+            last: the later frame.
+            depth_first_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
+            T_first_last: the motion as its steps were measured, unscaled.
+        """
+        known = _heading_and_length(T_first_last)
+        if known is None:
+            return None
+        tracks = self._tracker.track_across(first, last, Foresight(*known, depth_first_unscaled, self._intrinsics))
+        if len(tracks.previous) < self._config.min_inliers:
+            return None
+        learned = _sample(depth_first_unscaled, tracks.previous)
+        matches = Matches(self._rays(tracks.previous), self._rays(tracks.current), learned)
+        found = self._two_views.refined(matches, known[0])
+        if found is None or found.inliers.sum() < self._config.min_inliers:
+            return None
+        sigmas = np.sqrt(np.diag(found.covariance)[:3])
+        return Span(first.index, last.index, found.heading.R_current_previous, sigmas)
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
@@ -222,8 +255,8 @@ class GeometricOdometry:
         return np.asarray(np.hypot(own, floors))
 
 
-def _heading_and_length(motion: Motion) -> tuple[Heading, float] | None:
-    T_current_previous = invert(motion.relative_pose.T_from_to)
+def _heading_and_length(T_previous_current: FloatArray) -> tuple[Heading, float] | None:
+    T_current_previous = invert(T_previous_current)
     length = float(np.linalg.norm(T_current_previous[:3, 3]))
     return (Heading(T_current_previous[:3, :3], T_current_previous[:3, 3] / length), length) if length > 0 else None
 

@@ -58,6 +58,27 @@ class CornerTracker:
             self._fill(second, _Corners(forward[kept], names))
         return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
 
+    def track_across(self, previous: Frame, current: Frame, foresight: Foresight) -> Tracks:
+        """Corners of ``previous`` that were followed to the next frame, found again in a later one that is foreseen."""
+        first, second = self._see(previous), self._see(current)
+        following = self._seen.get(previous.index + 1)
+        if first.corners is None or following is None or following.corners is None:
+            return Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64))
+        followed = np.isin(first.corners.names, following.corners.names)
+        points, names = first.corners.pixels[followed], first.corners.names[followed]
+
+        def follow() -> tuple[Pixels, NDArray[np.bool_]]:
+            found = self._there_and_back(
+                first.grey, foresight.undone(second.grey), points, self._config.window_px, _FORESEEN_LEVELS
+            )
+            found = _inside(replace(found, pixels=foresight.in_current(found.pixels)), second.grey)
+            return found.pixels, found.kept
+
+        settings = repr((self._config.window_px, self._config.forward_backward_px))
+        given = first.image, second.image, points, settings, *foresight.given
+        pixels, kept = self._recall("corners across a span", given, follow)
+        return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), names[kept])
+
     def _found_again(
         self, first: _Seen, second: _Seen, points: Pixels, foresight: Foresight | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
@@ -127,9 +148,7 @@ class CornerTracker:
             better = undone.kept & (~found.kept | (undone.unlike < found.unlike))
             pixels = np.where(better[:, None], foresight.in_current(undone.pixels), found.pixels)
             found = replace(found, pixels=pixels, kept=found.kept | better)
-        height, width = second.shape
-        inside = (found.pixels >= 0).all(axis=1) & (found.pixels <= [width - 1, height - 1]).all(axis=1)
-        return replace(found, kept=found.kept & inside)
+        return _inside(found, second)
 
     def _there_and_back(self, first: Grey, second: Grey, points: Pixels, side: int, levels: int) -> _Found:
         """Points ``(M, 2)`` followed forwards; kept are those that come back to where they were."""
@@ -167,6 +186,13 @@ class _Found:
 class _Corners:
     pixels: Pixels
     names: NDArray[np.int64]
+
+
+def _inside(found: _Found, image: Grey) -> _Found:
+    """The same without those that left the image."""
+    height, width = image.shape
+    inside = (found.pixels >= 0).all(axis=1) & (found.pixels <= [width - 1, height - 1]).all(axis=1)
+    return replace(found, kept=found.kept & inside)
 
 
 def _exposed_like(grey: Grey, other: Grey) -> Grey:

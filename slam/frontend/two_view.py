@@ -99,6 +99,12 @@ class TwoViewEstimator:
         self._last, covariance = self._steering.steered(best.heading, CORNER_CORRELATION**2 * best.covariance)
         return TwoView(self._last, covariance / CORNER_CORRELATION**2, best.inliers)
 
+    def refined(self, matches: Matches, start: Heading) -> TwoView | None:
+        """The motion that corners agree on near one that is well known; it is not remembered."""
+        share = max(self._config.depth_sigma_share, float(np.median(self._depth_shares)) if self._depth_shares else 0.0)
+        belief = _Belief(share, start.direction, float(np.deg2rad(self._config.habit_sigma_deg)))
+        return self._refined(matches, start, belief)
+
     def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
         def propose() -> Answer:
             found = heading_by_essential(first, second, tolerance)

@@ -24,6 +24,7 @@ from slam.frontend.epipolar import (
     triangulated_depth,
 )
 from slam.frontend.foresight import Foresight
+from slam.frontend.movers import Movers
 from slam.frontend.refusal import Refusal
 from slam.frontend.spans import Span
 from slam.frontend.tracking import CornerTracker, Tracks
@@ -89,6 +90,7 @@ class GeometricOdometry:
         self._config = config
         self._intrinsics = intrinsics
         self._tracker = CornerTracker(config, recall)
+        self._movers = Movers(intrinsics.width, intrinsics.height)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, recall)
         self._last: tuple[Heading, float] | None = None
 
@@ -147,7 +149,8 @@ class GeometricOdometry:
         if len(tracks.previous) < self._config.min_inliers:
             return None
         learned = _sample(depth_first_unscaled, tracks.previous)
-        matches = Matches(self._rays(tracks.previous), self._rays(tracks.current), learned)
+        weights = self._movers.weights(tracks.previous)
+        matches = Matches(self._rays(tracks.previous), self._rays(tracks.current), learned, weights)
         found = self._two_views.refined(matches, known[0])
         if found is None or found.inliers.sum() < self._config.min_inliers:
             return None
@@ -185,7 +188,10 @@ class GeometricOdometry:
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
-        two_view = self._two_views.estimate(Matches(rays_previous, rays_current, learned))
+        weights = self._movers.weights(tracks.previous)
+        two_view = self._two_views.estimate(Matches(rays_previous, rays_current, learned, weights))
+        if two_view is not None:
+            self._movers.learn(tracks.current, two_view.inliers)
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
             return None
         heading = two_view.heading

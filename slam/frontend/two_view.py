@@ -27,6 +27,7 @@ _OVERSTEP = 1.4
 _CONVERGED = 1e-5
 _MAD_TO_SIGMA = 1.4826
 _LEAST_POINTS = 8
+_LEAST_PROPOSING_WEIGHT = 0.2
 _REMEMBERED = 100
 _LEAST_REMEMBERED = 10
 _RESECTION_PX = 2.0
@@ -40,11 +41,15 @@ CORNER_CORRELATION = 2.0
 
 @dataclass(frozen=True)
 class Matches:
-    """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN."""
+    """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
+
+    ``weights`` ``(M,)`` in (0, 1] say how far each is to be believed.
+    """
 
     rays_previous: FloatArray
     rays_current: FloatArray
     depth_previous: FloatArray
+    weights: FloatArray
 
 
 @dataclass(frozen=True)
@@ -83,12 +88,15 @@ class TwoViewEstimator:
 
     def estimate(self, matches: Matches) -> TwoView | None:
         """Rotation and direction of the next motion; None where corners agree on none."""
-        first, second = matches.rays_previous, matches.rays_current
+        believed = matches.weights >= _LEAST_PROPOSING_WEIGHT
+        first, second = matches.rays_previous[believed], matches.rays_current[believed]
         proposed = self._proposed(first, second, self._config.inlier_px / self._focal_px)
         belief = self._belief(matches, proposed)
         candidates = [self._refined(matches, proposed, belief)]
         if candidates[0] is None or candidates[0].inliers.mean() < self._config.clear_share:
-            by_points = heading_by_points(first, second, matches.depth_previous, _RESECTION_PX / self._focal_px)
+            by_points = heading_by_points(
+                first, second, matches.depth_previous[believed], _RESECTION_PX / self._focal_px
+            )
             candidates += [self._refined(matches, other, belief) for other in (by_points, self._last)]
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
@@ -155,7 +163,7 @@ class TwoViewEstimator:
         settings = repr(
             (belief.depth_share, belief.axis_sigma, self._config.inlier_px, self._config.along_px, self._focal_px)
         )
-        corners = (matches.rays_previous, matches.rays_current, matches.depth_previous)
+        corners = (matches.rays_previous, matches.rays_current, matches.depth_previous, matches.weights)
         begin = (start.R_current_previous, start.direction, belief.axis)
         known = self._recall("motion by all", (*corners, *begin, settings), refine)
         return TwoView(Heading(known[0], known[1]), known[2], known[3].astype(bool)) if known else None
@@ -180,7 +188,7 @@ class TwoViewEstimator:
             if inliers.sum() < _LEAST_POINTS:
                 return None
             sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(across[near]))), 1e-3 * self._config.inlier_px)
-            weights = inliers / (1.0 + (across / (2.0 * sigma)) ** 2)
+            weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
             weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
             weights = weights / sigma**2
             normal = by_all.T @ (weights_along[:, None] * by_all) + 1e-9 * np.eye(6)
@@ -245,7 +253,8 @@ def _sampson(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sampson distances ``(M,)``, their Jacobian ``(M, 5)`` and the tangent ``(3, 2)`` of the direction.
 
-    The gradient's norm is held fixed in the Jacobian, as in reweighted least squares.
+    The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the motion by
+    the square of the corners' noise.
     """
     R, direction = heading.R_current_previous, heading.direction
     turned = rays_previous @ R.T
@@ -259,7 +268,17 @@ def _sampson(
     first = cross(direction, axis)
     first = first / np.linalg.norm(first)
     tangent = np.stack([first, cross(direction, first)], axis=1)
-    by_rotation = cross(turned, across)
-    by_direction = cross(turned, rays_current) @ tangent
+    distance = algebraic / gradient
+    slope_current, slope_previous = _flat(lines_current), _flat(lines_previous) @ R.T
+    norm_by_rotation = cross(turned, cross(slope_current, direction)) + cross(slope_previous, across)
+    norm_by_direction = cross(turned, slope_current) + cross(slope_previous, rays_current)
+    share = (distance / gradient)[:, None]
+    by_rotation = cross(turned, across) - share * norm_by_rotation
+    by_direction = (cross(turned, rays_current) - share * norm_by_direction) @ tangent
     jacobian = np.concatenate([by_rotation, by_direction], axis=1) / gradient[:, None]
-    return algebraic / gradient, jacobian, tangent
+    return distance, jacobian, tangent
+
+
+def _flat(lines: FloatArray) -> FloatArray:
+    """Lines ``(M, 3)`` with their last coefficient, which a point in the image does not move by, set to zero."""
+    return np.asarray(lines * [1.0, 1.0, 0.0])

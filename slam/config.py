@@ -60,6 +60,9 @@ class GeometryConfig(Section):
     span_steps: int = Field(
         default=2, ge=1, le=3, description="turns are also measured across so many steps at once; 1: they are not"
     )
+    mover_sharpness: float = Field(
+        default=4.0, ge=0, description="power of the share of corners that fit near one lately; 0: believe all alike"
+    )
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")

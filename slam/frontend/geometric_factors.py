@@ -90,7 +90,7 @@ class GeometricOdometry:
         self._config = config
         self._intrinsics = intrinsics
         self._tracker = CornerTracker(config, recall)
-        self._movers = Movers(intrinsics.width, intrinsics.height)
+        self._movers = Movers(intrinsics.width, intrinsics.height, config.mover_sharpness)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, recall)
         self._last: tuple[Heading, float] | None = None
 

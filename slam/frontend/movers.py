@@ -18,14 +18,20 @@ _SPREAD_CELLS = 1.5
 _KEPT = 0.9
 # so many corners' worth of belief that a place is like the rest of the image
 _BELIEVED_CORNERS = 0.5
-_SHARPNESS = 4.0
 
 
 class Movers:
     """The share of corners that fitted the camera's motion, place by place, over the last steps of one drive."""
 
-    def __init__(self, width: int, height: int) -> None:
-        """Nothing seen yet, in images of this size in pixels."""
+    def __init__(self, width: int, height: int, sharpness: float) -> None:
+        """Nothing seen yet.
+
+        Args:
+            width: of the images, pixels.
+            height: likewise.
+            sharpness: power of a place's share over the usual one; 0 believes all places alike.
+        """
+        self._sharpness = sharpness
         shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
         self._fitting, self._all = np.zeros(shape), np.zeros(shape)
 
@@ -36,7 +42,7 @@ class Movers:
         usual = self._fitting.sum() / self._all.sum()
         fitting, seen = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self._fitting, self._all))
         share = (fitting + _BELIEVED_CORNERS * usual) / (seen + _BELIEVED_CORNERS)
-        return np.asarray(np.minimum(share[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** _SHARPNESS)
+        return np.asarray(np.minimum(share[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** self._sharpness)
 
     def learn(self, pixels: FloatArray, fitting: NDArray[np.bool_]) -> None:
         """Remember which corners, now at ``pixels`` ``(M, 2)``, fitted a step's motion ``(M,)``."""

@@ -35,6 +35,8 @@ _RESECTION_PX = 2.0
 _ALONG_SIGMAS = 2.5
 # an outlier costs as much as this half-squared residual
 _OUTLIER_COST = 3.0
+# learned depth errs in patches: its sigma is widened by this where it need not choose between motions
+_PATCH_WIDENING = 3.0
 # neighbouring corners err together: beside other evidence, sigmas of independent ones are widened by this
 CORNER_CORRELATION = 2.0
 
@@ -108,9 +110,12 @@ class TwoViewEstimator:
         return TwoView(self._last, covariance / CORNER_CORRELATION**2, best.inliers)
 
     def refined(self, matches: Matches, start: Heading) -> TwoView | None:
-        """The motion that corners agree on near one that is well known; it is not remembered."""
+        """The motion that corners agree on near one that is well known; it is not remembered.
+
+        Learned depth tells motions apart, and here there is nothing left to tell apart: it weighs little.
+        """
         share = max(self._config.depth_sigma_share, float(np.median(self._depth_shares)) if self._depth_shares else 0.0)
-        belief = _Belief(share, start.direction, float(np.deg2rad(self._config.habit_sigma_deg)))
+        belief = _Belief(_PATCH_WIDENING * share, start.direction, float(np.deg2rad(self._config.habit_sigma_deg)))
         return self._refined(matches, start, belief)
 
     def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:

@@ -190,7 +190,7 @@ class GeometricOdometry:
             return None
         weights = self._movers.weights(tracks.previous)
         two_view = self._two_views.estimate(Matches(rays_previous, rays_current, learned, weights))
-        if two_view is not None:
+        if two_view is not None and step[1] == step[0] + 1:
             self._movers.learn(tracks.current, two_view.inliers)
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
             return None

@@ -147,7 +147,7 @@ class TwoViewEstimator:
 
     def _ratios(self, matches: Matches, heading: Heading) -> FloatArray:
         """Logarithms of learned over triangulated depth, of corners near their lines that shift along them."""
-        distance = _sampson(matches.rays_previous, matches.rays_current, heading)[0] * self._focal_px
+        distance = sampson(matches.rays_previous, matches.rays_current, heading)[0] * self._focal_px
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, heading)
         turned = _image(matches.rays_previous @ heading.R_current_previous.T)
         shift_px = np.linalg.norm(matches.rays_current[:, :2] - turned, axis=1) * self._focal_px
@@ -184,7 +184,7 @@ class TwoViewEstimator:
         heading, length = start, float(np.exp(np.median(ratios)))
         known = np.isfinite(matches.depth_previous)
         for iteration in range(_ITERATIONS):
-            across, by_motion, tangent = _sampson(matches.rays_previous, matches.rays_current, heading)
+            across, by_motion, tangent = sampson(matches.rays_previous, matches.rays_current, heading)
             across, by_motion = across * self._focal_px, by_motion * self._focal_px
             along, by_all, shift_px = _along(matches, heading, length, tangent, self._focal_px)
             near = np.abs(across) < self._config.inlier_px
@@ -253,7 +253,7 @@ def _ahead(points: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(points[:, 2], 1e-6))
 
 
-def _sampson(
+def sampson(
     rays_previous: FloatArray, rays_current: FloatArray, heading: Heading
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sampson distances ``(M,)``, their Jacobian ``(M, 5)`` and the tangent ``(3, 2)`` of the direction.

@@ -3,7 +3,9 @@ import numpy as np
 import pytest
 
 from slam.config import GeometryConfig
-from slam.frames import Frame
+from slam.frames import Frame, Intrinsics
+from slam.frontend.epipolar import Heading
+from slam.frontend.foresight import Foresight
 from slam.frontend.tracking import CornerTracker
 
 CONFIG = GeometryConfig(max_corners=300)
@@ -59,3 +61,22 @@ def test_few_corners_are_sought_again_under_another_exposure(frames):
     assert len(again.names) > max(2 * len(once.names), 40)
     error = np.abs(again.previous - again.current - [SHIFT_PX, 0]).max(axis=1)
     assert np.median(error) < 0.1
+
+
+def test_corners_are_found_again_two_frames_later_where_they_were_foreseen(frames):
+    tracker = CornerTracker(CONFIG)
+    tracks = [tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])]
+    camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
+    depth, sliding = np.full((120, 200), 10.0, np.float32), Heading(np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    foreseen = Foresight(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
+    across = tracker.track_across(frames[0], frames[2], foreseen)
+    assert len(across.names) > 0.8 * len(tracks[0].names)
+    assert np.isin(across.names, tracks[0].names).all()
+    error = np.abs(across.previous - across.current - [2 * SHIFT_PX, 0]).max(axis=1)
+    assert np.median(error) < 0.02 and error.max() < 0.5
+
+
+def test_corners_that_nobody_followed_are_not_found_across(frames):
+    camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
+    nothing = Foresight(Heading(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera)
+    assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing).names) == 0

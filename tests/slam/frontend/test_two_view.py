@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,9 +7,9 @@ import pytest
 from slam import se3
 from slam.config import GeometryConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.epipolar import heading_by_essential
+from slam.frontend.epipolar import Heading, heading_by_essential
 from slam.frontend.geometric_factors import GeometricOdometry, Motion
-from slam.frontend.two_view import Matches, TwoViewEstimator
+from slam.frontend.two_view import Matches, TwoViewEstimator, sampson
 from slam.sequences.simulated import SimulatedStreet, SimulationOptions
 
 CONFIG = GeometryConfig()
@@ -33,7 +34,7 @@ def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> 
     previous[:, :2] += noise[0]
     current[:, :2] += noise[1]
     learned = np.concatenate([np.full(CAR, 10.0), depth]) * np.exp(error * rng.normal(size=len(previous)))
-    return Matches(previous, current, learned), T_current_previous
+    return Matches(previous, current, learned, np.ones(len(learned))), T_current_previous
 
 
 def turned_deg(R_a: np.ndarray, R_b: np.ndarray) -> float:
@@ -41,33 +42,83 @@ def turned_deg(R_a: np.ndarray, R_b: np.ndarray) -> float:
 
 
 def test_a_car_that_turns_with_the_camera_is_no_part_of_the_world():
-    misled = 0
-    for seed in range(5):
+    """Of one step alone, nothing before it: consensus is misled nearly always, the estimator one time in four."""
+    alone, judged, of_car = [], [], []
+    for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
-        alone = heading_by_essential(matches.rays_previous, matches.rays_current, CONFIG.inlier_px / FOCAL_PX)
-        assert alone is not None
-        misled += turned_deg(alone.R_current_previous, T_current_previous[:3, :3]) > 1.0
+        heading = heading_by_essential(matches.rays_previous, matches.rays_current, CONFIG.inlier_px / FOCAL_PX)
         two_view = TwoViewEstimator(CONFIG, FOCAL_PX).estimate(matches)
-        assert two_view is not None
-        assert turned_deg(two_view.heading.R_current_previous, T_current_previous[:3, :3]) < 0.5
-        assert two_view.inliers[CAR:].mean() > 0.7
-        assert two_view.inliers[:CAR].mean() < 0.2
-    assert misled >= 3
+        assert heading is not None and two_view is not None
+        alone.append(turned_deg(heading.R_current_previous, T_current_previous[:3, :3]))
+        judged.append(turned_deg(two_view.heading.R_current_previous, T_current_previous[:3, :3]))
+        of_car.append(two_view.inliers[:CAR].mean())
+    right = np.array(judged) < 0.2
+    assert np.median(alone) > 1.5
+    assert right.mean() >= 0.7
+    assert np.median(judged) < 0.1
+    assert np.array(of_car)[right].max() < 0.2
 
 
 def test_a_wrong_unit_and_unknown_depths_do_not_matter():
     matches, T_current_previous = corner_with_a_car(0)
     learned = 0.01 * matches.depth_previous
     learned[::7] = np.nan
-    other = TwoViewEstimator(CONFIG, FOCAL_PX).estimate(Matches(matches.rays_previous, matches.rays_current, learned))
+    other = TwoViewEstimator(CONFIG, FOCAL_PX).estimate(replace(matches, depth_previous=learned))
     assert other is not None
     assert turned_deg(other.heading.R_current_previous, T_current_previous[:3, :3]) < 0.5
+
+
+def test_corners_that_are_not_believed_do_not_bend_the_motion():
+    """Learned depth says little here, so that only their weights tell the car's corners from the world's."""
+    for seed in range(6):
+        matches, T_current_previous = corner_with_a_car(seed)
+        weights = np.where(np.arange(len(matches.weights)) < CAR, 0.001, 1.0)
+        blind = replace(matches, depth_previous=np.full(len(weights), np.nan))
+        blind.depth_previous[CAR::4] = matches.depth_previous[CAR::4]
+        all_alike, weighted = (
+            TwoViewEstimator(CONFIG, FOCAL_PX).estimate(each) for each in (blind, replace(blind, weights=weights))
+        )
+        assert all_alike is not None and weighted is not None
+        assert turned_deg(all_alike.heading.R_current_previous, T_current_previous[:3, :3]) > 1.0
+        assert turned_deg(weighted.heading.R_current_previous, T_current_previous[:3, :3]) < 0.3
+
+
+def test_a_motion_that_is_well_known_is_refined_and_not_remembered():
+    matches, T_current_previous = corner_with_a_car(0, error=0.05)
+    direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
+    off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
+    estimator, other = TwoViewEstimator(CONFIG, FOCAL_PX), TwoViewEstimator(CONFIG, FOCAL_PX)
+    refined = estimator.refined(matches, Heading(off @ T_current_previous[:3, :3], direction))
+    assert refined is not None
+    assert turned_deg(refined.heading.R_current_previous, T_current_previous[:3, :3]) < 0.06
+    one, two = estimator.estimate(matches), other.estimate(matches)
+    assert one is not None and two is not None
+    np.testing.assert_array_equal(one.heading.R_current_previous, two.heading.R_current_previous)
+
+
+def test_distances_from_epipolar_lines_have_the_jacobian_that_differences_show():
+    """With corners far off their lines, where the change of the gradient's norm counts."""
+    rng = np.random.default_rng(1)
+    previous = np.column_stack([rng.uniform(-1.0, 1.0, (20, 2)), np.ones(20)])
+    current = previous + np.column_stack([rng.normal(0.0, 0.2, (20, 2)), np.zeros(20)])
+    R = se3.from_rotation_vector(np.array([0.01, 0.06, 0.02]), np.zeros(3))[:3, :3]
+    direction = np.array([0.1, -0.05, -1.0]) / np.linalg.norm([0.1, -0.05, -1.0])
+    _, jacobian, tangent = sampson(previous, current, Heading(R, direction))
+
+    def moved(step: np.ndarray) -> np.ndarray:
+        turned = se3.from_rotation_vector(step[:3], np.zeros(3))[:3, :3] @ R
+        slid = direction + tangent @ step[3:]
+        return sampson(previous, current, Heading(turned, slid / np.linalg.norm(slid)))[0]
+
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+        np.testing.assert_allclose((moved(step) - moved(-step)) / 2e-6, jacobian[:, k], atol=1e-8)
 
 
 def test_nothing_in_common_is_no_motion():
     rng = np.random.default_rng(0)
     rays = [np.column_stack([rng.uniform(-0.8, 0.8, (12, 2)), np.ones(12)]) for _ in range(2)]
-    assert TwoViewEstimator(CONFIG, FOCAL_PX).estimate(Matches(*rays, np.full(12, np.nan))) is None
+    assert TwoViewEstimator(CONFIG, FOCAL_PX).estimate(Matches(*rays, np.full(12, np.nan), np.ones(12))) is None
 
 
 @pytest.mark.parametrize("first", [264])

@@ -124,7 +124,7 @@ class Observer:
         self._steps = config.geometry.steps if config.geometry.enabled else ()
         self._window: deque[Frame] = deque(maxlen=predictor.sources + 1)
         self._recent: deque[tuple[Frame, DepthMap, float | None]] = deque(
-            maxlen=max(*self._steps, config.geometry.span_steps, 1)
+            maxlen=max((*self._steps, config.geometry.span_steps))
         )
         self._unread = 0
         self._spool = Spool()

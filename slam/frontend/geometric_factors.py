@@ -148,9 +148,7 @@ class GeometricOdometry:
         tracks = self._tracker.track_across(first, last, Foresight(*known, depth_first_unscaled, self._intrinsics))
         if len(tracks.previous) < self._config.min_inliers:
             return None
-        learned = _sample(depth_first_unscaled, tracks.previous)
-        weights = self._movers.weights(tracks.previous)
-        matches = Matches(self._rays(tracks.previous), self._rays(tracks.current), learned, weights)
+        matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous))
         found = self._two_views.refined(matches, known[0])
         if found is None or found.inliers.sum() < self._config.min_inliers:
             return None
@@ -168,6 +166,10 @@ class GeometricOdometry:
         y = (pixels[:, 1] - camera.cy) / camera.fy
         return np.stack([x, y, np.ones_like(x)], axis=1)
 
+    def _matches(self, tracks: Tracks, learned: FloatArray) -> Matches:
+        weights = self._movers.weights(tracks.previous)
+        return Matches(self._rays(tracks.previous), self._rays(tracks.current), learned, weights)
+
     def _still(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
         flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
         if flow >= self._config.still_flow_px or not np.isfinite(depth).any():
@@ -182,14 +184,14 @@ class GeometricOdometry:
         self, step: tuple[int, int], tracks: Tracks, learned: FloatArray, depth: FloatArray
     ) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        rays_previous, rays_current = self._rays(tracks.previous), self._rays(tracks.current)
+        matches = self._matches(tracks, learned)
+        rays_previous, rays_current = matches.rays_previous, matches.rays_current
         # an essential matrix of a pure rotation invents a translation: only believe one that is needed
         turned = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
-        weights = self._movers.weights(tracks.previous)
-        two_view = self._two_views.estimate(Matches(rays_previous, rays_current, learned, weights))
+        two_view = self._two_views.estimate(matches)
         if two_view is not None and step[1] == step[0] + 1:
             self._movers.learn(tracks.current, two_view.inliers)
         if two_view is None or two_view.inliers.sum() < self._config.min_inliers:

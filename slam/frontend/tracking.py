@@ -68,10 +68,8 @@ class CornerTracker:
         points, names = first.corners.pixels[followed], first.corners.names[followed]
 
         def follow() -> tuple[Pixels, NDArray[np.bool_]]:
-            found = self._there_and_back(
-                first.grey, foresight.undone(second.grey), points, self._config.window_px, _FORESEEN_LEVELS
-            )
-            found = _inside(replace(found, pixels=foresight.in_current(found.pixels)), second.grey)
+            foreseen = self._through(first.grey, second.grey, points, self._config.window_px, foresight)
+            found = _inside(foreseen, second.grey)
             return found.pixels, found.kept
 
         settings = repr((self._config.window_px, self._config.forward_backward_px))
@@ -144,11 +142,16 @@ class CornerTracker:
         """Where points ``(M, 2)`` went, and which of them can be believed."""
         found = self._there_and_back(first, second, points, side, self._config.pyramid_levels)
         if foresight is not None:
-            undone = self._there_and_back(first, foresight.undone(second), points, side, _FORESEEN_LEVELS)
-            better = undone.kept & (~found.kept | (undone.unlike < found.unlike))
-            pixels = np.where(better[:, None], foresight.in_current(undone.pixels), found.pixels)
+            foreseen = self._through(first, second, points, side, foresight)
+            better = foreseen.kept & (~found.kept | (foreseen.unlike < found.unlike))
+            pixels = np.where(better[:, None], foreseen.pixels, found.pixels)
             found = replace(found, pixels=pixels, kept=found.kept | better)
         return _inside(found, second)
+
+    def _through(self, first: Grey, second: Grey, points: Pixels, side: int, foresight: Foresight) -> _Found:
+        """Where points ``(M, 2)`` went, followed in the later image with what is foreseen undone."""
+        undone = self._there_and_back(first, foresight.undone(second), points, side, _FORESEEN_LEVELS)
+        return replace(undone, pixels=foresight.in_current(undone.pixels))
 
     def _there_and_back(self, first: Grey, second: Grey, points: Pixels, side: int, levels: int) -> _Found:
         """Points ``(M, 2)`` followed forwards; kept are those that come back to where they were."""

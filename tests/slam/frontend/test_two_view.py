@@ -43,7 +43,7 @@ def turned_deg(R_a: np.ndarray, R_b: np.ndarray) -> float:
 
 def test_a_car_that_turns_with_the_camera_is_no_part_of_the_world():
     """Of one step alone, nothing before it: consensus is misled nearly always, the estimator one time in four."""
-    alone, judged, of_car = [], [], []
+    alone, judged, of_car, of_world = [], [], [], []
     for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
         heading = heading_by_essential(matches.rays_previous, matches.rays_current, CONFIG.inlier_px / FOCAL_PX)
@@ -52,11 +52,13 @@ def test_a_car_that_turns_with_the_camera_is_no_part_of_the_world():
         alone.append(turned_deg(heading.R_current_previous, T_current_previous[:3, :3]))
         judged.append(turned_deg(two_view.heading.R_current_previous, T_current_previous[:3, :3]))
         of_car.append(two_view.inliers[:CAR].mean())
+        of_world.append(two_view.inliers[CAR:].mean())
     right = np.array(judged) < 0.2
     assert np.median(alone) > 1.5
     assert right.mean() >= 0.7
     assert np.median(judged) < 0.1
     assert np.array(of_car)[right].max() < 0.2
+    assert np.array(of_world)[right].min() > 0.7
 
 
 def test_a_wrong_unit_and_unknown_depths_do_not_matter():

@@ -3,6 +3,8 @@
 import ctypes
 import functools
 import importlib
+from contextlib import suppress
+from threading import Thread
 from types import ModuleType
 
 from slam.errors import SlamError
@@ -33,3 +35,13 @@ def import_rerun() -> ModuleType:
         return importlib.import_module("rerun")
     except (ImportError, OSError) as error:
         raise SlamError(f"--rerun needs rerun ({error}): pip install 'erfsfm-slam[rerun]', or rerun-sdk") from error
+
+
+def import_open3d_beside() -> None:
+    """Begin to import Open3D, which takes a second, in another thread; whoever needs it hears of errors."""
+
+    def begin() -> None:
+        with suppress(SlamError):
+            import_open3d()
+
+    Thread(target=begin, name="open3d").start()

@@ -141,6 +141,7 @@ class Slam:
             self._solve(measured)
 
     def _measure(self) -> Measurements | None:
+        self._observer.settle()
         if not self._observer.seen.snippets:
             return None
         return self._pipeline.measure(self._mode, self._observer.closed())

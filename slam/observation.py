@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -84,12 +85,30 @@ def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
         return error
 
 
+@dataclass(frozen=True)
+class _Arrived:
+    """A frame of which nothing but the networks was asked yet."""
+
+    frame: Frame
+    depth: Future[DepthMap]
+    snippet: Future[SnippetPoses] | None
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What another thread was asked, the stage that waits for it, and what to do with the ``answer``."""
+
+    stage: str
+    answer: Future[Any]
+    keep: Callable[[Any], None]
+
+
 class Observer:
     """Watches the frames of one sequence in time order.
 
-    The networks compute in a second thread while corners are measured in the first, and the road of a step in a third
-    while the next frame is watched. What depends on another waits for it, so that results do not depend on which of
-    them is faster.
+    The networks look at a frame in a second thread while corners of the one before are measured in the first; the road
+    of a step, and the turn across it and those before, are measured in a third. What depends on another waits for it,
+    and what nothing waits for is taken up with the next frame: results do not depend on which of them is faster.
     """
 
     def __init__(
@@ -129,8 +148,9 @@ class Observer:
         self._unread = 0
         self._spool = Spool()
         self._networks = ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=leave_a_core)
-        self._roads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="road")
-        self._asked_road: tuple[int, Future[RoadStep | Refusal]] | None = None
+        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
+        self._arrived: _Arrived | None = None
+        self._asked: list[_Asked] = []
 
     def add(self, index: int, frame: Frame | SequenceError) -> None:
         """Watch the next frame, or learn that there is no image of it.
@@ -153,7 +173,14 @@ class Observer:
                 return
             if verdict == "repeated":
                 self.seen.repeated.append(index)
-        self._observe(frame)
+        arrived = self._ask_networks(frame)
+        self._watch_arrived()
+        self._arrived = arrived
+
+    def settle(self) -> None:
+        """Finish with every frame so far; ``seen`` is complete then."""
+        self._watch_arrived()
+        self._finish_asked()
 
     def closed(self) -> Observations:
         """Everything seen so far with its gaps bridged; more frames may follow.
@@ -161,7 +188,7 @@ class Observer:
         Raises:
             SlamError: no snippet of usable frames.
         """
-        self._finish_road()
+        self.settle()
         seen = self.seen
         closed = bridge(
             len(seen.roads),
@@ -184,26 +211,35 @@ class Observer:
         )
 
     def _leave_out(self, index: int, reason: str) -> None:
+        self._watch_arrived()
         self.seen.unusable[index] = reason
         self.seen.roads.append(Refusal(reason))
         self._window.clear()
 
-    def _observe(self, frame: Frame) -> None:
-        seen = self.seen
+    def _ask_networks(self, frame: Frame) -> _Arrived:
         self._window.append(frame)
-        asked_depth = self._networks.submit(lambda: self._predictor.depth(frame))
-        asked_snippet = None
-        if len(self._window) == self._window.maxlen:
-            asked_snippet = self._networks.submit(lambda: self._predictor.snippet(list(self._window)))
+        depth = self._networks.submit(self._predictor.depth, frame)
+        if len(self._window) < self._predictor.sources + 1:
+            return _Arrived(frame, depth, None)
+        return _Arrived(frame, depth, self._networks.submit(self._predictor.snippet, list(self._window)))
+
+    def _watch_arrived(self) -> None:
+        """All but the networks, of the frame that arrived last."""
+        arrived, self._arrived = self._arrived, None
+        if arrived is None:
+            return
+        seen, frame = self.seen, arrived.frame
         with self._watch.stage("geometry"):
             moved = self._measure_geometry(frame)
-            self._measure_span(frame)
-        with self._watch.stage("road"):
-            self._finish_road()
+            span = self._span(frame)
+        self._finish_asked()
+        if arrived.snippet is not None:
+            self._asked.append(_Asked("pose network", arrived.snippet, seen.snippets.append))
+        self._asked.append(_Asked("geometry", self._beside.submit(span), self._keep_span))
         if moved is not None and self._config.road.enabled:
-            self._ask_road(moved, frame)
+            self._asked.append(self._ask_road(moved, frame))
         with self._watch.stage("depth network"):
-            depth = asked_depth.result()
+            depth = arrived.depth.result()
         with self._watch.stage("road"):
             road = fit_road(depth, self._intrinsics, self._config.scale)
         seen.roads.append(road)
@@ -213,9 +249,6 @@ class Observer:
             with self._watch.stage("loops"):
                 seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
-        if asked_snippet is not None:
-            with self._watch.stage("pose network"):
-                seen.snippets.append(asked_snippet.result())
 
     def _measure_geometry(self, current: Frame) -> tuple[Frame, Motion] | None:
         """Steps from earlier frames, by the depth of the earlier one; the frame before where its step has structure."""
@@ -235,35 +268,38 @@ class Observer:
                 moved = previous, measured
         return moved
 
-    def _measure_span(self, current: Frame) -> None:
-        """The turn across the last steps, where each of them was measured."""
+    def _span(self, current: Frame) -> Callable[[], Span | None]:
+        """How to measure the turn across the last steps, where each of them was measured."""
         wanted = self._config.geometry.span_steps
         steps = range(current.index - wanted, current.index)
         if wanted < 2 or len(self._recent) < wanted or not all(step in self.seen.motions for step in steps):
-            return
+            return lambda: None
         first, depth_first, _ = self._recent[-wanted]
         T_first_current = chain(np.array([self.seen.motions[step].relative_pose.T_from_to for step in steps]))[-1]
-        span = self._geometry.measure_span(first, current, depth_first, T_first_current)
+        return self._geometry.ask_span(first, current, depth_first, T_first_current)
+
+    def _keep_span(self, span: Span | None) -> None:
         if span is not None:
             self.seen.spans.append(span)
 
-    def _ask_road(self, moved: tuple[Frame, Motion], current: Frame) -> None:
+    def _ask_road(self, moved: tuple[Frame, Motion], current: Frame) -> _Asked:
         previous, motion = moved
         T_previous_current = motion.relative_pose.T_from_to
-        asked = self._roads.submit(lambda: self._aligner.measure(previous, current, T_previous_current))
-        self._asked_road = previous.index, asked
 
-    def _finish_road(self) -> None:
-        """Wait for the road of the last step that was asked."""
-        if self._asked_road is None:
-            return
-        step, asked = self._asked_road
-        self._asked_road = None
-        road_step = asked.result()
-        if isinstance(road_step, Refusal):
-            logger.info("road %d -> %d refused: %s", step, step + 1, road_step.reason)
-        else:
-            self.seen.road_steps[step] = road_step
+        def keep(road_step: RoadStep | Refusal) -> None:
+            if isinstance(road_step, Refusal):
+                logger.info("road %d -> %d refused: %s", previous.index, current.index, road_step.reason)
+            else:
+                self.seen.road_steps[previous.index] = road_step
+
+        return _Asked("road", self._beside.submit(self._aligner.measure, previous, current, T_previous_current), keep)
+
+    def _finish_asked(self) -> None:
+        """Wait for what was asked of the last frame."""
+        for asked in self._asked:
+            with self._watch.stage(asked.stage):
+                asked.keep(asked.answer.result())
+        self._asked.clear()
 
     def _keep(self, frame: Frame, depth: DepthMap) -> None:
         """Remember thinned frames for the map, and a few whole ones for the report."""

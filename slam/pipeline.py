@@ -12,6 +12,7 @@ import numpy as np
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
+from slam.foreign import import_open3d_beside
 from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive_noise import StepNoise, drive_noise
@@ -117,6 +118,8 @@ class SlamPipeline:
     def estimate(self) -> SlamResult:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
         mode = self._require_possible()
+        if self._config.mapping.enabled:
+            import_open3d_beside()
         observations = self._observe()
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
@@ -56,6 +55,7 @@ from slam.summary import (
     finite,
     null,
 )
+from slam.threads import one_thread_each
 from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -128,7 +128,7 @@ def run_slam(
         try:
             _seed(seed)
             pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall)
-            with threadpool_limits(1, "blas"):  # matrices are small: more threads would only wait for each other
+            with one_thread_each():
                 result = _run(folder, pipeline, recording, provenance, settings.output.report)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)

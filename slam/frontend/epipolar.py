@@ -126,9 +126,10 @@ def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, head
 
     From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
     """
-    across = cross(rays_current, rays_previous @ heading.R_current_previous.T)
-    along = -cross(rays_current, heading.direction)
-    return np.asarray((across * along).sum(axis=1) / np.maximum((across**2).sum(axis=1), 1e-18))
+    current = rays_current.T
+    across = cross(current, heading.R_current_previous @ rays_previous.T)
+    along = -cross(current, heading.direction)
+    return np.asarray((across * along).sum(axis=0) / np.maximum((across**2).sum(axis=0), 1e-18))
 
 
 def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, heading: Heading) -> FloatArray:
@@ -137,6 +138,6 @@ def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, head
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``a x b`` of ``(3,)`` or ``(M, 3)``; NumPy's own spends most of its time on choosing axes."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    """``a x b`` of ``(3,)`` or ``(3, M)``; NumPy's own spends most of its time on choosing axes."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -18,8 +18,7 @@ from slam.frames import DepthMap, Intrinsics
 from slam.frontend.epipolar import Heading
 from slam.memory import Given
 
-_FARTHEST = 1e6
-_NEAREST = 1e-6
+_NEAREST = np.float32(1e-6)
 # as much of an image as stays in a processor's cache through all of its arithmetic
 _ROWS = 16
 
@@ -61,18 +60,20 @@ class Foresight:
     def _current(self) -> NDArray[np.float32]:
         """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
         K, depth = self.intrinsics.K, self.depth_previous
-        turned = K @ self.heading.R_current_previous @ np.linalg.inv(K)
-        moved = self.length * K @ self.heading.direction
+        turned = (K @ self.heading.R_current_previous @ np.linalg.inv(K)).astype(np.float32)
+        moved = (self.length * K @ self.heading.direction).astype(np.float32)
         height, width = depth.shape
         current = np.empty((height, width, 2), np.float32)
-        u = np.arange(width)
+        u = np.arange(width, dtype=np.float32)
         for top in range(0, height, _ROWS):
-            v = np.arange(top, min(top + _ROWS, height))[:, None]
-            z_previous = depth[v[:, 0]]
-            near = 1.0 / np.where(np.isfinite(z_previous) & (z_previous > 0), z_previous, _FARTHEST).astype(np.float64)
+            z_previous = depth[top : top + _ROWS]
+            v = np.arange(top, top + len(z_previous), dtype=np.float32)[:, None]
+            with np.errstate(divide="ignore"):
+                near = np.where(z_previous > 0, 1 / z_previous, np.float32(0))
             x, y, z = (
-                row[0] * u + row[1] * v + row[2] + shift * near for row, shift in zip(turned, moved, strict=True)
+                (row[0] * u + row[1] * v + row[2]) + shift * near for row, shift in zip(turned, moved, strict=True)
             )
             ahead = np.maximum(z, _NEAREST)
-            current[top : top + _ROWS, :, 0], current[top : top + _ROWS, :, 1] = x / ahead, y / ahead
+            np.divide(x, ahead, out=current[top : top + _ROWS, :, 0])
+            np.divide(y, ahead, out=current[top : top + _ROWS, :, 1])
         return current

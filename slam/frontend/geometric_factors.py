@@ -6,6 +6,7 @@ ratio of learned to triangulated depth; perspective-n-point against learned dept
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -131,29 +132,38 @@ class GeometricOdometry:
             )
         return measured
 
-    def measure_span(
+    def ask_span(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
-    ) -> Span | None:
-        """The turn between frames some steps apart, both measured already; None where too few corners tell.
+    ) -> Callable[[], Span | None]:
+        """How to measure the turn between frames some steps apart, both measured already.
 
         Args:
             first: the earlier frame.
             last: the later frame.
             depth_first_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             T_first_last: the motion as its steps were measured, unscaled.
+
+        Returns:
+            Measures it, in any thread, by what is known now; None where too few corners tell.
         """
         known = _heading_and_length(T_first_last)
         if known is None:
-            return None
-        tracks = self._tracker.track_across(first, last, Foresight(*known, depth_first_unscaled, self._intrinsics))
-        if len(tracks.previous) < self._config.min_inliers:
-            return None
-        matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous))
-        found = self._two_views.refined(matches, known[0])
-        if found is None or found.inliers.sum() < self._config.min_inliers:
-            return None
-        sigmas = np.sqrt(np.diag(found.covariance)[:3])
-        return Span(first.index, last.index, found.heading.R_current_previous, sigmas)
+            return lambda: None
+        follow = self._tracker.ask_across(first, last, Foresight(*known, depth_first_unscaled, self._intrinsics))
+        movers, depth_share = self._movers.as_now(), self._two_views.depth_share
+
+        def measure() -> Span | None:
+            tracks = follow()
+            if len(tracks.previous) < self._config.min_inliers:
+                return None
+            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), movers)
+            found = self._two_views.refined(matches, known[0], depth_share)
+            if found is None or found.inliers.sum() < self._config.min_inliers:
+                return None
+            sigmas = np.sqrt(np.diag(found.covariance)[:3])
+            return Span(first.index, last.index, found.heading.R_current_previous, sigmas)
+
+        return measure
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
@@ -166,8 +176,8 @@ class GeometricOdometry:
         y = (pixels[:, 1] - camera.cy) / camera.fy
         return np.stack([x, y, np.ones_like(x)], axis=1)
 
-    def _matches(self, tracks: Tracks, learned: FloatArray) -> Matches:
-        weights = self._movers.weights(tracks.previous)
+    def _matches(self, tracks: Tracks, learned: FloatArray, movers: Movers) -> Matches:
+        weights = movers.weights(tracks.previous)
         return Matches(self._rays(tracks.previous), self._rays(tracks.current), learned, weights)
 
     def _still(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
@@ -184,7 +194,7 @@ class GeometricOdometry:
         self, step: tuple[int, int], tracks: Tracks, learned: FloatArray, depth: FloatArray
     ) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, learned)
+        matches = self._matches(tracks, learned, self._movers)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         # an essential matrix of a pure rotation invents a translation: only believe one that is needed
         turned = rotation_between(rays_previous, rays_current)

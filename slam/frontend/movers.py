@@ -6,6 +6,8 @@ bend it; but most do not, and those beside them are then not to be believed eith
 
 from __future__ import annotations
 
+from copy import copy
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +48,14 @@ class Movers:
 
     def learn(self, pixels: FloatArray, fitting: NDArray[np.bool_]) -> None:
         """Remember which corners, now at ``pixels`` ``(M, 2)``, fitted a step's motion ``(M,)``."""
-        self._all *= _KEPT
-        self._fitting *= _KEPT
+        self._all, self._fitting = _KEPT * self._all, _KEPT * self._fitting
         cells = self._cells(pixels)
         np.add.at(self._all, cells, 1.0)
         np.add.at(self._fitting, cells, fitting.astype(float))
+
+    def as_now(self) -> Movers:
+        """What was seen so far, which nothing learnt later changes."""
+        return copy(self)  # learning makes arrays anew
 
     def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)

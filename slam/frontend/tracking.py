@@ -7,7 +7,8 @@ and go where their windows look more alike.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from slam.config import GeometryConfig
 from slam.frames import Frame, Image
 from slam.frontend.foresight import Foresight, Grey, Pixels
-from slam.memory import Recall, compute_anew
+from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 
 _REMEMBERED = 4
@@ -58,24 +59,30 @@ class CornerTracker:
             self._fill(second, _Corners(forward[kept], names))
         return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
 
-    def track_across(self, previous: Frame, current: Frame, foresight: Foresight) -> Tracks:
-        """Corners of ``previous`` that were followed to the next frame, found again in a later one that is foreseen."""
+    def ask_across(self, previous: Frame, current: Frame, foresight: Foresight) -> Callable[[], Tracks]:
+        """How to find corners of ``previous`` that were followed to the next frame in a later one that is foreseen.
+
+        What is returned finds them, in any thread.
+        """
         first, second = self._see(previous), self._see(current)
         following = self._seen.get(previous.index + 1)
         if first.corners is None or following is None or following.corners is None:
-            return Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64))
+            return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64))
         followed = np.isin(first.corners.names, following.corners.names)
         points, names = first.corners.pixels[followed], first.corners.names[followed]
 
-        def follow() -> tuple[Pixels, NDArray[np.bool_]]:
-            foreseen = self._through(first.grey, second.grey, points, self._config.window_px, foresight)
-            found = _inside(foreseen, second.grey)
+        def follow() -> Answer:
+            way = _through(second.grey, self._config.window_px, foresight)
+            found = self._followed(first.grey, second.grey, points, [way])
             return found.pixels, found.kept
 
-        settings = repr((self._config.window_px, self._config.forward_backward_px))
-        given = first.image, second.image, points, settings, *foresight.given
-        pixels, kept = self._recall("corners across a span", given, follow)
-        return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), names[kept])
+        def find() -> Tracks:
+            settings = repr((self._config.window_px, self._config.forward_backward_px))
+            given = first.image, second.image, points, settings, *foresight.given
+            pixels, kept = self._recall("corners across a span", given, follow)
+            return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), names[kept])
+
+        return find
 
     def _found_again(
         self, first: _Seen, second: _Seen, points: Pixels, foresight: Foresight | None
@@ -83,7 +90,7 @@ class CornerTracker:
         """Where points ``(M, 2)`` went and which can be believed, sought wider where they are few."""
         config = self._config
 
-        def follow() -> tuple[Pixels, NDArray[np.bool_]]:
+        def follow() -> Answer:
             found = self._follow(first.grey, second.grey, points, config.window_px, foresight)
             if found.kept.sum() < config.few_corners:
                 alike = _exposed_like(second.grey, first.grey)
@@ -139,63 +146,77 @@ class CornerTracker:
         return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
     def _follow(self, first: Grey, second: Grey, points: Pixels, side: int, foresight: Foresight | None) -> _Found:
-        """Where points ``(M, 2)`` went, and which of them can be believed."""
-        found = self._there_and_back(first, second, points, side, self._config.pyramid_levels)
+        """Where points ``(M, 2)`` went, as they are or through what is foreseen, and which of them can be believed."""
+        ways = [_Way(second, side, self._config.pyramid_levels)]
         if foresight is not None:
-            foreseen = self._through(first, second, points, side, foresight)
-            better = foreseen.kept & (~found.kept | (foreseen.unlike < found.unlike))
-            pixels = np.where(better[:, None], foreseen.pixels, found.pixels)
-            found = replace(found, pixels=pixels, kept=found.kept | better)
-        return _inside(found, second)
+            ways.append(_through(second, side, foresight))
+        return self._followed(first, second, points, ways)
 
-    def _through(self, first: Grey, second: Grey, points: Pixels, side: int, foresight: Foresight) -> _Found:
-        """Where points ``(M, 2)`` went, followed in the later image with what is foreseen undone."""
-        undone = self._there_and_back(first, foresight.undone(second), points, side, _FORESEEN_LEVELS)
-        return replace(undone, pixels=foresight.in_current(undone.pixels))
-
-    def _there_and_back(self, first: Grey, second: Grey, points: Pixels, side: int, levels: int) -> _Found:
-        """Points ``(M, 2)`` followed forwards; kept are those that come back to where they were."""
+    def _followed(self, first: Grey, second: Grey, points: Pixels, ways: Sequence[_Way]) -> _Found:
+        """Points ``(M, 2)`` by the way that leaves windows most alike, of those that lead back."""
+        pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
         if len(points) == 0:
-            return _Found(points, np.zeros(0, dtype=bool), np.zeros(0, np.float32))
+            return _Found(pixels, kept)
+        arrived = [_flow(first, way.image, points, way) for way in ways]
+        unlike = np.stack([np.where(found, unlike, np.inf) for _, found, unlike in arrived])
+        for choice in np.argsort(unlike, axis=0, kind="stable"):
+            for n, (way, (forward, found, _)) in enumerate(zip(ways, arrived, strict=True)):
+                tried = np.flatnonzero(~kept & (choice == n) & found)
+                if len(tried) == 0:
+                    continue
+                backward, found_back, _ = _flow(way.image, first, forward[tried], way)
+                error = np.abs(backward - points[tried]).max(axis=1)
+                returned = tried[found_back & (error < self._config.forward_backward_px)]
+                pixels[returned], kept[returned] = way.in_current(forward[returned]), True
+        height, width = second.shape
+        inside = (pixels >= 0).all(axis=1) & (pixels <= [width - 1, height - 1]).all(axis=1)
+        return _Found(pixels, kept & inside)
 
-        def flow(start: Grey, end: Grey, pixels: Pixels) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
-            moved, status, unlike = cv2.calcOpticalFlowPyrLK(
-                start,
-                end,
-                pixels.reshape(-1, 1, 2),
-                None,
-                winSize=(side, side),
-                maxLevel=levels,
-                criteria=_CRITERIA,
-            )
-            return moved.reshape(-1, 2), status.ravel().astype(bool), unlike.ravel()
 
-        forward, found, unlike = flow(first, second, points)
-        backward, found_back, _ = flow(second, first, forward)
-        error = np.abs(backward - points).max(axis=1)
-        return _Found(forward, found & found_back & (error < self._config.forward_backward_px), unlike)
+@dataclass(frozen=True)
+class _Way:
+    """An image in which points are sought with windows of ``side`` over so many ``levels`` above it.
+
+    ``in_current`` says where in the later image something of it lies.
+    """
+
+    image: Grey
+    side: int
+    levels: int
+    in_current: Callable[[Pixels], Pixels] = lambda pixels: pixels
+
+
+def _through(second: Grey, side: int, foresight: Foresight) -> _Way:
+    """Through the later image with what is foreseen undone."""
+    return _Way(foresight.undone(second), side, _FORESEEN_LEVELS, foresight.in_current)
+
+
+def _flow(start: Grey, end: Grey, pixels: Pixels, way: _Way) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
+    """Where pixels ``(M, 2)`` went, which of them went anywhere, and how far their windows differ ``(M,)``."""
+    moved, status, unlike = cv2.calcOpticalFlowPyrLK(
+        start,
+        end,
+        pixels.reshape(-1, 1, 2),
+        None,
+        winSize=(way.side, way.side),
+        maxLevel=way.levels,
+        criteria=_CRITERIA,
+    )
+    return moved.reshape(-1, 2), status.ravel().astype(bool), unlike.ravel()
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Where points went ``(M, 2)``, which are ``kept`` ``(M,)``, and how far their windows differ ``(M,)``."""
+    """Where points went ``(M, 2)``, and which of them can be believed ``(M,)``."""
 
     pixels: Pixels
     kept: NDArray[np.bool_]
-    unlike: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class _Corners:
     pixels: Pixels
     names: NDArray[np.int64]
-
-
-def _inside(found: _Found, image: Grey) -> _Found:
-    """The same without those that left the image."""
-    height, width = image.shape
-    inside = (found.pixels >= 0).all(axis=1) & (found.pixels <= [width - 1, height - 1]).all(axis=1)
-    return replace(found, kept=found.kept & inside)
 
 
 def _exposed_like(grey: Grey, other: Grey) -> Grey:

@@ -183,13 +183,13 @@ def test_a_turn_across_two_steps_is_measured_in_its_two_images(texture):
     odometry = GeometricOdometry(CONFIG, CAMERA)
     steps = [pose_of(odometry.measure(a[0], b[0], a[1])).T_from_to for a, b in itertools.pairwise(frames[:3])]
     first, last = frames[0], frames[2]
-    span = odometry.measure_span(first[0], last[0], first[1], steps[0] @ steps[1])
+    span = odometry.ask_span(first[0], last[0], first[1], steps[0] @ steps[1])()
     assert span is not None
     assert (span.from_index, span.to_index, list(span.steps)) == (0, 2, [0, 1])
     R_last_first = poses[2][:3, :3].T @ poses[0][:3, :3]
     assert np.rad2deg(se3.rotation_angle(span.R_to_from.T @ R_last_first)) < 0.02
     assert (np.rad2deg(span.sigmas) < 0.05).all()
-    assert odometry.measure_span(first[0], last[0], first[1], np.eye(4)) is None  # a camera that stood
+    assert odometry.ask_span(first[0], last[0], first[1], np.eye(4))() is None  # a camera that stood
 
 
 def test_corners_keep_their_names_and_tie_the_lengths_of_neighbouring_steps(texture):

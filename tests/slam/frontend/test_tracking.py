@@ -69,7 +69,7 @@ def test_corners_are_found_again_two_frames_later_where_they_were_foreseen(frame
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     depth, sliding = np.full((120, 200), 10.0, np.float32), Heading(np.eye(3), np.array([-1.0, 0.0, 0.0]))
     foreseen = Foresight(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
-    across = tracker.track_across(frames[0], frames[2], foreseen)
+    across = tracker.ask_across(frames[0], frames[2], foreseen)()
     assert len(across.names) > 0.8 * len(tracks[0].names)
     assert np.isin(across.names, tracks[0].names).all()
     error = np.abs(across.previous - across.current - [2 * SHIFT_PX, 0]).max(axis=1)
@@ -79,4 +79,4 @@ def test_corners_are_found_again_two_frames_later_where_they_were_foreseen(frame
 def test_corners_that_nobody_followed_are_not_found_across(frames):
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     nothing = Foresight(Heading(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera)
-    assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing).names) == 0
+    assert len(CornerTracker(CONFIG).ask_across(frames[0], frames[2], nothing)().names) == 0

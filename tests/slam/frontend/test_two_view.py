@@ -90,7 +90,7 @@ def test_a_motion_that_is_well_known_is_refined_and_not_remembered():
     direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
     off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
     estimator, other = TwoViewEstimator(CONFIG, FOCAL_PX), TwoViewEstimator(CONFIG, FOCAL_PX)
-    refined = estimator.refined(matches, Heading(off @ T_current_previous[:3, :3], direction))
+    refined = estimator.refined(matches, Heading(off @ T_current_previous[:3, :3], direction), estimator.depth_share)
     assert refined is not None
     assert turned_deg(refined.heading.R_current_previous, T_current_previous[:3, :3]) < 0.06
     one, two = estimator.estimate(matches), other.estimate(matches)

@@ -235,7 +235,8 @@ class SlamPipeline:
     def _measure(self, seen: Observations, lidar: LidarPath | None, scale: Scale) -> list[RelativePose]:
         """All relative poses with their noise, in the mode's unit."""
         by_corners = {step: m.relative_pose.T_from_to for step, m in seen.motions.items()}
-        drive = drive_noise(by_corners, self._config.geometry)
+        own = {step: motion.own_noise for step, motion in seen.motions.items()}
+        drive = drive_noise(by_corners, own, self._config.geometry)
         geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
         networks = self._by_networks(seen)
         if self._config.frontend.use == "bridge":

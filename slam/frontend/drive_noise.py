@@ -2,8 +2,9 @@
 
 Corners promise sigmas that hold where the camera is all that errs. On the road more goes wrong than they know of -
 stamps, the mount, whatever is not a pinhole - and it goes wrong in proportion to how the camera shakes, how it turns,
-and where a step does not fit the steps beside it. So the sigmas of each step are widened by shares of these. The shares
-in ``GeometryConfig`` were fitted once (``docs/design/0009-noise-from-the-drive-itself.md``).
+and where a step does not fit the steps beside it. So the sigmas of each step are widened by shares of what of these the
+corners' own noise does not explain. The shares in ``GeometryConfig`` were fitted once
+(``docs/design/0009-noise-from-the-drive-itself.md``).
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ _MAD_TO_SIGMA = 1.4826
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
 _THIRD_DIFFERENCE = np.sqrt(20.0)
+# white noise makes a step differ from what its neighbours foretell by so many of its sigmas
+_JOLT_OF_NOISE = 1.5
 
 
 @dataclass(frozen=True)
 class StepNoise:
-    """Sigmas to add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians.
+    """Sigmas that add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians.
 
     The direction is of the earlier camera as the later one sees it, where GTSAM perturbs; along it there is no error.
     """
@@ -34,22 +37,31 @@ class StepNoise:
     direction: FloatArray
 
 
-def drive_noise(T_previous_current: Mapping[int, FloatArray], config: GeometryConfig) -> dict[int, StepNoise]:
-    """The noise of each step of a drive.
+def drive_noise(
+    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: GeometryConfig
+) -> dict[int, StepNoise]:
+    """The noise of each step of a drive beside what its corners know of.
 
     Args:
         T_previous_current: steps that corners measured, by their first frame; lengths are not looked at.
+        own: the sigmas that the corners of each step promise.
         config: the shares.
     """
+    if not T_previous_current:
+        return {}
     turned = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
     along = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
-    shake = rotation_shake(turned)
+    shake = _beyond(rotation_shake(turned), np.median([own[k].rotation for k in turned], axis=0))
     noise = {}
     for k, turn in turned.items():
         rotation = [config.shake_rotation_share * shake, config.turn_rotation_share * turn]
-        rotation.append(config.jolt_rotation_share * jolt(turned, k))
+        jolted, swerved = (
+            _beyond(jolt(values, k), _JOLT_OF_NOISE * known)
+            for values, known in ((turned, own[k].rotation), (along, own[k].direction))
+        )
+        rotation.append(config.jolt_rotation_share * jolted)
         aside = config.shake_direction_share * np.linalg.norm(shake) * np.sqrt(np.maximum(1.0 - along[k] ** 2, 0.0))
-        direction = np.hypot(aside, config.jolt_direction_share * jolt(along, k))
+        direction = np.hypot(aside, config.jolt_direction_share * swerved)
         noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction)
     return noise
 
@@ -79,6 +91,11 @@ def jolt(values: Mapping[int, FloatArray], step: int) -> FloatArray:
         if all(step + n in values for n, _ in line)
     ]
     return np.asarray(np.abs(values[step] - np.median(foretold, axis=0))) if foretold else np.zeros(3)
+
+
+def _beyond(seen: FloatArray, known: FloatArray) -> FloatArray:
+    """What of a deviation ``(3,)`` sigmas that are known of ``(3,)`` do not explain."""
+    return np.asarray(np.sqrt(np.maximum(seen**2 - known**2, 0.0)))
 
 
 def _unit(vector: FloatArray) -> FloatArray:

@@ -56,6 +56,17 @@ class Motion:
     structure: Structure | None = None
     direction_sigmas: FloatArray | None = None
 
+    @property
+    def own_noise(self) -> StepNoise:
+        """What the corners promise of rotation and direction.
+
+        Raises:
+            ValueError: it has no direction apart from its length.
+        """
+        if self.direction_sigmas is None:
+            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
+        return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
+
     def with_turn(self, R_current_previous: FloatArray) -> Motion:
         """The same way seen from the current camera, with another turn ``(3, 3)``."""
         T_current_previous = make(R_current_previous, invert(self.relative_pose.T_from_to)[:3, 3])
@@ -72,12 +83,10 @@ class Motion:
             chain_sigma_share: that of independent errors which add up along the steps as those of the lengths do.
             noise: of rotation and direction, beside the corners' own.
         """
-        if self.direction_sigmas is None:
-            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
+        own = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()
         T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
-        rotation = np.hypot(self.relative_pose.sigmas[:3], noise.rotation)
-        direction = np.hypot(self.direction_sigmas, noise.direction)
+        rotation, direction = np.hypot(own.rotation, noise.rotation), np.hypot(own.direction, noise.direction)
         sigmas, chain_sigmas = (
             _sigmas(T_previous_current, rotation, direction, share) for share in (sigma_share, chain_sigma_share)
         )

@@ -145,7 +145,7 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     known = np.where(measured, 1.0, np.nan)
     sigmas, alike = marginals(information, steps)
-    chain_sigmas = sigmas * np.sqrt((1.0 + alike) / (1.0 - alike))
+    chain_sigmas = config.chain_widening * sigmas * np.sqrt((1.0 + alike) / (1.0 - alike))
     return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * chain_sigmas, np.exp(state[steps:]))
 
 

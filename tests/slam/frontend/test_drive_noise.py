@@ -2,10 +2,14 @@ import numpy as np
 import pytest
 
 from slam.config import GeometryConfig
-from slam.frontend.drive_noise import drive_noise, jolt, rotation_shake
+from slam.frontend.drive_noise import StepNoise, drive_noise, jolt, rotation_shake
 from slam.se3 import from_rotation_vector
 
 CONFIG = GeometryConfig()
+
+
+def own(count: int, sigma_rad: float = 0.0) -> dict[int, StepNoise]:
+    return {k: StepNoise(np.full(3, sigma_rad), np.full(3, sigma_rad)) for k in range(count)}
 
 
 def steps(turns_rad: np.ndarray) -> dict[int, np.ndarray]:
@@ -53,7 +57,7 @@ def test_a_jolt_is_the_step_that_does_not_fit_and_not_its_neighbours():
 
 def test_noise_is_shares_of_shake_and_turn():
     shaken = turns(np.full(3, 1e-3))
-    noise, shake = drive_noise(steps(shaken), CONFIG), rotation_shake(dict(enumerate(shaken)))
+    noise, shake = drive_noise(steps(shaken), own(400), CONFIG), rotation_shake(dict(enumerate(shaken)))
     assert noise.keys() == set(range(400))
     calm = min(noise.values(), key=lambda n: n.direction.sum())
     assert calm.direction[0] == pytest.approx(CONFIG.shake_direction_share * np.linalg.norm(shake), rel=0.1)
@@ -67,7 +71,17 @@ def test_sharp_turns_and_jolts_widen_their_own_steps():
     smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
     jolted = smooth.copy()
     jolted[30, 0] += np.deg2rad(1.0)
-    before, after = drive_noise(steps(smooth), CONFIG), drive_noise(steps(jolted), CONFIG)
+    before, after = (drive_noise(steps(turned), own(60), CONFIG) for turned in (smooth, jolted))
     assert before[16].rotation[1] == pytest.approx(CONFIG.turn_rotation_share * smooth[16, 1], rel=0.1)
     assert after[30].rotation[0] == pytest.approx(CONFIG.jolt_rotation_share * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
+
+
+def test_what_corners_know_of_is_not_counted_twice():
+    shaken = steps(turns(np.full(3, 1e-3)))
+    alone, known = (drive_noise(shaken, own(400, sigma), CONFIG) for sigma in (0.0, 1.5e-3))
+    calm = [step.rotation[0] for step in known.values()]
+    assert np.median(calm) < 0.03e-3, "white noise of the corners' own size shakes nothing"
+    assert all((known[k].rotation <= alone[k].rotation).all() for k in alone)
+    assert all((known[k].direction <= alone[k].direction).all() for k in alone)
+    assert drive_noise({}, {}, CONFIG) == {}

@@ -143,7 +143,7 @@ def test_lengths_tied_to_their_neighbours_add_up_as_they_say() -> None:
             ratio=chained,
             ratio_sigma=np.full(STEPS, 0.02 / CONFIG.ratio_widening),
         )
-        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9, chain_widening=1.0))
         summed = np.log(solved.length / TRUE)[middle].sum()
         alone.append(summed / np.linalg.norm(solved.sigma_share[middle]))
         together.append(summed / np.linalg.norm(solved.chain_sigma_share[middle]))

@@ -10,15 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.config import load_config
+from slam.config import SlamConfig, load_config
 from slam.errors import SequenceError
 from slam.evaluation import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend.bridging import BRIDGE_SOURCE
+from slam.observation import Observer
 from slam.oracle import OracleNoise, OraclePredictor
 from slam.pipeline import SlamPipeline, SlamResult
 from slam.sequences.simulated import SimulationOptions
 from slam.sequences.simulated_sequence import SimulatedSequence
+from slam.timing import Stopwatch
 
 FRAMES = 60
 BAD = range(25, 35)
@@ -71,16 +73,21 @@ def street() -> SimulatedSequence:
     return SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
 
 
-def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> SlamResult:
-    sequence = Damaged(street(), damage, bad)
-
+def oracle_of(sequence: Damaged) -> OraclePredictor:
     def depth_of(index: int) -> np.ndarray:
         depth = street().street.render(index).depth
         return np.where(depth > 0, depth, 200.0)
 
-    oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR)
-    options = ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", "mapping.width_px=104", *overrides]
-    return SlamPipeline(sequence, oracle, load_config(None, options)).run()
+    return OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR)
+
+
+def config_with(*overrides: str) -> SlamConfig:
+    return load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", *overrides])
+
+
+def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> SlamResult:
+    sequence = Damaged(street(), damage, bad)
+    return SlamPipeline(sequence, oracle_of(sequence), config_with("mapping.width_px=104", *overrides)).run()
 
 
 @pytest.mark.parametrize("damage", [black, noise, repeated, unreadable], ids=lambda damage: damage.__name__)
@@ -112,3 +119,23 @@ def test_too_many_unreadable_images_are_the_error_they_are() -> None:
         run(unreadable, BAD, "bridging.max_unread_frames=3")
     with pytest.raises(SequenceError, match=r"image 25\.png is truncated"):
         run(unreadable, BAD, "bridging.enabled=false")
+
+
+def test_settling_after_each_frame_sees_the_same_as_going_on() -> None:
+    sequence = Damaged(street(), black, range(12, 14))
+    config = config_with("mapping.enabled=false")
+    going_on, settling = (
+        Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "settling")
+    )
+    for index in range(24):
+        frame = sequence.frame(index)
+        going_on.add(index, frame)
+        settling.add(index, frame)
+        settling.settle()
+        assert len(settling.seen.roads) == index + 1, "a settled observer has finished with every frame"
+    late, soon = going_on.closed(), settling.closed()
+    assert len(late.spans) > 10 and late.road_steps.keys() == soon.road_steps.keys()
+    for seen in (lambda o: [span.R_to_from for span in o.spans], lambda o: [pose.T_from_to for pose in o.geometric]):
+        np.testing.assert_array_equal(seen(late), seen(soon))
+    assert [snippet.target for snippet in late.snippets] == [snippet.target for snippet in soon.snippets]
+    assert [view.index for view in late.views] == [view.index for view in soon.views]

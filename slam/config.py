@@ -117,12 +117,12 @@ class LengthConfig(Section):
     ratio_widening: float = Field(default=1.5, gt=0, description="sigmas that points give, widened by this")
     learned_sigma: float = Field(default=0.1, gt=0, description="of a length by learned depth")
     unit_walk_sigma: float = Field(default=0.003, gt=0, description="how far learned depth's unit walks in a step")
-    chain_widening: float = Field(
-        default=1.5, gt=0, description="sigmas along the graph: what ails a stretch of road lasts longer than is known"
-    )
     unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
     max_contradiction: float = Field(default=2.5, gt=1, description="largest factor from the length by learned depth")
     outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")
+    chain_widening: float = Field(
+        default=1.5, gt=0, description="sigmas along the graph, widened by this: what ails a stretch of road lasts"
+    )
 
 
 class BridgingConfig(Section):

@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from erfsfm.data.splits import overlapping
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
+from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 
 logger = logging.getLogger(__name__)
@@ -89,6 +90,12 @@ class DepthPosePredictor:
         else:
             predictor.noise = noise
         return predictor
+
+    def freeze(self) -> Self:
+        """Answer by graphs of the networks from now on: the same up to rounding, and sooner on a CPU."""
+        if self.device.type == "cpu":
+            self._depth_net, self._pose_net = Frozen(self._depth_net), Frozen(self._pose_net)
+        return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
         """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""

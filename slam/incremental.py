@@ -82,7 +82,7 @@ class Slam:
         device: str = "cpu",
     ) -> Slam:
         """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
-        networks = DepthPosePredictor.from_weights(name_or_dir, device)
+        networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
         return cls(NetworkPredictor(networks), intrinsics, config, camera_height_m, noise=networks.noise)
 
     def __len__(self) -> int:

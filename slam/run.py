@@ -106,7 +106,7 @@ def run_slam(
         import_rerun()  # better missed before the run than after it
     settings = load_config(config, overrides)
     recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
-    networks = DepthPosePredictor.from_weights(weights, device)
+    networks = DepthPosePredictor.from_weights(weights, device).freeze()
     memory = None if cache is None else Memory(cache)
     predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory))
     recall = compute_anew if memory is None else Recollection(memory, _code()).recall

@@ -107,6 +107,24 @@ class DeformableConv2d(nn.Module):
         )
 
 
+def meets_kernel(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
+    """Whether a pass of `inputs` through a network computes any of its deformable layers by the compiled path."""
+    met = []
+
+    def look(layer: nn.Module, given: tuple[Tensor, ...]) -> None:
+        assert isinstance(layer, DeformableConv2d)
+        met.append(_suits_kernel(given[0], layer.offset(given[0]), layer.kernel.weight, None))
+
+    layers = [layer for layer in network.modules() if isinstance(layer, DeformableConv2d)]
+    hooks = [layer.register_forward_pre_hook(look) for layer in layers]
+    try:
+        network(*inputs)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return any(met) and _compiled_kernel() is not None
+
+
 def _pair(value: int | tuple[int, int]) -> tuple[int, int]:
     return (value, value) if isinstance(value, int) else (value[0], value[1])
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
@@ -20,7 +21,6 @@ from erfsfm.data.images import resize_image
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
-from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 
@@ -138,20 +138,24 @@ class DepthPosePredictor:
         middle = self.sources // 2
         inputs = [self._input(image) for image in images]
         target = inputs.pop(middle)
-        vectors: Tensor = self._pose_net(target, inputs)[0].double()  # (N, 6)
-        return pose_vector_to_matrix(vectors).cpu().numpy()
+        vectors = self._pose_net(target, inputs)[0].double().cpu().numpy()  # (N, 6)
+        T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
+        T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
+        T_source_target[:, :3, 3] = vectors[:, :3]
+        return T_source_target
 
     def _input(self, image: NDArray[np.uint8]) -> Tensor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
         for known, content, tensor in self._inputs:
-            if known is image and np.array_equal(content, image):
+            if known is image and (content is image or np.array_equal(content, image)):
                 return tensor
         resized = resize_image(image, self.record.network.height, self.record.network.width)
-        tensor = torch.from_numpy(np.ascontiguousarray(resized)).to(self.device)
-        tensor = tensor.permute(2, 0, 1)[None].float() / 127.5 - 1
-        self._inputs.append((image, image.copy(), tensor))
+        tensor = torch.from_numpy(resized.astype(np.float32)).to(self.device)
+        tensor = tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
+        is_settled = image.base is None and not image.flags.writeable
+        self._inputs.append((image, image if is_settled else image.copy(), tensor))
         return tensor
 
 

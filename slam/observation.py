@@ -80,7 +80,9 @@ class Observations:
 def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
     """A frame, or why its image cannot be read."""
     try:
-        return sequence.frame(index)
+        frame = sequence.frame(index)
+        frame.image.setflags(write=False)  # whoever remembers it need not copy it
+        return frame
     except SequenceError as error:
         return error
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
 from slam.foreign import import_open3d_beside
-from slam.frames import Predictor, RelativePose, runs
+from slam.frames import DepthMap, Image, Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive_noise import StepNoise, drive_noise
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
@@ -35,6 +35,7 @@ from slam.memory import Recall, compute_anew
 from slam.observation import Observations, Observer, read_frame
 from slam.pose_graph import PoseGraph
 from slam.se3 import FloatArray, chain, invert
+from slam.threads import read_ahead
 from slam.timing import Stopwatch
 from slam.trajectory import Trajectory
 
@@ -161,11 +162,14 @@ class SlamPipeline:
             return None
         height, width = keyframes[0].depth_unscaled.shape
         tsdf_map = TsdfMap(self._config.mapping, self._sequence.intrinsics.resized(width, height))
+
+        def read(n: int) -> tuple[DepthMap, Image]:
+            metres = keyframes[n].depth_unscaled * np.float32(estimate.scale.per_frame[keyframes[n].index])
+            return metres, keyframes[n].image
+
         with self._watch.stage("map"):
-            for done, keyframe in enumerate(keyframes):
-                metres = keyframe.depth_unscaled * np.float32(estimate.scale.per_frame[keyframe.index])
-                T_world_camera = estimate.optimised.T_world_camera[keyframe.index]
-                tsdf_map.integrate(metres, keyframe.image, T_world_camera)
+            for done, (metres, image) in enumerate(read_ahead(read, len(keyframes))):
+                tsdf_map.integrate(metres, image, estimate.optimised.T_world_camera[keyframes[done].index])
                 self._progress("map", done + 1, len(keyframes))
         return tsdf_map
 
@@ -201,15 +205,12 @@ class SlamPipeline:
         observer = Observer(
             self._predictor, self._sequence.intrinsics, self._config, self._watch, examples, self._recall
         )
-        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as ahead:
-            following = ahead.submit(read_frame, self._sequence, 0)
-            for index in range(total):
-                with self._watch.stage("read"):
-                    frame = following.result()
-                if index + 1 < total:
-                    following = ahead.submit(read_frame, self._sequence, index + 1)
-                observer.add(index, frame)
-                self._progress("frames", index + 1, total)
+        frames = read_ahead(partial(read_frame, self._sequence), total)
+        for index in range(total):
+            with self._watch.stage("read"):
+                frame = next(frames)
+            observer.add(index, frame)
+            self._progress("frames", index + 1, total)
         seen = observer.closed()
         for first, last in runs(seen.bridged):
             logger.warning("frames %d to %d bridged: %s", first, last, seen.bridged[first])

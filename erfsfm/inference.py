@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
+from erfsfm.checkpoint import commit as commit  # likewise
 from erfsfm.data.images import resize_image
-from erfsfm.data.splits import overlapping
+from erfsfm.data.splits import overlapping as overlapping  # for slam, which enters by this door
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.networks.frozen import Frozen

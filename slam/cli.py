@@ -52,6 +52,9 @@ def run(
         Path | None, typer.Option(help="keep the networks' answers there: a second run skips the networks")
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
+    continues: Annotated[
+        Path | None, typer.Option("--continue", help="a run folder: these frames follow on its last one")
+    ] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -78,6 +81,7 @@ def run(
             command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
             cache=cache,
             rerun=rerun,
+            continues=continues,
         )
     metrics = folder.metrics()
     if as_json:

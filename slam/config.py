@@ -255,6 +255,10 @@ class OutputConfig(Section):
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
+    keep: Literal["nothing", "drive", "keyframes"] = Field(
+        default="drive",
+        description="for run --continue: nothing, what was measured, or that and frames for the map",
+    )
 
 
 class SlamConfig(Section):

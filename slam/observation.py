@@ -26,6 +26,7 @@ from slam.frontend.scale import RoadPlane, fit_road
 from slam.frontend.spans import Span
 from slam.loops.descriptors import FeatureExtractor, View
 from slam.memory import Recall, compute_anew
+from slam.records import Learner
 from slam.se3 import chain
 from slam.spool import Spool, Spooled
 from slam.timing import Stopwatch
@@ -105,13 +106,15 @@ class _Asked:
     keep: Callable[[Any], None]
 
 
-class Observer:
+class Observer(Learner):
     """Watches the frames of one sequence in time order.
 
     The networks look at a frame in a second thread while corners of the one before are measured in the first; the road
     of a step, and the turn across it and those before, are measured in a third. What depends on another waits for it,
     and what nothing waits for is taken up with the next frame: results do not depend on which of them is faster.
     """
+
+    remembers = ("_gate", "_geometry", "_aligner", "_window", "_recent", "_unread")
 
     def __init__(
         self,

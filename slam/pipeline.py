@@ -11,6 +11,7 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
+from slam.drive import Drive
 from slam.errors import SlamError
 from slam.foreign import import_open3d_beside
 from slam.frames import DepthMap, Image, Predictor, RelativePose, runs
@@ -65,6 +66,7 @@ class SlamResult:
     optimised: Trajectory
     lidar: LidarPath | None
     reference: Trajectory | None
+    observer: Observer
     observations: Observations
     scale: Scale
     factors: list[RelativePose]
@@ -85,6 +87,7 @@ class SlamPipeline:
         progress: Progress | None = None,
         noise: PoseNoise | None = None,
         recall: Recall = compute_anew,
+        drive: Drive | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -95,6 +98,7 @@ class SlamPipeline:
             progress: told the stage, and how much of it is done.
             noise: of the snippet poses; None measures it against image geometry alone.
             recall: remembers what images alone determine.
+            drive: what was seen of the first frames of the sequence, whose images are then not asked for.
         """
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
@@ -104,6 +108,7 @@ class SlamPipeline:
         self._config = config
         self._progress = progress or (lambda stage, done, total: None)
         self._recall = recall
+        self._drive = drive
         self._watch = Stopwatch()
 
     def run(self) -> SlamResult:
@@ -121,7 +126,10 @@ class SlamPipeline:
         mode = self._require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        observations = self._observe()
+        observer = self._observe()
+        observations = observer.closed()
+        for first, last in runs(observations.bridged):
+            logger.warning("frames %d to %d bridged: %s", first, last, observations.bridged[first])
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
         graph, T_optimised = self._optimise(measured.factors, loops, measured.T_odometry)
@@ -131,6 +139,7 @@ class SlamPipeline:
             optimised=self._trajectory(T_optimised),
             lidar=measured.lidar,
             reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
+            observer=observer,
             observations=observations,
             scale=measured.scale,
             factors=measured.factors,
@@ -168,7 +177,7 @@ class SlamPipeline:
             return metres, keyframes[n].image
 
         with self._watch.stage("map"):
-            for done, (metres, image) in enumerate(read_ahead(read, len(keyframes))):
+            for done, (metres, image) in enumerate(read_ahead(read, range(len(keyframes)))):
                 tsdf_map.integrate(metres, image, estimate.optimised.T_world_camera[keyframes[done].index])
                 self._progress("map", done + 1, len(keyframes))
         return tsdf_map
@@ -198,23 +207,24 @@ class SlamPipeline:
             )
         return mode
 
-    def _observe(self) -> Observations:
-        """One pass over the frames, gaps closed at its end."""
-        total = len(self._sequence)
-        examples = np.linspace(0, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
+    def _observe(self) -> Observer:
+        """One pass over the frames, or those that no one has seen yet."""
+        first, total = 0 if self._drive is None else len(self._drive.stamps), len(self._sequence)
+        examples = np.linspace(first, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
         observer = Observer(
             self._predictor, self._sequence.intrinsics, self._config, self._watch, examples, self._recall
         )
-        frames = read_ahead(partial(read_frame, self._sequence), total)
-        for index in range(total):
+        if self._drive is not None:
+            self._drive.resume(observer)
+            if self._config.mapping.enabled and not observer.seen.keyframes:
+                logger.warning("the map begins at frame %d: nothing for it is kept (output.keep=keyframes does)", first)
+        frames = read_ahead(partial(read_frame, self._sequence), range(first, total))
+        for index in range(first, total):
             with self._watch.stage("read"):
                 frame = next(frames)
             observer.add(index, frame)
             self._progress("frames", index + 1, total)
-        seen = observer.closed()
-        for first, last in runs(seen.bridged):
-            logger.warning("frames %d to %d bridged: %s", first, last, seen.bridged[first])
-        return seen
+        return observer
 
     def _find_scale(self, mode: ScaleMode, seen: Observations, lidar: LidarPath | None, T_network: FloatArray) -> Scale:
         """The unit of length, as the named mode wants it, and the lengths of all steps in it."""

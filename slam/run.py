@@ -5,60 +5,45 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
-from erfsfm.evaluation.pose_metrics import (
-    SnippetErrors,
-    snippet_errors,
-    snippet_from_network,
-    snippets_from_trajectory,
-)
-from erfsfm.inference import DepthPosePredictor, commit
+from erfsfm.inference import DepthPosePredictor, commit, overlapping
 from slam import frontend, loops, se3
 from slam.cache import CachedNetworks
-from slam.config import dump_yaml, load_config
-from slam.errors import SlamError
-from slam.evaluation import trajectory_metrics
+from slam.config import OutputConfig, SlamConfig, dump_yaml, load_config
+from slam.drive import DRIVE, KEYFRAMES, Drive, write_keyframes
+from slam.errors import ConfigError, RunError, SlamError
 from slam.foreign import import_rerun
 from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.refusal import Refusal
-from slam.map_metrics import accuracy_median_m, completeness, pose_similarity, visible_surface
 from slam.memory import Memory, Recollection, compute_anew, fingerprint
 from slam.networks import NetworkPredictor
 from slam.pipeline import Progress, SlamPipeline, SlamResult
 from slam.places import PLACES, Places
-from slam.pose_graph import coverage, coverage_by_source
 from slam.report import DepthExample, write_report
 from slam.rerun_file import write_rerun
 from slam.run_folder import RunFolder
-from slam.se3 import apply, umeyama
+from slam.run_map import write_map
+from slam.run_metrics import lidar_trajectory, run_metrics
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import Excerpt
 from slam.summary import (
-    SCHEMA,
     Provenance,
     as_json,
-    describe_bridged,
     describe_failure,
-    describe_sequence,
-    describe_timing,
-    finite,
-    null,
 )
 from slam.threads import one_thread_each
-from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
+
+# what a pass over the frames depends on
+_SETTLED = ("geometry", "bridging", "road", "scale", "loops")
 
 
 def run_slam(
@@ -76,6 +61,7 @@ def run_slam(
     command: str = "slam.run_slam",
     cache: Path | None = None,
     rerun: Path | None = None,
+    continues: Path | None = None,
 ) -> RunFolder:
     """Run the whole system on one sequence.
 
@@ -95,6 +81,8 @@ def run_slam(
         command: recorded in the metrics.
         cache: folder that keeps the networks' answers and what images alone determine; None asks anew.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
+        continues: a run folder whose last frame comes right before the first of these, taken by the same camera; its
+            configuration holds, and the new folder has the whole drive.
 
     Returns:
         The run folder.
@@ -104,9 +92,12 @@ def run_slam(
     """
     if rerun is not None:
         import_rerun()  # better missed before the run than after it
-    settings = load_config(config, overrides)
+    settings = load_config(config, overrides) if continues is None else _continued(continues, config, overrides, output)
     recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
     networks = DepthPosePredictor.from_weights(weights, device).freeze()
+    drive = None if continues is None else _drive(continues, networks.sha256, recording)
+    if drive is not None:
+        recording = drive.continued(recording)
     memory = None if cache is None else Memory(cache)
     predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory))
     recall = compute_anew if memory is None else Recollection(memory, _code()).recall
@@ -127,15 +118,40 @@ def run_slam(
     with _logging_to(folder.path / "run.log"):
         try:
             _seed(seed)
-            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall)
+            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall, drive)
             with one_thread_each():
-                result = _run(folder, pipeline, recording, provenance, settings.output.report)
+                result = _run(folder, pipeline, recording, provenance, settings.output)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
             return folder
         except BaseException as error:
             _leave_failure(folder, provenance, settings.output.report, error)
             raise
+
+
+def _continued(continues: Path, config: str | Path | None, overrides: Sequence[str], output: Path | None) -> SlamConfig:
+    """The configuration of a run to continue, with changes to what is not settled by the frames seen."""
+    if config is not None:
+        raise ConfigError(f"the configuration of {continues} holds for what continues it: leave out --config")
+    if output is not None and output.resolve() == continues.resolve():
+        raise RunError(f"{output} is the run to continue, and would be lost with this one: choose another --output")
+    own = load_config(RunFolder.open(continues).require("config.yaml"))
+    settings = load_config(continues / "config.yaml", overrides)
+    for name in _SETTLED:
+        if getattr(settings, name) != getattr(own, name):
+            raise ConfigError(f"{name} is settled by the frames of {continues}: leave out --set {name}..., or run anew")
+    return settings
+
+
+def _drive(continues: Path, weights_sha256: str, following: FrameSequence) -> Drive:
+    """What is kept of a run to continue, if these networks and frames can go on with it."""
+    drive = Drive.read(continues)
+    if drive.weights_sha256 != weights_sha256:
+        raise RunError(f"{continues} was run with other weights: continue it with the same --weights")
+    twice = overlapping(following.provenance(), drive.sources)
+    if twice:
+        raise RunError(f"{', '.join(twice)} holds frames of {continues}: give those that follow, with --frames A:B")
+    return drive
 
 
 def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, error: BaseException) -> None:
@@ -169,14 +185,18 @@ def _seed(seed: int) -> None:
 
 
 def _run(
-    folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, report: bool
+    folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, output: OutputConfig
 ) -> SlamResult:
     estimate = pipeline.estimate()
     _write_estimate(folder, estimate, sequence.intrinsics)
+    if output.keep != "nothing":
+        folder.write(DRIVE, Drive.of(sequence, estimate.observer, provenance.weights_sha256).write)
+    if output.keep == "keyframes":
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, estimate.observer.seen.keyframes))
     result = replace(estimate, map=pipeline.fuse(estimate))
-    surface = _write_map(folder, result, sequence)
-    folder.write_metrics(_metrics(result, sequence, provenance, surface.summary))
-    if report:
+    surface = write_map(folder, result, sequence)
+    folder.write_metrics(run_metrics(result, sequence, provenance, surface.summary))
+    if output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, surface.points, surface.colours)
     return result
@@ -188,7 +208,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, intrinsics: Intrinsic
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
-    lidar = _lidar_trajectory(result)
+    lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("trajectory_lidar", lidar)
     folder.write("graph.g2o", result.graph.write_g2o)
@@ -201,133 +221,6 @@ def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
     views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.observations.views)
     T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
     return Places(intrinsics, views, T_world_camera)
-
-
-def _lidar_trajectory(result: SlamResult) -> Trajectory | None:
-    """The LiDAR's path with the stamps of its frames."""
-    if result.lidar is None:
-        return None
-    return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
-
-
-def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
-    """Errors of the LiDAR's path against the truth at its own frames."""
-    lidar = _lidar_trajectory(result)
-    if lidar is None or result.lidar is None:
-        return null("lidar", "the sequence has no LiDAR scans")
-    reference = None if result.reference is None else result.reference.select(result.lidar.frames).rebased()
-    return {"lidar": trajectory_metrics(lidar, reference)}
-
-
-def _metrics(
-    result: SlamResult, sequence: FrameSequence, provenance: Provenance, map_summary: dict[str, Any]
-) -> dict[str, Any]:
-    reference = result.reference
-    trajectories = {
-        "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
-        "odometry": trajectory_metrics(result.odometry, reference),
-        "optimised": trajectory_metrics(result.optimised, reference),
-        **_lidar_metrics(result),
-    }
-    metrics: dict[str, Any] = finite(
-        {
-            "schema": SCHEMA,
-            "status": "ok",
-            "provenance": asdict(provenance),
-            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
-            | describe_bridged(result.observations.bridged),
-            "timing": describe_timing(result.stopwatch, len(sequence)),
-            "scale": _scale(result),
-            "trajectories": trajectories,
-            "graph": _graph(result),
-            "loops": result.loops.summary(),
-            "map": map_summary,
-        }
-    )
-    return metrics
-
-
-def _network_snippets(result: SlamResult) -> SnippetErrors | None:
-    """The paper's protocol on the network's direct answers; None without truth or with other snippets."""
-    snippets = result.observations.snippets
-    if result.reference is None or len(snippets[0].sources) != 4:
-        return None
-    predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
-    return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
-
-
-def _scale(result: SlamResult) -> dict[str, Any]:
-    estimate = result.scale.estimate
-    if isinstance(estimate, Refusal):
-        return {"mode": result.scale.mode, **null("value", estimate.reason)}
-    return {
-        "mode": result.scale.mode,
-        "value": estimate.value,
-        "spread": estimate.spread,
-        "frames_used": estimate.frames_used,
-    }
-
-
-def _graph(result: SlamResult) -> dict[str, Any]:
-    """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
-    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
-    if result.reference is None:
-        return summary | null("coverage", "the sequence has no true poses")
-    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
-    if not aligned.scale > 0:
-        return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
-    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """The map as points for the report, and its numbers."""
-
-    summary: dict[str, Any]
-    points: NDArray[np.float64] | None = None
-    colours: NDArray[np.float64] | None = None
-
-
-def _write_map(folder: RunFolder, result: SlamResult, sequence: FrameSequence) -> _Surface:
-    if result.map is None:
-        return _Surface(_no_map("fusion is switched off (mapping.enabled)"))
-    try:
-        folder.write("map_mesh.ply", result.map.write_mesh)
-        folder.write("map_cloud.ply", result.map.write_cloud)
-    except SlamError as error:
-        logger.warning("no map: %s", error)
-        return _Surface(_no_map(str(error)))
-    cloud = result.map.cloud()
-    quality = _map_quality(cloud.points_world, result, sequence)
-    return _Surface(asdict(result.map.statistics()) | quality, cloud.points_world, cloud.colours)
-
-
-def _no_map(reason: str) -> dict[str, Any]:
-    names = ("triangles", "points", "blocks", "accuracy_median_m", "completeness")
-    return {key: value for name in names for key, value in null(name, reason).items()}
-
-
-def _map_quality(points: NDArray[np.float64], result: SlamResult, sequence: FrameSequence) -> dict[str, Any]:
-    """Distance to the true street and share of it found, the map moved with its trajectory to the truth."""
-    base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
-    street = getattr(base, "street", None)
-    if result.reference is None or street is None:
-        reason = "the true surface is known for the embedded simulated sequence only"
-        return null("accuracy_median_m", reason) | null("completeness", reason)
-    to_truth = pose_similarity(result.reference.T_world_camera, result.optimised.T_world_camera)
-    T_street_first = street.T_world_camera[first]
-    points_true = apply(T_street_first, to_truth.scale * points @ to_truth.R_a_b.T + to_truth.t_a_b)
-    seen = [
-        visible_surface(street.render(k).depth, sequence.intrinsics.K, street.T_world_camera[k], step=8)
-        for k in range(first, first + len(sequence), 10)
-    ]
-    rng = np.random.default_rng(0)
-    sample = points_true[rng.permutation(len(points_true))[:20_000]]
-    return {
-        "accuracy_median_m": accuracy_median_m(sample, street.distance_to_surface),
-        "completeness": completeness(np.concatenate(seen), points_true),
-    }
 
 
 @contextmanager

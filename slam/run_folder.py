@@ -25,6 +25,8 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
     "graph.g2o",
     "loops.json",
     "places.npz",
+    "drive.zip",
+    "keyframes.npz",
     "map_mesh.ply",
     "map_cloud.ply",
     "report.html",

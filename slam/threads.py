@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -13,16 +14,16 @@ from threadpoolctl import threadpool_limits
 T = TypeVar("T")
 
 
-def read_ahead(read: Callable[[int], T], count: int) -> Iterator[T]:
-    """What ``read`` gives for 0, 1, ... ``count`` - 1, each read in another thread while the one before is used."""
+def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
+    """What ``read`` gives for each of some numbers, in another thread while the one before is used."""
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
-        following = ahead.submit(read, 0) if count else None
-        for index in range(count):
-            assert following is not None
-            current = following.result()
-            if index + 1 < count:
-                following = ahead.submit(read, index + 1)
-            yield current
+        waiting: deque[Future[T]] = deque()
+        for number in numbers:
+            waiting.append(ahead.submit(read, number))
+            if len(waiting) > 1:
+                yield waiting.popleft().result()
+        for last in waiting:
+            yield last.result()
 
 
 @contextmanager

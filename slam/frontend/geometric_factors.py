@@ -31,6 +31,7 @@ from slam.frontend.spans import Span
 from slam.frontend.tracking import CornerTracker, Tracks
 from slam.frontend.two_view import CORNER_CORRELATION, Matches, TwoView, TwoViewEstimator
 from slam.memory import Recall, compute_anew
+from slam.records import Learner
 from slam.se3 import FloatArray, invert, make
 
 ESSENTIAL_SOURCE = "essential"
@@ -93,8 +94,10 @@ class Motion:
         return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, chain_sigmas=chain_sigmas)
 
 
-class GeometricOdometry:
+class GeometricOdometry(Learner):
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
+
+    remembers = ("_tracker", "_movers", "_two_views", "_last")
 
     def __init__(self, config: GeometryConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config

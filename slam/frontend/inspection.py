@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from slam.config import BridgingConfig
 from slam.frames import Image
 from slam.frontend.refusal import Refusal
+from slam.records import Learner
 
 _THUMB = (32, 16)  # width, height
 
 Verdict = Literal["new", "repeated"] | Refusal
 
 
-class FrameGate:
+class FrameGate(Learner):
     """Looks at the images of one sequence in time order."""
+
+    remembers = ("_last", "_usable", "_doubtful")
 
     def __init__(self, config: BridgingConfig) -> None:
         self._config = config

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.records import Learner
 from slam.se3 import FloatArray
 
 _CELL_PX = 8.0
@@ -22,8 +23,10 @@ _KEPT = 0.9
 _BELIEVED_CORNERS = 0.5
 
 
-class Movers:
+class Movers(Learner):
     """The share of corners that fitted the camera's motion, place by place, over the last steps of one drive."""
+
+    remembers = ("_fitting", "_all")
 
     def __init__(self, width: int, height: int, sharpness: float) -> None:
         """Nothing seen yet.

@@ -19,6 +19,7 @@ from slam.config import RoadConfig
 from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.refusal import Refusal
 from slam.memory import Answer, Recall, compute_anew
+from slam.records import Learner
 from slam.se3 import FloatArray
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
@@ -40,12 +41,14 @@ class RoadStep:
     normal: FloatArray
 
 
-class RoadAligner:
+class RoadAligner(Learner):
     """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it.
 
     A car ahead hides most of a long strip of road and stands still in the image. Where the long strip is refused, a
     short and wide one is asked, which ends before such a car; it is less sure.
     """
+
+    remembers = ("_directions",)
 
     def __init__(self, config: RoadConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config

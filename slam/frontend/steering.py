@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.frontend.epipolar import Heading
+from slam.records import Learner
 from slam.se3 import FloatArray
 
 _REMEMBERED = 200
@@ -28,8 +29,10 @@ _SLOPE_SIGMA = 2.0
 _HALF_WEIGHT_SIGMAS = 2.0
 
 
-class Steering:
+class Steering(Learner):
     """How the turns and directions of one drive belong together, learned from one step after the other."""
+
+    remembers = ("_turns", "_directions", "_covariances")
 
     def __init__(self, least_sigma: float) -> None:
         """Nothing seen yet.

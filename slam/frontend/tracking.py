@@ -18,6 +18,7 @@ from slam.config import GeometryConfig
 from slam.frames import Frame, Image
 from slam.frontend.foresight import Foresight, Grey, Pixels
 from slam.memory import Answer, Recall, compute_anew
+from slam.records import Learner
 from slam.se3 import FloatArray
 
 _REMEMBERED = 4
@@ -38,13 +39,15 @@ class Tracks:
     names: NDArray[np.int64]
 
 
-class CornerTracker:
+class CornerTracker(Learner):
     """Follows corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
+
+    remembers = ("_seen", "_named")
 
     def __init__(self, config: GeometryConfig, recall: Recall = compute_anew) -> None:
         self._config = config
         self._recall = recall
-        self._seen: OrderedDict[int, _Seen] = OrderedDict()
+        self._seen: OrderedDict[int, SeenImage] = OrderedDict()
         self._named = 0
 
     def track(self, previous: Frame, current: Frame, foresight: Foresight | None = None) -> Tracks:
@@ -56,7 +59,7 @@ class CornerTracker:
         forward, kept = self._found_again(first, second, first.corners.pixels, foresight)
         names = first.corners.names[kept]
         if second.corners is None:
-            self._fill(second, _Corners(forward[kept], names))
+            self._fill(second, Corners(forward[kept], names))
         return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), names)
 
     def ask_across(self, previous: Frame, current: Frame, foresight: Foresight) -> Callable[[], Tracks]:
@@ -85,7 +88,7 @@ class CornerTracker:
         return find
 
     def _found_again(
-        self, first: _Seen, second: _Seen, points: Pixels, foresight: Foresight | None
+        self, first: SeenImage, second: SeenImage, points: Pixels, foresight: Foresight | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Where points ``(M, 2)`` went and which can be believed, sought wider where they are few."""
         config = self._config
@@ -109,17 +112,17 @@ class CornerTracker:
         pixels, kept = self._recall("corners found again", given, follow)
         return pixels, kept
 
-    def _see(self, frame: Frame) -> _Seen:
+    def _see(self, frame: Frame) -> SeenImage:
         seen = self._seen.get(frame.index)
         if seen is None or seen.image is not frame.image:
             grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-            seen = self._seen[frame.index] = _Seen(frame.image, grey)
+            seen = self._seen[frame.index] = SeenImage(frame.image, grey)
         self._seen.move_to_end(frame.index)
         while len(self._seen) > _REMEMBERED:
             self._seen.popitem(last=False)
         return seen
 
-    def _fill(self, seen: _Seen, arrived: _Corners) -> None:
+    def _fill(self, seen: SeenImage, arrived: Corners) -> None:
         """Give a frame the corners that arrived and new ones where there is room."""
         config = self._config
         pixels, names = arrived.pixels, arrived.names
@@ -132,7 +135,7 @@ class CornerTracker:
             pixels = np.concatenate([pixels, fresh])
             names = np.concatenate([names, self._named + np.arange(len(fresh))])
             self._named += len(fresh)
-        seen.corners = _Corners(pixels, names)
+        seen.corners = Corners(pixels, names)
 
     def _fresh(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
         """At most ``room`` corners ``(M, 2)`` away from those known."""
@@ -214,7 +217,9 @@ class _Found:
 
 
 @dataclass(frozen=True)
-class _Corners:
+class Corners:
+    """Corners of one image, pixels ``(M, 2)``, and their names ``(M,)``."""
+
     pixels: Pixels
     names: NDArray[np.int64]
 
@@ -226,12 +231,14 @@ def _exposed_like(grey: Grey, other: Grey) -> Grey:
     return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))
 
 
-def _no_corners() -> _Corners:
-    return _Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
+def _no_corners() -> Corners:
+    return Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
 
 
 @dataclass
-class _Seen:
+class SeenImage:
+    """An image, its grey levels, and its corners once they are known."""
+
     image: Image
     grey: Grey
-    corners: _Corners | None = None
+    corners: Corners | None = None

@@ -20,6 +20,7 @@ from slam.config import GeometryConfig
 from slam.frontend.epipolar import Heading, cross, heading_by_essential, heading_by_points, triangulated_depth
 from slam.frontend.steering import Steering
 from slam.memory import Answer, Recall, compute_anew
+from slam.records import Learner
 from slam.se3 import FloatArray
 
 _ITERATIONS = 10
@@ -77,8 +78,10 @@ class _Belief:
     axis_sigma: float
 
 
-class TwoViewEstimator:
+class TwoViewEstimator(Learner):
     """Estimates the motions of one drive, one after the other."""
+
+    remembers = ("_directions", "_depth_shares", "_steering", "_last")
 
     def __init__(self, config: GeometryConfig, focal_px: float, recall: Recall = compute_anew) -> None:
         self._config = config

@@ -72,22 +72,27 @@ class Drive:
         _RECORDS.write(path, **vars(self))
 
     @classmethod
-    def read(cls, folder: Path) -> Self:
-        """Read what a run left in its folder.
+    def read(cls, path: Path) -> Self:
+        """Read what ``write`` wrote.
 
         Raises:
             RunError: missing, damaged or of another version.
         """
+        content = _RECORDS.read(path)
+        try:
+            return cls(**content)
+        except TypeError as error:
+            raise RunError(f"{path} is damaged: run the sequence again") from error
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Read what a run left in its folder, keyframes where it kept them; raises as ``read``."""
         if not (folder / DRIVE).is_file():
             raise RunError(
                 f"{folder} cannot be continued: it has no {DRIVE}; give a folder that 'erfsfm-slam run' wrote and "
-                "finished with output.keep=drive"
+                "finished, and not with output.keep=nothing"
             )
-        content = _RECORDS.read(folder / DRIVE)
-        try:
-            drive = cls(**content)
-        except TypeError as error:
-            raise RunError(f"{folder / DRIVE} is damaged: run the sequence again") from error
+        drive = cls.read(folder / DRIVE)
         if (folder / KEYFRAMES).is_file():
             drive.seen.keyframes.extend(_read_keyframes(folder / KEYFRAMES))
         return drive

@@ -10,7 +10,9 @@ import numpy as np
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
 from slam.config import SlamConfig
+from slam.drive import Drive
 from slam.errors import SlamError
+from slam.files import write_atomically
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.frontend.scale import rescaled, resolve_mode
 from slam.loops.closure import LoopClosures
@@ -39,6 +41,7 @@ class Slam:
         update_frames: int = 10,
         sweep_frames: int = 100,
         noise: PoseNoise | None = None,
+        weights_sha256: str = "",
     ) -> None:
         """Prepare for the first frame.
 
@@ -50,6 +53,7 @@ class Slam:
             update_frames: the graph is solved after so many frames, and when it is asked.
             sweep_frames: loops are looked for after so many frames; 0 leaves it to ``close_loops``.
             noise: of the snippet poses; None measures it against image geometry alone.
+            weights_sha256: of the networks, so that what others saw is not resumed.
 
         Raises:
             SlamError: a scale mode that wants more than images.
@@ -62,6 +66,7 @@ class Slam:
             raise SlamError("scale mode camera-height wants camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = config.model_copy(update={"mapping": without_map})
+        self._weights_sha256 = weights_sha256
         self._drive = _Drive(intrinsics, camera_height_m)
         self._pipeline = SlamPipeline(self._drive, predictor, config, noise=noise)
         self._observer = Observer(predictor, intrinsics, config, Stopwatch())
@@ -83,7 +88,14 @@ class Slam:
     ) -> Slam:
         """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
         networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
-        return cls(NetworkPredictor(networks), intrinsics, config, camera_height_m, noise=networks.noise)
+        return cls(
+            NetworkPredictor(networks),
+            intrinsics,
+            config,
+            camera_height_m,
+            noise=networks.noise,
+            weights_sha256=networks.sha256,
+        )
 
     def __len__(self) -> int:
         """Number of frames so far."""
@@ -111,6 +123,30 @@ class Slam:
             self.close_loops()
         elif len(self) % self._update_frames == 0:
             self._update()
+
+    def save(self, path: Path) -> None:
+        """Keep all that was measured in a file, for `resume`; frames may go on coming.
+
+        Raises:
+            SlamError: the file cannot be written.
+        """
+        self._observer.settle()
+        write_atomically(path, Drive.of(self._drive, self._observer, self._weights_sha256).write)
+
+    def resume(self, path: Path) -> None:
+        """Go on after the last frame of what `save` kept, as if there had been no pause; loops are looked for anew.
+
+        Raises:
+            SlamError: frames came already, or the file is missing, damaged or of another camera or other weights.
+        """
+        if len(self):
+            raise SlamError(f"{path} is resumed before the first frame; {len(self)} came already")
+        drive = Drive.read(path)
+        mine = (self._drive.intrinsics, self._drive.camera_height_m, self._weights_sha256)
+        if (drive.intrinsics, drive.camera_height_m, drive.weights_sha256) != mine:
+            raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
+        drive.resume(self._observer)
+        self._drive.stamps = drive.stamps
 
     def trajectory(self) -> Trajectory:
         """All frames so far; where no snippet has been seen yet, the camera is taken to stand.

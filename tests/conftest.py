@@ -77,7 +77,10 @@ _METRICS = {
 # may be null only where they are null for a reason; these never are
 _ALWAYS = {"schema", "status", "provenance", "frames", "name", "timing", "mode", "nodes", "factors", *_PROVENANCE}
 _STEMS = ("trajectory_network", "trajectory_odometry", "trajectory_optimised")
-_FILES = ("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz", "report.html", "run.log")
+_FILES = (
+    *("config.yaml", "metrics.json", "graph.g2o", "loops.json", "places.npz", "drive.zip"),
+    *("report.html", "run.log"),
+)
 _MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
 
 

@@ -15,6 +15,8 @@ from slam.sequences.recording import require_frame
 
 logger = logging.getLogger(__name__)
 
+_ROUNDING_PX = 0.01
+
 
 class Continued:
     """So many frames of before, then all of another sequence of the same camera. LiDAR scans are not followed."""
@@ -41,10 +43,10 @@ class Continued:
         Raises:
             SequenceError: another camera.
         """
-        if following.intrinsics != intrinsics:
+        if not _alike(following.intrinsics, intrinsics):
             raise SequenceError(
-                f"{following.name} was taken with another camera: {following.intrinsics}, and the run to continue with "
-                f"{intrinsics}: give frames of the same camera and size"
+                f"{following.name} was taken with another camera, {_described(following.intrinsics)}, than the frames "
+                f"before it, {_described(intrinsics)}: give frames of the same camera and size"
             )
         self.name, self.intrinsics, self.camera_height_m = name, intrinsics, camera_height_m
         self.before = len(stamps)
@@ -70,6 +72,15 @@ class Continued:
     def provenance(self) -> tuple[str, ...]:
         """Names of all that it is made of, as the leak record of a checkpoint writes them."""
         return (*self._sources, *self._following.provenance())
+
+
+def _alike(a: Intrinsics, b: Intrinsics) -> bool:
+    """The same camera, up to the rounding of calibration files."""
+    return (a.width, a.height) == (b.width, b.height) and bool(np.abs(a.K - b.K).max() < _ROUNDING_PX)
+
+
+def _described(camera: Intrinsics) -> str:
+    return f"{camera.width} x {camera.height} pixels, fx {camera.fx:.2f}, fy {camera.fy:.2f}"
 
 
 def _after(stamps: FloatArray, following: FloatArray) -> FloatArray:

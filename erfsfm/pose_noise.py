@@ -36,7 +36,8 @@ class PoseNoise(Section):
 
     They add in squares: ``frame`` for each frame between the two, ``turn`` of the angle turned (for the translation:
     of the angle a frame, times the length), ``length`` of the length moved, ``disagreement`` of what the measurements
-    in both directions differ by. ``correlation`` is that of the whitened errors of both directions.
+    in both directions differ by, ``residual`` of the photometric residual (``erfsfm.photometric_residual``; for the
+    translation times the length). ``correlation`` is that of the whitened errors of both directions.
     """
 
     format: Literal[1] = 1
@@ -44,6 +45,7 @@ class PoseNoise(Section):
     turn: _Six
     length: _Six
     disagreement: _Six
+    residual: _Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     correlation: tuple[
         Annotated[float, Field(ge=0, le=1)],
         Annotated[float, Field(ge=0, le=1)],
@@ -56,10 +58,14 @@ class PoseNoise(Section):
     measured_on: list[str] = Field(description="recordings and frame ranges")
     pairs: int = Field(ge=1, description="measured pairs of frames")
 
+    @property
+    def coefficients(self) -> FloatArray:
+        """``(5, 6)``, in the order of `PairPose.features`."""
+        return np.array([self.frame, self.turn, self.length, self.disagreement, self.residual])
+
     def sigmas(self, pair: PairPose) -> FloatArray:
         """Sigmas ``(6,)`` of the mean of a pair's measurements, in the later camera."""
-        coefficients = np.array([self.frame, self.turn, self.length, self.disagreement])  # (4, 6)
-        single = np.sqrt((coefficients**2 * pair.features**2).sum(axis=0))
+        single = np.sqrt((self.coefficients**2 * pair.features**2).sum(axis=0))
         n = pair.measurements
         return np.asarray(single * np.sqrt((1.0 + (n - 1) * np.array(self.correlation)) / n))
 
@@ -68,13 +74,15 @@ class PoseNoise(Section):
 class PairPose:
     """What snippets measured between two frames: ``T_first_last`` ``(4, 4)``, the mean of both directions, unscaled.
 
-    ``directions`` ``(M, 4, 4)`` are the single measurements, each as ``T_first_last``.
+    ``directions`` ``(M, 4, 4)`` are the single measurements, each as ``T_first_last``, ``residual`` the mean of their
+    photometric residuals.
     """
 
     first: int
     last: int
     T_first_last: FloatArray
     directions: FloatArray
+    residual: float
 
     @property
     def measurements(self) -> int:
@@ -83,30 +91,38 @@ class PairPose:
 
     @property
     def features(self) -> FloatArray:
-        """What the noise grows with ``(4, 6)``: frames, turn, length, disagreement of both directions."""
+        """What the noise grows with ``(5, 6)``: frames, turn, length, disagreement of both directions, residual."""
         frames = float(self.last - self.first)
         turn = float(np.linalg.norm(tangent(self.T_first_last)[:3]))
         length = float(np.linalg.norm(self.T_first_last[:3, 3]))
         differ = np.zeros(6)
         if self.measurements > 1:
             differ = np.abs(difference(self.directions[0], self.directions[1]))
-        rows = [np.full(6, frames), np.repeat([turn, turn / frames * length], 3), np.full(6, length), differ]
-        return np.stack(rows)
+        by_turn = np.repeat([turn, turn / frames * length], 3)
+        by_residual = self.residual * np.repeat([1.0, length], 3)
+        return np.stack([np.full(6, frames), by_turn, np.full(6, length), differ, by_residual])
 
 
-def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray]]) -> list[PairPose]:
+def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArray | None]]) -> list[PairPose]:
     """Every pair of frames that snippets measured, once.
 
     Args:
-        snippets: target, sources and ``T_source_target`` ``(N, 4, 4)`` of each.
+        snippets: target, sources, ``T_source_target`` ``(N, 4, 4)`` and photometric residuals ``(N,)`` of each; where
+            these are None, nothing is known to be explained.
     """
-    measured: dict[tuple[int, int], list[FloatArray]] = {}
-    for target, sources, T_source_target in snippets:
-        for source, T in zip(sources, T_source_target, strict=True):
+    measured: dict[tuple[int, int], list[tuple[FloatArray, float]]] = {}
+    for target, sources, T_source_target, residuals in snippets:
+        left = np.ones(len(sources)) if residuals is None else residuals
+        for source, T, residual in zip(sources, T_source_target, left, strict=True):
             forward = source < target
             pair = (source, target) if forward else (target, source)
-            measured.setdefault(pair, []).append(np.asarray(T if forward else np.linalg.inv(T), dtype=np.float64))
-    return [PairPose(*pair, _mean(poses), np.stack(poses)) for pair, poses in sorted(measured.items())]
+            T_first_last = np.asarray(T if forward else np.linalg.inv(T), dtype=np.float64)
+            measured.setdefault(pair, []).append((T_first_last, float(residual)))
+    pairs = []
+    for (first, last), directions in sorted(measured.items()):
+        poses, shares = [T for T, _ in directions], [residual for _, residual in directions]
+        pairs.append(PairPose(first, last, _mean(poses), np.stack(poses), float(np.mean(shares))))
+    return pairs
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:

@@ -96,12 +96,14 @@ class SnippetPoses:
     """A pose network's answer for one snippet.
 
     ``T_source_target`` ``(N, 4, 4)``: target camera to source camera, unscaled, row k for
-    ``sources[k]`` in time order; ``target`` is the middle frame.
+    ``sources[k]`` in time order; ``target`` is the middle frame. ``residuals`` ``(N,)`` are the shares of the images'
+    differences that these poses leave unexplained, None where no one looked.
     """
 
     target: int
     sources: tuple[int, ...]
     T_source_target: FloatArray
+    residuals: FloatArray | None = None
 
 
 class Predictor(Protocol):

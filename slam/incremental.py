@@ -89,7 +89,7 @@ class Slam:
         """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
         networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
         return cls(
-            NetworkPredictor(networks),
+            NetworkPredictor(networks, intrinsics),
             intrinsics,
             config,
             camera_height_m,
@@ -116,6 +116,8 @@ class Slam:
             raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
         if len(self) and not stamp > self._drive.stamps[-1]:
             raise ValueError(f"stamps must increase; got {stamp} after {self._drive.stamps[-1]}")
+        image = image.copy()  # it is looked at again when the next one comes
+        image.setflags(write=False)
         index = len(self)
         self._drive.stamps = np.append(self._drive.stamps, stamp)
         self._observer.add(index, Frame(index, float(stamp), image))

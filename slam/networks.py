@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.inference import depth_at
-from slam.frames import DepthMap, Frame, Image, SnippetPoses
+from erfsfm.photometric_residual import PhotometricResidual
+from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
 
 
 class Networks(Protocol):
@@ -29,18 +31,36 @@ class Networks(Protocol):
 class NetworkPredictor:
     """Answers by frame what networks answer by image."""
 
-    def __init__(self, networks: Networks) -> None:
+    def __init__(self, networks: Networks, intrinsics: Intrinsics) -> None:
+        """Ask networks about the frames of one sequence.
+
+        Args:
+            networks: whom to ask.
+            intrinsics: of all images.
+        """
         self._networks = networks
+        self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
+        self._known: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=networks.sources + 1)
         self.sources = networks.sources
 
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` at the image's size."""
         height, width = frame.image.shape[:2]
-        return depth_at(self._networks.disparity(frame.image), height, width)
+        return depth_at(self._disparity(frame), height, width)
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
-        T_source_target = self._networks.poses([frame.image for frame in frames])
+        images = [frame.image for frame in frames]
+        T_source_target = self._networks.poses(images)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        return SnippetPoses(frames[middle].index, sources, T_source_target)
+        residuals = self._residual.shares(images, self._disparity(frames[middle]), T_source_target)
+        return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
+
+    def _disparity(self, frame: Frame) -> NDArray[np.float32]:
+        for index, disparity in self._known:
+            if index == frame.index:
+                return disparity
+        disparity = self._networks.disparity(frame.image)
+        self._known.append((frame.index, disparity))
+        return disparity

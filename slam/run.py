@@ -99,7 +99,7 @@ def run_slam(
     if drive is not None:
         recording = drive.continued(recording)
     memory = None if cache is None else Memory(cache)
-    predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory))
+    predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory), recording.intrinsics)
     recall = compute_anew if memory is None else Recollection(memory, _code()).recall
     provenance = Provenance(
         version=__version__,

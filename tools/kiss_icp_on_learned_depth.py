@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> None:
         if options.cache is not None:
             networks = CachedNetworks(networks, networks.sha256, options.cache)
         settings = load_config(None, options.set)
-        result = SlamPipeline(recording, NetworkPredictor(networks), settings).estimate()
+        result = SlamPipeline(recording, NetworkPredictor(networks, recording.intrinsics), settings).estimate()
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error
     if result.reference is None or not result.observations.keyframes:

@@ -20,6 +20,7 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import Networks, refuse_leak, windows
+from erfsfm.photometric_residual import PhotometricResidual
 from erfsfm.pose_noise import FloatArray, PoseNoise, difference, pair_poses
 
 LEVELS = (0.5, 0.9, 0.95)
@@ -35,7 +36,7 @@ class PairErrors:
     """Errors of P pairs of a recording, in the later camera and the networks' unit.
 
     ``mean`` ``(P, 6)`` of the mean of both directions, ``single`` ``(P, 2, 6)`` of each (NaN where there is one),
-    ``features`` ``(P, 4, 6)`` as in `PairPose`.
+    ``features`` ``(P, 5, 6)`` as in `PairPose`.
     """
 
     recording: str
@@ -88,16 +89,19 @@ def measure(networks: Networks, recording: Recording) -> PairErrors:
     """Errors of all pairs, the truth brought to the networks' unit, which is followed along the drive."""
     T_world_camera = recording.true_poses()
     assert T_world_camera is not None
-    half = networks.sources // 2
+    half, camera = networks.sources // 2, recording.camera
+    residual = PhotometricResidual(camera.K.astype(np.float64), camera.width, camera.height)
     snippets = []
-    for target, T_source_target in enumerate(windows(networks, recording), start=half):
+    for target, images in enumerate(windows(networks, recording), start=half):
         sources = [k for k in range(target - half, target + half + 1) if k != target]
-        snippets.append((target, sources, T_source_target))
+        T_source_target = networks.poses(images)
+        shares = residual.shares(images, np.reciprocal(networks.depth(images[half])), T_source_target)
+        snippets.append((target, sources, T_source_target, shares))
     return pair_errors(recording.frames_name, snippets, T_world_camera)
 
 
 def pair_errors(
-    name: str, snippets: Sequence[tuple[int, Sequence[int], FloatArray]], T_world_camera: FloatArray
+    name: str, snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArray | None]], T_world_camera: FloatArray
 ) -> PairErrors:
     """Errors of what snippets measured against the truth ``(N, 4, 4)``."""
     pairs = pair_poses(snippets)
@@ -122,10 +126,10 @@ def pair_errors(
 
 def fit(errors: Sequence[PairErrors], pose_sha256: str) -> PoseNoise:
     """The noise that explains the errors of some recordings."""
-    laws = np.array([_fit_component(errors, k) for k in range(6)]).T  # (4, 6)
+    laws = np.array([_fit_component(errors, k) for k in range(6)]).T  # (5, 6)
     spread = [np.sqrt((laws**2 * e.features**2).sum(axis=1)) for e in errors]  # (P, 6) each
     correlation = [_correlation(errors, spread, k) for k in range(6)]
-    frame, turn, length, disagreement = laws
+    frame, turn, length, disagreement, residual = laws
 
     def noise(factor: float) -> PoseNoise:
         return PoseNoise(
@@ -133,6 +137,7 @@ def fit(errors: Sequence[PairErrors], pose_sha256: str) -> PoseNoise:
             turn=_six(factor * turn),
             length=_six(factor * length),
             disagreement=_six(factor * disagreement),
+            residual=_six(factor * residual),
             correlation=_six(np.array(correlation)),
             pose_sha256=pose_sha256,
             measured_on=[e.recording for e in errors],
@@ -148,10 +153,9 @@ def fit(errors: Sequence[PairErrors], pose_sha256: str) -> PoseNoise:
 
 def coverage(errors: PairErrors, noise: PoseNoise) -> list[float]:
     """Share of pairs whose whitened squared error lies inside the 50, 90 and 95 % quantile of chi-square(6)."""
-    coefficients = np.array([noise.frame, noise.turn, noise.length, noise.disagreement])
     count = np.isfinite(errors.single[:, :, 0]).sum(axis=1)[:, None]
     merged = (1 + (count - 1) * np.array(noise.correlation)) / count
-    squared = (errors.mean**2 / ((coefficients**2 * errors.features**2).sum(axis=1) * merged)).sum(axis=1)
+    squared = (errors.mean**2 / ((noise.coefficients**2 * errors.features**2).sum(axis=1) * merged)).sum(axis=1)
     return [float((squared <= chi2.ppf(level, 6)).mean()) for level in LEVELS]
 
 
@@ -162,7 +166,7 @@ def _six(values: FloatArray) -> tuple[float, float, float, float, float, float]:
 
 
 def _fit_component(errors: Sequence[PairErrors], k: int) -> FloatArray:
-    """Coefficients ``(4,)`` of one component by the likelihood of Student's t, single measurements, all recordings."""
+    """Coefficients ``(5,)`` of one component by the likelihood of Student's t, single measurements, all recordings."""
     squares = [np.nanmean(e.single[:, :, k] ** 2, axis=1) for e in errors]
     features = [e.features[:, :, k] ** 2 for e in errors]
     typical = max(float(np.sqrt(np.median(np.concatenate(squares)))), _LEAST)
@@ -177,8 +181,8 @@ def _fit_component(errors: Sequence[PairErrors], k: int) -> FloatArray:
             total += float(np.mean(0.5 * np.log(variance) + heavy))
         return total
 
-    best = minimize(cost, np.full(4, -0.7), method="L-BFGS-B", bounds=[(-7.0, 3.0)] * 4)
-    return np.asarray(units * np.exp(best.x) * (sizes > 0) + _LEAST * (np.arange(4) == 0))
+    best = minimize(cost, np.full(5, -0.7), method="L-BFGS-B", bounds=[(-7.0, 3.0)] * 5)
+    return np.asarray(units * np.exp(best.x) * (sizes > 0) + _LEAST * (np.arange(5) == 0))
 
 
 def _correlation(errors: Sequence[PairErrors], spread: Sequence[FloatArray], k: int) -> float:

@@ -118,7 +118,7 @@ def _pose_rows(
     true = snippets_from_trajectory(T_world_camera, length)
     if len(true) == 0:
         raise DataError(f"{recording.name} has {len(recording)} frames; a snippet needs {length}")
-    predicted = np.stack([snippet_from_network(T_source_target) for T_source_target in windows(networks, recording)])
+    predicted = np.stack([snippet_from_network(networks.poses(images)) for images in windows(networks, recording)])
     straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
     rows = []
@@ -129,13 +129,13 @@ def _pose_rows(
     return rows
 
 
-def windows(networks: Networks, recording: Recording) -> Iterator[NDArray[np.float64]]:
-    """What the pose network says of each window; no more images are held than one window has."""
+def windows(networks: Networks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
+    """The images of each window of a pose network; no more of them are held than one window has."""
     images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):
         images.append(recording.image(index, recording.camera.height, recording.camera.width))
         if len(images) == images.maxlen:
-            yield networks.poses(list(images))
+            yield list(images)
 
 
 def _median_map(truths: list[NDArray[np.float32]]) -> NDArray[np.float32]:

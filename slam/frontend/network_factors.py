@@ -60,7 +60,7 @@ def calibrated_factors(
         noise: of this network.
         config: ``noise_steps`` common steps are needed before the drive may widen the noise.
     """
-    pairs = pair_poses([(s.target, s.sources, s.T_source_target) for s in snippets])
+    pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
     sigmas = [noise.sigmas(pair) for pair in pairs]
     widening = _widening(pairs, sigmas, geometric, config.noise_steps)
     return [

@@ -29,25 +29,42 @@ def moved(z: float) -> np.ndarray:
 
 
 def test_a_pair_seen_by_two_snippets_is_one_measurement_of_both_directions() -> None:
-    snippets = [(1, (0, 2), np.stack([moved(2.0), moved(-2.0)])), (2, (1, 3), np.stack([moved(2.2), moved(-2.0)]))]
+    snippets = [
+        (1, (0, 2), np.stack([moved(2.0), moved(-2.0)]), np.array([0.3, 0.5])),
+        (2, (1, 3), np.stack([moved(2.2), moved(-2.0)]), np.array([0.7, 0.4])),
+    ]
     pairs = {(pair.first, pair.last): pair for pair in pair_poses(snippets)}
     assert pairs.keys() == {(0, 1), (1, 2), (2, 3)}
     assert [pairs[k, k + 1].measurements for k in range(3)] == [1, 2, 1]
     np.testing.assert_allclose(pairs[1, 2].T_first_last, moved(2.1))
     np.testing.assert_allclose(pairs[2, 3].T_first_last, moved(2.0))
-    frames, turn, length, differ = pairs[1, 2].features
+    frames, turn, length, differ, residual = pairs[1, 2].features
     np.testing.assert_allclose(frames, 1)
     np.testing.assert_allclose(turn, 0, atol=1e-12)
     np.testing.assert_allclose(length, 2.1)
     np.testing.assert_allclose(differ, [0, 0, 0, 0, 0, 0.2], atol=1e-12)
+    assert pairs[1, 2].residual == pytest.approx(0.6)  # of 2 seen from 1, and of 1 seen from 2
+    np.testing.assert_allclose(residual, 0.6 * np.array([1, 1, 1, 2.1, 2.1, 2.1]))
 
 
 def test_correlated_measurements_do_not_count_as_independent() -> None:
-    once, twice = (pair_poses([(1, (0, 2), np.stack([moved(2.0), moved(-2.0)]))] * n)[0] for n in (1, 2))
+    once, twice = (pair_poses([(1, (0, 2), np.stack([moved(2.0), moved(-2.0)]), None)] * n)[0] for n in (1, 2))
     single, both = NOISE.sigmas(once), NOISE.sigmas(twice)
     np.testing.assert_allclose(single[:3], [0.001, 0.002, 0.003])
     np.testing.assert_allclose(single[3:], np.hypot(0.01, [0.04, 0.04, 0.1]))
     np.testing.assert_allclose(both / single, np.sqrt([1, 0.75, 0.5, 1, 0.75, 0.5]))
+
+
+def test_what_the_images_leave_unexplained_widens() -> None:
+    noise = NOISE.model_copy(update={"residual": (0.0, 0.01, 0.0, 0.0, 0.0, 0.1)})
+
+    def sigmas(share: float) -> np.ndarray:
+        residuals = np.array([share, share])
+        return noise.sigmas(pair_poses([(1, (0, 2), np.stack([moved(2.0), moved(-2.0)]), residuals)])[0])
+
+    np.testing.assert_allclose(sigmas(0.0)[:3], [0.001, 0.002, 0.003])
+    np.testing.assert_allclose(sigmas(0.5)[1], np.hypot(0.002, 0.005))
+    np.testing.assert_allclose(sigmas(0.5)[5] ** 2 - sigmas(0.0)[5] ** 2, (0.1 * 0.5 * 2.0) ** 2)
 
 
 def test_noise_comes_back_from_its_file(tmp_path: Path) -> None:

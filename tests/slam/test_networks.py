@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from erfsfm.inference import DepthPosePredictor
-from slam.frames import Frame, Predictor
+from slam.frames import Frame, Intrinsics, Predictor
 from slam.networks import NetworkPredictor
+
+CAMERA = Intrinsics(160, 48, 90.0, 90.0, 79.5, 23.5)
 
 
 @pytest.fixture
@@ -23,7 +25,7 @@ def frames(first: int, count: int = 5) -> list[Frame]:
 
 
 def test_answers_by_frame_what_the_networks_answer_by_image(direct: DepthPosePredictor) -> None:
-    predictor: Predictor = NetworkPredictor(direct)
+    predictor: Predictor = NetworkPredictor(direct, CAMERA)
     snippet = frames(10)
     depth = predictor.depth(snippet[0])
     assert depth.shape == (48, 160) and depth.dtype == np.float32 and (depth > 0).all()
@@ -35,4 +37,23 @@ def test_answers_by_frame_what_the_networks_answer_by_image(direct: DepthPosePre
 
 def test_a_snippet_of_another_length_is_refused(direct: DepthPosePredictor) -> None:
     with pytest.raises(ValueError, match="5 images; got 3"):
-        NetworkPredictor(direct).snippet(frames(0, 3))
+        NetworkPredictor(direct, CAMERA).snippet(frames(0, 3))
+
+
+def test_depth_is_asked_once_a_frame_and_its_residual_goes_with_a_snippet(direct: DepthPosePredictor) -> None:
+    asked = []
+
+    class Counted:
+        sources = direct.sources
+        poses = staticmethod(direct.poses)
+
+        def disparity(self, image: np.ndarray) -> np.ndarray:
+            asked.append(image)
+            return direct.disparity(image)
+
+    predictor, snippet = NetworkPredictor(Counted(), CAMERA), frames(0)
+    for frame in snippet:
+        predictor.depth(frame)
+    poses = predictor.snippet(snippet)
+    assert len(asked) == 5
+    assert poses.residuals is not None and poses.residuals.shape == (4,) and (poses.residuals > 0).all()

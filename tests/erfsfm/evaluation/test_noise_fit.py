@@ -29,10 +29,18 @@ def drive(seed: int, count: int = 260) -> FloatArray:
     return T_world_camera
 
 
-def snippets(T_world_camera: FloatArray, seed: int, shared: float) -> list[tuple[int, Sequence[int], FloatArray]]:
-    """Direct poses in another unit; ``shared`` is the correlation of both directions' errors."""
+Snippets = list[tuple[int, Sequence[int], FloatArray, FloatArray]]
+
+
+def snippets(T_world_camera: FloatArray, seed: int, shared: float, told: float = 0.0) -> Snippets:
+    """Direct poses in another unit.
+
+    ``shared`` is the correlation of both directions' errors; the yaw of a pair errs besides by ``told`` times its
+    photometric residual.
+    """
     rng = np.random.default_rng(seed)
     common: dict[tuple[int, int], FloatArray] = {}
+    left: dict[tuple[int, int], float] = {}
     found = []
     for target in range(2, len(T_world_camera) - 2):
         sources = [target - 2, target - 1, target + 1, target + 2]
@@ -44,15 +52,18 @@ def snippets(T_world_camera: FloatArray, seed: int, shared: float) -> list[tuple
             T = np.linalg.inv(T_world_camera[pair[0]]) @ T_world_camera[pair[1]]
             T[:3, 3] += LENGTH_SHARE * np.linalg.norm(T[:3, 3]) * (T[:3, :3] @ noise[3:])
             T[:3, :3] @= Rotation.from_rotvec(ROTATION * (pair[1] - pair[0]) * noise[:3]).as_matrix()
+            residual = left.setdefault(pair, 0.3 + float(rng.random()) ** 3)
+            T[:3, :3] @= Rotation.from_rotvec([0.0, told * residual * noise[1], 0.0]).as_matrix()
             T[:3, 3] *= UNIT
             poses.append(T if source < target else np.linalg.inv(T))
-        found.append((target, sources, np.stack(poses)))
+        residuals = np.array([left[min(source, target), max(source, target)] for source in sources])
+        found.append((target, sources, np.stack(poses), residuals))
     return found
 
 
-def errors(seed: int, shared: float = 0.8) -> PairErrors:
+def errors(seed: int, shared: float = 0.8, told: float = 0.0) -> PairErrors:
     T_world_camera = drive(seed)
-    return pair_errors(f"drive {seed}", snippets(T_world_camera, seed + 100, shared), T_world_camera)
+    return pair_errors(f"drive {seed}", snippets(T_world_camera, seed + 100, shared, told), T_world_camera)
 
 
 # where both directions share little, their disagreement tells part of each error, and what is left is more alike
@@ -62,8 +73,7 @@ def test_noise_that_is_known_is_found_and_covers_an_unseen_drive(shared: float, 
     unseen = errors(2, shared)
     for frames in (1.0, 2.0):
         squares = (unseen.features[unseen.features[:, 0, 0] == frames] ** 2).mean(axis=0)
-        laws = np.array([noise.frame, noise.turn, noise.length, noise.disagreement])
-        sigmas = np.sqrt((laws**2 * squares).sum(axis=0))
+        sigmas = np.sqrt((noise.coefficients**2 * squares).sum(axis=0))
         np.testing.assert_allclose(sigmas[:3], ROTATION * frames, rtol=0.35)
         np.testing.assert_allclose(sigmas[3:], LENGTH_SHARE * np.sqrt(squares[2, 0]), rtol=0.35)
     assert least < min(noise.correlation) <= max(noise.correlation) < most
@@ -116,3 +126,11 @@ def test_the_command_measures_a_drive(tmp_path: Path, write_root: Callable[..., 
     assert [row["recording"] for row in rows] == noise.measured_on == ["kitti_odometry/00[0:40]"]
     assert noise.pairs == rows[0]["pairs"] > 50 and noise.pose_sha256 == "abc"
     assert min(noise.frame) > 0
+
+
+def test_what_residuals_tell_is_found() -> None:
+    told = 0.01
+    noise = fit([errors(0, told=told), errors(1, told=told)], "abc")
+    assert noise.residual[1] == pytest.approx(told, rel=0.4)
+    assert max(noise.residual[0], noise.residual[2]) < 0.2 * told
+    assert coverage(errors(2, told=told), noise) == pytest.approx([0.5, 0.9, 0.95], abs=0.07)

@@ -1,0 +1,87 @@
+"""How much of the difference between images is left when depth and poses have explained what they can.
+
+What is left is one of the signs of a pose that errs (``erfsfm.pose_noise``). NumPy and OpenCV alone, on small images:
+a sign need not be sharp, and it is asked of every snippet.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_SIZE = (104, 32)  # width, height
+_LEAST_PIXELS = 100
+_LEAST_DIFFERENCE = 1e-3  # grey levels
+
+
+class PhotometricResidual:
+    """Judges the snippets of one camera, one after the other."""
+
+    def __init__(self, K: NDArray[np.float64], width: int, height: int) -> None:
+        """Prepare for images of a size.
+
+        Args:
+            K: camera matrix ``(3, 3)`` of these images, pixels; (0, 0) is the centre of the top-left pixel.
+            width: of the images, pixels.
+            height: likewise.
+        """
+        shrink = np.array([_SIZE[0] / width, _SIZE[1] / height])
+        self._focal = shrink * [K[0, 0], K[1, 1]]
+        self._centre = shrink * (K[:2, 2] + 0.5) - 0.5
+        u, v = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in _SIZE))
+        x, y = (u - self._centre[0]) / self._focal[0], (v - self._centre[1]) / self._focal[1]
+        self._rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])  # (3, P)
+        self._seen: deque[tuple[NDArray[np.uint8], NDArray[np.float32]]] = deque(maxlen=8)
+
+    def shares(
+        self,
+        images: Sequence[NDArray[np.uint8]],
+        disparity_target: NDArray[np.float32],
+        T_source_target: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Mean absolute difference of target and warped source over that of target and source as it is.
+
+        Args:
+            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle.
+            disparity_target: 1/depth of the target in the unit of the poses, of any size.
+            T_source_target: ``(N, 4, 4)``, target camera to source camera, row k for the k-th source in time order.
+
+        Returns:
+            ``(N,)``: 0 where all is explained, 1 where nothing is, or where hardly a pixel is seen in both.
+        """
+        greys = [self._small(image) for image in images]
+        target = greys.pop(len(images) // 2)
+        near = cv2.resize(disparity_target, _SIZE, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
+        return np.array([self._share(target, grey, near, T) for grey, T in zip(greys, T_source_target, strict=True)])
+
+    def _share(
+        self,
+        target: NDArray[np.float32],
+        source: NDArray[np.float32],
+        near: NDArray[np.float64],
+        T_source_target: NDArray[np.float64],
+    ) -> float:
+        x, y, z = T_source_target[:3, :3] @ self._rays + T_source_target[:3, 3:] * near
+        ahead = np.maximum(z, 1e-6)
+        u, v = self._focal[0] * x / ahead + self._centre[0], self._focal[1] * y / ahead + self._centre[1]
+        width, height = _SIZE
+        both = ((z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)).reshape(height, width)
+        if both.sum() < _LEAST_PIXELS:
+            return 1.0
+        columns, rows = (side.reshape(height, width).astype(np.float32) for side in (u, v))
+        warped = cv2.remap(source, columns, rows, cv2.INTER_LINEAR)
+        left, was = (float(np.abs(target - other)[both].mean()) for other in (warped, source))
+        return left / max(was, _LEAST_DIFFERENCE)
+
+    def _small(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        for known, grey in self._seen:
+            if known is image:
+                return grey
+        small = cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA)
+        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.float32)
+        self._seen.append((image, grey))
+        return grey

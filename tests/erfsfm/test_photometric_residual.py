@@ -1,0 +1,76 @@
+"""What images say against a pose: nothing where depth and motion are true, much where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from erfsfm.photometric_residual import PhotometricResidual
+
+WIDTH, HEIGHT = 416, 128
+K = np.array([[240.0, 0.0, 207.5], [0.0, 240.0, 63.5], [0.0, 0.0, 1.0]])
+DEPTH = 10.0
+
+
+def wall(T_wall_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """A wall at z = 10 with soft stripes, as a camera sees it that does not turn."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    depth = DEPTH - T_wall_camera[2, 3]
+    x = (u - K[0, 2]) / K[0, 0] * depth + T_wall_camera[0, 3]
+    y = (v - K[1, 2]) / K[1, 1] * depth + T_wall_camera[1, 3]
+    grey = 128 + 60 * np.sin(2.0 * x) + 50 * np.sin(1.7 * y + 0.6 * x)
+    return np.repeat(np.rint(grey).astype(np.uint8)[:, :, None], 3, axis=2)
+
+
+def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> NDArray[np.float64]:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def share(moved: NDArray[np.float64], believed: NDArray[np.float64], depth: float = DEPTH) -> float:
+    """Of a camera that moved, with another pose ``T_source_target`` believed of it; the target stands at the origin."""
+    residual = PhotometricResidual(K, WIDTH, HEIGHT)
+    disparity = np.full((HEIGHT, WIDTH), 1 / depth, np.float32)
+    shares = residual.shares([wall(moved), wall(at()), wall(at())], disparity, np.stack([believed, np.eye(4)]))
+    return float(shares[0])
+
+
+@pytest.mark.parametrize("moved", [at(x=0.4), at(z=1.0), at(0.2, -0.1, 0.6)])
+def test_true_motion_and_depth_explain_the_images(moved: NDArray[np.float64]) -> None:
+    assert share(moved, np.linalg.inv(moved)) < 0.08
+
+
+def test_no_motion_explains_nothing() -> None:
+    assert share(at(x=0.4), np.eye(4)) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("wrong", [at(x=0.2), at(x=-0.3), at(x=0.8)])
+def test_the_wronger_the_more_is_left(wrong: NDArray[np.float64]) -> None:
+    moved = at(x=0.4)
+    assert share(moved, np.linalg.inv(wrong)) > 5 * share(moved, np.linalg.inv(moved))
+
+
+def test_depth_and_translation_share_their_unit() -> None:
+    """Both in another unit are the same motion; one of them alone is not."""
+    moved = at(x=0.4)
+    believed = np.linalg.inv(moved)
+    believed[:3, 3] *= 0.25
+    assert share(moved, believed, depth=0.25 * DEPTH) == pytest.approx(share(moved, np.linalg.inv(moved)), abs=1e-6)
+    assert share(moved, believed) > 0.5
+
+
+def test_what_is_not_seen_in_both_says_nothing() -> None:
+    assert share(at(x=0.4), at(x=50.0)) == 1.0
+    assert share(at(z=1.0), at(z=-20.0)) == 1.0
+
+
+def test_rows_follow_the_sources_in_time_order() -> None:
+    residual = PhotometricResidual(K, WIDTH, HEIGHT)
+    disparity = np.full((32, 104), 1 / DEPTH, np.float32)
+    true = [np.linalg.inv(at(x=x)) for x in (-0.4, -0.2, 0.2, 0.4)]
+    images = [wall(at(x=x)) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
+    swapped = np.stack([true[0], true[1], true[3], true[2]])
+    shares = residual.shares(images, disparity, swapped)
+    assert (shares[:2] < 0.1).all() and (shares[2:] > 0.3).all()

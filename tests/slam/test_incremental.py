@@ -101,3 +101,16 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         started(load_config(None, ["scale.mode=reference"]))
     with pytest.raises(SlamError, match="wants camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
+
+
+def test_a_buffer_that_is_filled_anew_is_a_new_frame() -> None:
+    """As of a camera's driver, which writes every image to the same place."""
+    config = load_config(None, ["mapping.enabled=false", "loops.enabled=false"])
+    slam, buffered = (started(config, sweep_frames=0) for _ in range(2))
+    feed(slam, 0, 9)
+    buffer = np.empty_like(drive().frame(0).image)
+    for k in range(9):
+        frame = drive().frame(k)
+        buffer[:] = frame.image
+        buffered.add_frame(buffer, frame.stamp)
+    np.testing.assert_array_equal(buffered.trajectory().T_world_camera, slam.trajectory().T_world_camera)

@@ -1,0 +1,78 @@
+"""Graphs answer what their networks answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from erfsfm.networks import deformable
+from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.frozen import Frozen
+from erfsfm.networks.presets import build
+
+SIZE = (1, 3, 64, 128)
+
+
+def awake(network: nn.Module) -> nn.Module:
+    """With deformable layers that move their taps, as trained ones do."""
+    for layer in network.modules():
+        if isinstance(layer, DeformableConv2d):
+            for convolution in (layer.offset, layer.modulator):
+                nn.init.normal_(convolution.weight, std=0.02)
+    return network.eval()
+
+
+def inputs(kind: str, seed: int) -> tuple[Any, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    images = [2 * torch.rand(SIZE, generator=generator) - 1 for _ in range(5)]
+    return (images[0],) if kind == "depth" else (images[0], images[1:])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [f"{erf}{kind}{variant}" for kind in ("depth", "pose") for erf, variant in (("", "net"), ("erf-", "net-dfcv2"))]
+    + ["erf-depthnet-dilated", "erf-posenet-dilated", "erf-posenet-dfc"],
+)
+@torch.inference_mode()
+def test_a_graph_answers_as_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**40)  # all in plain PyTorch
+    kind = "depth" if "depth" in name else "pose"
+    network = awake(build(name, width=0.125, sources=4))
+    graph = Frozen(network)
+    for seed in range(3):
+        given = inputs(kind, seed)
+        wanted: Tensor = network(*given)
+        assert (graph(*given) - wanted).abs().max() <= 1e-5 * wanted.abs().max()
+    assert isinstance(graph.network, torch.jit.ScriptModule)
+
+
+@torch.inference_mode()
+def test_answers_repeat_from_the_first_on() -> None:
+    graph = Frozen(awake(build("erf-depthnet-dfcv2", width=0.125)))
+    given = inputs("depth", 0)
+    answers = [graph(*given) for _ in range(4)]
+    assert all(torch.equal(answer, answers[0]) for answer in answers)
+
+
+@torch.inference_mode()
+def test_what_numba_serves_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("numba")
+    monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
+    network = awake(build("erf-depthnet-dfc", width=0.25))
+    graph = Frozen(network)
+    graph(*inputs("depth", 0))
+    assert graph.network is network
+
+
+def test_a_network_that_refuses_goes_on_refusing() -> None:
+    class Refusing(nn.Module):
+        def forward(self, image: Tensor) -> Tensor:
+            raise ValueError("no network here")
+
+    graph = Frozen(Refusing())
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no network here"):
+            graph(torch.zeros(SIZE))

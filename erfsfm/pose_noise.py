@@ -74,33 +74,20 @@ class PoseNoise(Section):
 class PairPose:
     """What snippets measured between two frames: ``T_first_last`` ``(4, 4)``, the mean of both directions, unscaled.
 
-    ``directions`` ``(M, 4, 4)`` are the single measurements, each as ``T_first_last``, ``residual`` the mean of their
-    photometric residuals.
+    ``directions`` ``(M, 4, 4)`` are the single measurements, one or two, each as ``T_first_last``. With ``features``
+    ``(5, 6)`` the noise grows: frames, turn, length, disagreement of both directions, photometric residual.
     """
 
     first: int
     last: int
     T_first_last: FloatArray
     directions: FloatArray
-    residual: float
+    features: FloatArray
 
     @property
     def measurements(self) -> int:
         """1 or 2."""
         return len(self.directions)
-
-    @property
-    def features(self) -> FloatArray:
-        """What the noise grows with ``(5, 6)``: frames, turn, length, disagreement of both directions, residual."""
-        frames = float(self.last - self.first)
-        turn = float(np.linalg.norm(tangent(self.T_first_last)[:3]))
-        length = float(np.linalg.norm(self.T_first_last[:3, 3]))
-        differ = np.zeros(6)
-        if self.measurements > 1:
-            differ = np.abs(difference(self.directions[0], self.directions[1]))
-        by_turn = np.repeat([turn, turn / frames * length], 3)
-        by_residual = self.residual * np.repeat([1.0, length], 3)
-        return np.stack([np.full(6, frames), by_turn, np.full(6, length), differ, by_residual])
 
 
 def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArray | None]]) -> list[PairPose]:
@@ -113,16 +100,35 @@ def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArr
     measured: dict[tuple[int, int], list[tuple[FloatArray, float]]] = {}
     for target, sources, T_source_target, residuals in snippets:
         left = np.ones(len(sources)) if residuals is None else residuals
-        for source, T, residual in zip(sources, T_source_target, left, strict=True):
+        T_target_source = np.linalg.inv(T_source_target)
+        for k, source in enumerate(sources):
             forward = source < target
             pair = (source, target) if forward else (target, source)
-            T_first_last = np.asarray(T if forward else np.linalg.inv(T), dtype=np.float64)
-            measured.setdefault(pair, []).append((T_first_last, float(residual)))
-    pairs = []
-    for (first, last), directions in sorted(measured.items()):
-        poses, shares = [T for T, _ in directions], [residual for _, residual in directions]
-        pairs.append(PairPose(first, last, _mean(poses), np.stack(poses), float(np.mean(shares))))
-    return pairs
+            T_first_last = np.asarray((T_source_target if forward else T_target_source)[k], dtype=np.float64)
+            measured.setdefault(pair, []).append((T_first_last, float(left[k])))
+    if not measured:
+        return []
+    pairs, directions = zip(*sorted(measured.items()), strict=True)
+    poses = [np.stack([T for T, _ in each]) for each in directions]
+    residual = np.array([np.mean([share for _, share in each]) for each in directions])
+    T_first_last = _middle(*(np.stack([each[k] for each in poses]) for k in (0, -1)))
+    features = _features(np.array(pairs), poses, T_first_last, residual)
+    return [PairPose(*pair, *known) for pair, *known in zip(pairs, T_first_last, poses, features, strict=True)]
+
+
+def _features(
+    pairs: NDArray[np.int64], poses: Sequence[FloatArray], T_first_last: FloatArray, residual: FloatArray
+) -> FloatArray:
+    """``(P, 5, 6)`` of pairs ``(P, 2)``."""
+    frames = (pairs[:, 1] - pairs[:, 0]).astype(np.float64)
+    moved = tangent(T_first_last)
+    turn, length = np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)
+    differ = np.abs(difference(np.stack([each[0] for each in poses]), np.stack([each[-1] for each in poses])))
+    differ[[len(each) == 1 for each in poses]] = 0.0
+    by_turn, by_residual = ([turn, turn / frames * length], [residual, residual * length])
+    columns = [np.repeat(np.stack(both), 3, axis=0) for both in ([frames] * 2, by_turn, [length] * 2)]
+    columns += [differ.T, np.repeat(np.stack(by_residual), 3, axis=0)]
+    return np.stack(columns).transpose(2, 0, 1)
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:
@@ -167,10 +173,10 @@ def file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else ""
 
 
-def _mean(poses: Sequence[FloatArray]) -> FloatArray:
-    """The middle of one or two transforms that lie close together."""
-    mean = poses[0].copy()
-    turned = [Rotation.from_matrix(pose[:3, :3]) for pose in poses]
-    mean[:3, :3] = Rotation.concatenate(turned).mean().as_matrix()
-    mean[:3, 3] = np.mean([pose[:3, 3] for pose in poses], axis=0)
-    return mean
+def _middle(T_a_b: FloatArray, T_a_b_other: FloatArray) -> FloatArray:
+    """Half-way between transforms ``(P, 4, 4)`` that lie close together."""
+    middle: FloatArray = 0.5 * (T_a_b + T_a_b_other)
+    between = Rotation.from_matrix(np.swapaxes(T_a_b[:, :3, :3], 1, 2) @ T_a_b_other[:, :3, :3])
+    half = Rotation.from_rotvec(0.5 * between.as_rotvec())
+    middle[:, :3, :3] = (Rotation.from_matrix(T_a_b[:, :3, :3]) * half).as_matrix()
+    return middle

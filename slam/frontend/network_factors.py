@@ -74,17 +74,16 @@ def _widening(
 ) -> dict[int, FloatArray]:
     """Factors ``(6,)``, at least 1, on the sigmas of pairs so many frames apart, by chained steps of image geometry."""
     steps = {g.from_index: g.T_from_to for g in geometric if g.to_index == g.from_index + 1}
-    whitened: dict[int, list[FloatArray]] = {pair.last - pair.first: [] for pair in pairs}
-    for pair, sigma in zip(pairs, sigmas, strict=True):
-        between = [steps[k] for k in range(pair.first, pair.last) if k in steps]
-        if len(between) == pair.last - pair.first:
-            T_geometric = reduce(np.matmul, between)
-            whitened[len(between)].append(difference(pair.T_first_last, T_geometric) / sigma)
-    widening = {}
-    for frames, errors in sorted(whitened.items()):
-        widening[frames] = np.ones(6)
-        if len(errors) >= least:
-            widening[frames] = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(errors), axis=0), 1.0)
+    widening = {pair.last - pair.first: np.ones(6) for pair in pairs}
+    for frames in sorted(widening):
+        alike = [k for k, pair in enumerate(pairs) if pair.last - pair.first == frames]
+        between = {k: [steps[step] for step in range(pairs[k].first, pairs[k].last) if step in steps] for k in alike}
+        measured = [k for k in alike if len(between[k]) == frames]
+        if len(measured) >= least:
+            T_geometric = np.stack([reduce(np.matmul, between[k]) for k in measured])
+            errors = difference(np.stack([pairs[k].T_first_last for k in measured]), T_geometric)
+            whitened = errors / np.stack([sigmas[k] for k in measured])
+            widening[frames] = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(whitened), axis=0), 1.0)
             logger.info("pose network's noise over %d frames is widened by %s", frames, widening[frames].round(2))
     return widening
 

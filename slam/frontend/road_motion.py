@@ -141,23 +141,20 @@ class RoadAligner(Learner):
         return layers
 
     def _sampled(self, layer: _Layer, points_previous: FloatArray) -> FloatArray:
-        """Grey value and slopes ``(P, 3)`` of the earlier image where points ``(P, 3)`` of its camera fall."""
+        """Grey value and slopes ``(..., 3)`` of the earlier image where points ``(..., 3)`` of its camera fall."""
         camera = self._intrinsics
-        u = camera.fx * points_previous[:, 0] / points_previous[:, 2] + camera.cx
-        v = camera.fy * points_previous[:, 1] / points_previous[:, 2] + camera.cy - self._top_row
-        return np.asarray(
-            cv2.remap(layer, u.astype(np.float32)[:, None], v.astype(np.float32)[:, None], cv2.INTER_LINEAR)
-        ).reshape(len(u), 3)
+        u = camera.fx * points_previous[..., 0] / points_previous[..., 2] + camera.cx
+        v = camera.fy * points_previous[..., 1] / points_previous[..., 2] + camera.cy - self._top_row
+        columns, rows = (side.astype(np.float32).reshape(len(side), -1) for side in (u, v))
+        return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
         """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
         rays = strip.rays[::3]
         seen = now[strip.rows[::3], strip.columns[::3], 0]
         turned, shift = rays @ T_unit[:3, :3].T, np.outer(rays @ normal, T_unit[:3, 3])
-        costs = []
-        for length in _LENGTHS_HEIGHTS:
-            difference = self._sampled(before, _ahead(turned + length * shift))[:, 0] - seen
-            costs.append(np.minimum(np.abs(difference), _CLIPPED_GREY).mean())
+        difference = self._sampled(before, _ahead(turned + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
+        costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
     def _refine(
@@ -225,8 +222,8 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> 
 
 
 def _ahead(points: FloatArray) -> FloatArray:
-    """Points ``(P, 3)`` with depths kept off zero, where a plane that is far from true would put them."""
-    points[:, 2] = np.maximum(points[:, 2], 1e-3)
+    """Points ``(..., 3)`` with depths kept off zero, where a plane that is far from true would put them."""
+    points[..., 2] = np.maximum(points[..., 2], 1e-3)
     return points
 
 

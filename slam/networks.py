@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from erfsfm.inference import depth_at
 from erfsfm.photometric_residual import PhotometricResidual
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
+from slam.memory import Given, Recall, compute_anew
 
 
 class Networks(Protocol):
@@ -31,14 +33,17 @@ class Networks(Protocol):
 class NetworkPredictor:
     """Answers by frame what networks answer by image."""
 
-    def __init__(self, networks: Networks, intrinsics: Intrinsics) -> None:
+    def __init__(self, networks: Networks, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         """Ask networks about the frames of one sequence.
 
         Args:
             networks: whom to ask.
             intrinsics: of all images.
+            recall: remembers what is measured of images and answers together.
         """
         self._networks = networks
+        self._intrinsics = intrinsics
+        self._recall = recall
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
         self._known: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=networks.sources + 1)
         self.sources = networks.sources
@@ -54,7 +59,10 @@ class NetworkPredictor:
         T_source_target = self._networks.poses(images)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        residuals = self._residual.shares(images, self._disparity(frames[middle]), T_source_target)
+        disparity = self._disparity(frames[middle])
+        given: list[Given] = [*images, disparity, T_source_target, repr(self._intrinsics)]
+        shares = partial(self._residual.shares, images, disparity, T_source_target)
+        (residuals,) = self._recall("photometric residual", given, lambda: (shares(),))
         return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import scipy
 
-from erfsfm import __version__
+from erfsfm import __version__, photometric_residual
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit, overlapping
 from slam import frontend, loops, se3
@@ -99,8 +99,9 @@ def run_slam(
     if drive is not None:
         recording = drive.continued(recording)
     memory = None if cache is None else Memory(cache)
-    predictor = NetworkPredictor(networks if memory is None else _cached(networks, memory), recording.intrinsics)
     recall = compute_anew if memory is None else Recollection(memory, _code()).recall
+    asked = networks if memory is None else _cached(networks, memory)
+    predictor = NetworkPredictor(asked, recording.intrinsics, recall)
     provenance = Provenance(
         version=__version__,
         commit=commit(),
@@ -177,7 +178,7 @@ def _code() -> str:
     folders = (Path(package.__path__[0]) for package in (frontend, loops))
     sources = [path for folder in folders for path in sorted(folder.glob("*.py"))]
     versions = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
-    return " ".join((fingerprint(*sources, Path(se3.__file__)), *versions))
+    return " ".join((fingerprint(*sources, Path(se3.__file__), Path(photometric_residual.__file__)), *versions))
 
 
 def _seed(seed: int) -> None:

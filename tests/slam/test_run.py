@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 import slam.run
+import slam.run_metrics
 from slam import run_slam
 from slam.config import PoseGraphConfig, load_config
 from slam.errors import RunError, SlamError
@@ -192,7 +193,7 @@ def test_trajectories_stay_where_the_map_cannot_be_written(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(slam.run, "_write_map", full)
+    monkeypatch.setattr(slam.run, "write_map", full)
     with pytest.raises(OSError, match="No space left"):
         run_slam(**quick, output=tmp_path / "full")
     folder = RunFolder.open(tmp_path / "full")
@@ -234,7 +235,7 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)
-    graph = slam.run._graph(Result)  # type: ignore[arg-type]
+    graph = slam.run_metrics._graph(Result)  # type: ignore[arg-type]
     assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
 
 

@@ -287,8 +287,10 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
+    frames, before = metrics["sequence"]["frames"], metrics["sequence"].get("continued_at", 0)
+    looked_at = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
     typer.echo(
-        f"{metrics['sequence']['frames']} frames in {timing['seconds_total']:.1f} s "
+        f"{looked_at} in {timing['seconds_total']:.1f} s "
         f"({timing['frames_per_second']:.1f} a second); everything in {path}"
         + (f", read {path / 'report.html'}" if (path / "report.html").is_file() else "")
     )

@@ -280,3 +280,16 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert code == 0
     assert all(line.split()[0] in ("ok", "missing") for line in out.splitlines())
     assert "sequence sim: 14 frames" in out
+
+
+def test_a_drive_goes_on_and_says_how_many_frames_it_looked_at(
+    call: Call, kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
+    run = ("run", "--dataset", kitti_root, "--sequence", "sim", "--weights", tiny_weights)
+    assert call(*run, *QUICK, "--frames", "0:6", "--output", "begun")[0] == 0
+    code, out, _ = call(*run, "--continue", "begun", "--frames", "6:8", "--output", "on")
+    assert code == 0 and "2 more frames, 8 in all, in " in out
+    assert len((tmp_path / "on" / "trajectory_optimised.kitti.txt").read_text().splitlines()) == 8
+    code, out, err = call(*run, "--continue", "nowhere", "--output", "off")
+    assert (code, out, err.count("\n")) == (1, "", 1) and "nowhere is not a run folder" in err
+    assert not (tmp_path / "off").exists()

@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from torch import Tensor
+from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # likewise
+from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
 from erfsfm.data.images import resize_image
-from erfsfm.data.splits import overlapping as overlapping  # for slam, which enters by this door
+from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
+from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 
@@ -63,7 +63,7 @@ class DepthPosePredictor:
         self.sha256 = sha256
         self.sources: int = model.record.network.sources
         self._depth_net = model.depth_net.eval().to(self.device)
-        self._pose_net = model.pose_net.eval().to(self.device)
+        self._pose_net: nn.Module = _PoseMatrices(model.pose_net).eval().to(self.device)
         if self.device.type == "cpu":  # images have the channels of a pixel together, and small kernels gain by it
             for network in (self._depth_net, self._pose_net):
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -138,10 +138,7 @@ class DepthPosePredictor:
         middle = self.sources // 2
         inputs = [self._input(image) for image in images]
         target = inputs.pop(middle)
-        vectors = self._pose_net(target, inputs)[0].double().cpu().numpy()  # (N, 6)
-        T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
-        T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
-        T_source_target[:, :3, 3] = vectors[:, :3]
+        T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
         return T_source_target
 
     def _input(self, image: NDArray[np.uint8]) -> Tensor:
@@ -157,6 +154,19 @@ class DepthPosePredictor:
         is_settled = image.base is None and not image.flags.writeable
         self._inputs.append((image, image if is_settled else image.copy(), tensor))
         return tensor
+
+
+class _PoseMatrices(nn.Module):
+    """A pose network that answers for one snippet in transforms, double precision."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
+        """``T_source_target`` ``(N, 4, 4)``, unscaled."""
+        vectors: Tensor = self.network(target, sources)
+        return pose_vector_to_matrix(vectors[0].double())
 
 
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

@@ -24,6 +24,8 @@ from erfsfm.errors import CheckpointError
 from erfsfm.files import write_atomically
 
 FloatArray = NDArray[np.float64]
+# target, sources, T_source_target (N, 4, 4), photometric residuals (N,); without these, nothing counts as explained
+Snippet = tuple[int, Sequence[int], FloatArray, FloatArray | None]
 NOISE_FILE = "noise.yaml"
 
 _Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -90,13 +92,8 @@ class PairPose:
         return len(self.directions)
 
 
-def pair_poses(snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArray | None]]) -> list[PairPose]:
-    """Every pair of frames that snippets measured, once.
-
-    Args:
-        snippets: target, sources, ``T_source_target`` ``(N, 4, 4)`` and photometric residuals ``(N,)`` of each; where
-            these are None, nothing is known to be explained.
-    """
+def pair_poses(snippets: Sequence[Snippet]) -> list[PairPose]:
+    """Every pair of frames that snippets measured, once."""
     measured: dict[tuple[int, int], list[tuple[FloatArray, float]]] = {}
     for target, sources, T_source_target, residuals in snippets:
         left = np.ones(len(sources)) if residuals is None else residuals
@@ -125,10 +122,12 @@ def _features(
     turn, length = np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)
     differ = np.abs(difference(np.stack([each[0] for each in poses]), np.stack([each[-1] for each in poses])))
     differ[[len(each) == 1 for each in poses]] = 0.0
-    by_turn, by_residual = ([turn, turn / frames * length], [residual, residual * length])
-    columns = [np.repeat(np.stack(both), 3, axis=0) for both in ([frames] * 2, by_turn, [length] * 2)]
-    columns += [differ.T, np.repeat(np.stack(by_residual), 3, axis=0)]
-    return np.stack(columns).transpose(2, 0, 1)
+
+    def six(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+        return np.stack([rotation] * 3 + [translation] * 3, axis=1)
+
+    rows = [six(frames, frames), six(turn, turn / frames * length), six(length, length), differ]
+    return np.stack([*rows, six(residual, residual * length)], axis=1)
 
 
 def tangent(T_a_b: FloatArray) -> FloatArray:

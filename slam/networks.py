@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from erfsfm.inference import depth_at
 from erfsfm.photometric_residual import PhotometricResidual
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
-from slam.memory import Given, Recall, compute_anew
+from slam.memory import Answer, Given, Recall, compute_anew
 
 
 class Networks(Protocol):
@@ -61,8 +60,11 @@ class NetworkPredictor:
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         disparity = self._disparity(frames[middle])
         given: list[Given] = [*images, disparity, T_source_target, repr(self._intrinsics)]
-        shares = partial(self._residual.shares, images, disparity, T_source_target)
-        (residuals,) = self._recall("photometric residual", given, lambda: (shares(),))
+
+        def judge() -> Answer:
+            return (self._residual.shares(images, disparity, T_source_target),)
+
+        (residuals,) = self._recall("photometric residual", given, judge)
         return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:

@@ -21,7 +21,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import Networks, refuse_leak, windows
 from erfsfm.photometric_residual import PhotometricResidual
-from erfsfm.pose_noise import FloatArray, PoseNoise, difference, pair_poses
+from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses
 
 LEVELS = (0.5, 0.9, 0.95)
 _DEGREES = 4.0
@@ -91,7 +91,7 @@ def measure(networks: Networks, recording: Recording) -> PairErrors:
     assert T_world_camera is not None
     half, camera = networks.sources // 2, recording.camera
     residual = PhotometricResidual(camera.K.astype(np.float64), camera.width, camera.height)
-    snippets = []
+    snippets: list[Snippet] = []
     for target, images in enumerate(windows(networks, recording), start=half):
         sources = [k for k in range(target - half, target + half + 1) if k != target]
         T_source_target = networks.poses(images)
@@ -100,9 +100,7 @@ def measure(networks: Networks, recording: Recording) -> PairErrors:
     return pair_errors(recording.frames_name, snippets, T_world_camera)
 
 
-def pair_errors(
-    name: str, snippets: Sequence[tuple[int, Sequence[int], FloatArray, FloatArray | None]], T_world_camera: FloatArray
-) -> PairErrors:
+def pair_errors(name: str, snippets: Sequence[Snippet], T_world_camera: FloatArray) -> PairErrors:
     """Errors of what snippets measured against the truth ``(N, 4, 4)``."""
     pairs = pair_poses(snippets)
     true = [np.linalg.inv(T_world_camera[pair.first]) @ T_world_camera[pair.last] for pair in pairs]

@@ -34,7 +34,7 @@ def run(root: Path, output: Path, frames: str | None, **options: Any) -> RunFold
 
 
 def rounded(tree: Any) -> Any:
-    """Numbers to ten digits: the truth of both parts is joined, which rounds."""
+    """Numbers to nine decimals: the truth of both parts is joined, which rounds."""
     if isinstance(tree, dict):
         return {key: rounded(value) for key, value in tree.items()}
     return f"{tree + 0.0:.9f}" if isinstance(tree, float) else tree

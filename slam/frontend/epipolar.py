@@ -140,4 +140,4 @@ def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, head
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """``a x b`` of ``(3,)`` or ``(3, M)``; NumPy's own spends most of its time on choosing axes."""
     (ax, ay, az), (bx, by, bz) = a, b
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -18,9 +18,7 @@ from slam.frames import DepthMap, Intrinsics
 from slam.frontend.epipolar import Heading
 from slam.memory import Given
 
-_NEAREST = np.float32(1e-6)
-# as much of an image as stays in a processor's cache through all of its arithmetic
-_ROWS = 16
+_NEAREST = 1e-6
 
 Grey = NDArray[np.uint8]
 Pixels = NDArray[np.float32]
@@ -61,19 +59,13 @@ class Foresight:
         """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
         K, depth = self.intrinsics.K, self.depth_previous
         turned = (K @ self.heading.R_current_previous @ np.linalg.inv(K)).astype(np.float32)
-        moved = (self.length * K @ self.heading.direction).astype(np.float32)
-        height, width = depth.shape
-        current = np.empty((height, width, 2), np.float32)
-        u = np.arange(width, dtype=np.float32)
-        for top in range(0, height, _ROWS):
-            z_previous = depth[top : top + _ROWS]
-            v = np.arange(top, top + len(z_previous), dtype=np.float32)[:, None]
-            with np.errstate(divide="ignore"):
-                near = np.where(z_previous > 0, 1 / z_previous, np.float32(0))
-            x, y, z = (
-                (row[0] * u + row[1] * v + row[2]) + shift * near for row, shift in zip(turned, moved, strict=True)
-            )
-            ahead = np.maximum(z, _NEAREST)
-            np.divide(x, ahead, out=current[top : top + _ROWS, :, 0])
-            np.divide(y, ahead, out=current[top : top + _ROWS, :, 1])
-        return current
+        moved = self.length * K @ self.heading.direction
+        v, u = (np.arange(side, dtype=np.float32) for side in depth.shape)
+        near = cv2.divide(1.0, depth)
+        near[depth <= 0] = 0.0
+        x, y, z = (
+            cv2.scaleAdd(near, float(shift), np.add.outer(row[1] * v + row[2], row[0] * u))
+            for row, shift in zip(turned, moved, strict=True)
+        )
+        ahead = cv2.max(z, _NEAREST)
+        return np.asarray(cv2.merge([cv2.divide(x, ahead), cv2.divide(y, ahead)]))

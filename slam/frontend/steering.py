@@ -89,20 +89,21 @@ class Steering(Learner):
         A line through the turns seen, fitted by reweighting; how closely directions keep to it, beside their own
         errors, is what makes them most likely under Student's t.
         """
-        turns = np.column_stack([np.ones(len(self._turns)), np.array(self._turns)])  # (N, 4)
-        seen = np.array(self._directions) @ aside  # (N, 2)
-        own = np.einsum("ic,nij,jc->nc", aside, np.array(self._covariances), aside)
-        lines = np.zeros((4, 2))
-        lines[0] = np.median(seen, axis=0)
+        turns = np.concatenate([np.ones((1, len(self._turns))), np.array(self._turns).T])  # (4, N)
+        seen = aside.T @ np.array(self._directions).T  # (2, N)
+        squares = (aside[:, None] * aside).reshape(9, 2)
+        own = squares.T @ np.array(self._covariances).reshape(-1, 9).T
+        variances = self._sigmas[:, None, None] ** 2 + own  # (S, 2, N)
+        narrow = np.log(variances).sum(axis=2)
+        lines = np.zeros((2, 4))
+        lines[:, 0] = np.median(seen, axis=1)
         ridge = np.diag([0.0, *(3 * [_SLOPE_SIGMA**-2.0])])
         for _ in range(_REWEIGHTINGS):
-            squared = (seen - turns @ lines) ** 2
-            variance = self._sigmas[:, None, None] ** 2 + own
-            share = squared / variance
-            cost = np.log(variance) + (_STUDENT_FREEDOM + 1.0) * np.log1p(share / _STUDENT_FREEDOM)
-            sigma = self._sigmas[cost.sum(axis=1).argmin(axis=0)]
-            weights = 1.0 / (sigma**2 + own + squared / _HALF_WEIGHT_SIGMAS**2)
-            information = np.einsum("nc,ni,nj->cij", weights, turns, turns) + ridge
-            lines = np.linalg.solve(information, np.einsum("nc,ni,nc->ci", weights, turns, seen)[..., None])[..., 0].T
+            squared = (seen - lines @ turns) ** 2
+            surprise = np.log(1.0 + squared / (_STUDENT_FREEDOM * variances)).sum(axis=2)
+            sigma = self._sigmas[(narrow + (_STUDENT_FREEDOM + 1.0) * surprise).argmin(axis=0)]
+            weights = 1.0 / (sigma[:, None] ** 2 + own + squared / _HALF_WEIGHT_SIGMAS**2)
+            information = (weights[:, None] * turns) @ turns.T + ridge
+            lines = np.linalg.solve(information, ((weights * seen) @ turns.T)[..., None])[..., 0]
         now = np.concatenate([[1.0], turn])
-        return now @ lines, sigma**2 + np.linalg.solve(information, np.tile(now, (2, 1))[..., None])[..., 0] @ now
+        return lines @ now, sigma**2 + np.linalg.solve(information, np.tile(now, (2, 1))[..., None])[..., 0] @ now

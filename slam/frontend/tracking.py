@@ -140,9 +140,7 @@ class CornerTracker(Learner):
     def _fresh(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
         """At most ``room`` corners ``(M, 2)`` away from those known."""
         config = self._config
-        free = np.full(grey.shape, 255, np.uint8)
-        for u, v in np.rint(pixels).astype(int).tolist():
-            cv2.circle(free, (u, v), int(config.corner_spacing_px), 0, -1)
+        free = _away_from(pixels, int(config.corner_spacing_px), grey.shape)
         corners = cv2.goodFeaturesToTrack(
             grey, room, config.corner_quality, config.corner_spacing_px, mask=free, blockSize=5
         )
@@ -222,6 +220,17 @@ class Corners:
 
     pixels: Pixels
     names: NDArray[np.int64]
+
+
+def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it, all of them drawn at once."""
+    height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
+    disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
+    rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
+    u, v = np.rint(pixels).astype(np.int64).T
+    mask = np.full(height * width, 255, np.uint8)
+    mask[np.add.outer(v * width + u, rows * width + columns)] = 0
+    return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
 
 
 def _exposed_like(grey: Grey, other: Grey) -> Grey:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
-from slam.frontend.epipolar import Heading, cross, heading_by_essential, heading_by_points, triangulated_depth
+from slam.frontend.epipolar import Heading, heading_by_essential, heading_by_points, triangulated_depth
+from slam.frontend.residuals import Residuals, tangent_of
 from slam.frontend.steering import Steering
 from slam.memory import Answer, Recall, compute_anew
 from slam.records import Learner
@@ -159,13 +160,16 @@ class TwoViewEstimator(Learner):
 
     def _ratios(self, matches: Matches, heading: Heading) -> FloatArray:
         """Logarithms of learned over triangulated depth, of corners near their lines that shift along them."""
-        distance = sampson(matches.rays_previous, matches.rays_current, heading)[0] * self._focal_px
+        distance, _ = self._residuals(matches).across(heading, tangent_of(heading.direction))
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, heading)
         turned = _image(heading.R_current_previous @ matches.rays_previous.T)
         shift_px = np.hypot(*(matches.rays_current.T[:2] - turned)) * self._focal_px
         usable = (np.abs(distance) < self._config.inlier_px) & (depth > 0) & (shift_px > 1.0)
         usable &= np.isfinite(matches.depth_previous)
         return np.asarray(np.log(matches.depth_previous[usable] / depth[usable]))
+
+    def _residuals(self, matches: Matches) -> Residuals:
+        return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
 
     def _refined(self, matches: Matches, start: Heading | None, belief: _Belief) -> TwoView | None:
         if start is None:
@@ -194,11 +198,11 @@ class TwoViewEstimator(Learner):
         if len(ratios) < _LEAST_POINTS:
             return None
         heading, length = start, float(np.exp(np.median(ratios)))
-        known = np.isfinite(matches.depth_previous)
+        known, residuals = np.isfinite(matches.depth_previous), self._residuals(matches)
         for iteration in range(_ITERATIONS):
-            across, by_motion, tangent = sampson(matches.rays_previous, matches.rays_current, heading)
-            across, by_motion = across * self._focal_px, by_motion * self._focal_px
-            along, by_all, shift_px = _along(matches, heading, length, tangent, self._focal_px)
+            tangent = tangent_of(heading.direction)
+            across, by_motion = residuals.across(heading, tangent)
+            along, by_all, shift_px = residuals.along(heading, length, tangent)
             near = np.abs(across) < self._config.inlier_px
             sigma_along = np.hypot(self._config.along_px, belief.depth_share * shift_px)
             inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
@@ -208,10 +212,10 @@ class TwoViewEstimator(Learner):
             weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
             weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
             weights = weights / sigma**2
-            normal = by_all.T @ (weights_along[:, None] * by_all) + 1e-9 * np.eye(6)
-            normal[:5, :5] += by_motion.T @ (weights[:, None] * by_motion)
-            gradient = by_all.T @ (weights_along * along)
-            gradient[:5] += by_motion.T @ (weights * across)
+            normal = (weights_along * by_all) @ by_all.T + 1e-9 * np.eye(6)
+            normal[:5, :5] += (weights * by_motion) @ by_motion.T
+            gradient = by_all @ (weights_along * along)
+            gradient[:5] += by_motion @ (weights * across)
             astray = heading.direction - np.copysign(1.0, belief.axis @ heading.direction) * belief.axis
             normal[3:5, 3:5] += np.eye(2) / belief.axis_sigma**2
             gradient[3:5] += tangent.T @ astray / belief.axis_sigma**2
@@ -234,33 +238,6 @@ def _support(candidate: TwoView, belief: _Belief) -> float:
     return float(candidate.inliers.sum()) - 0.5 * astray**2 / _OUTLIER_COST
 
 
-def _along(
-    matches: Matches, heading: Heading, length: float, tangent: FloatArray, focal_px: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How far corners lie along their lines from where learned depth puts them ``(M,)``, pixels.
-
-    Also the Jacobian ``(M, 6)`` by rotation, direction and length, and the shift that learned depth expects ``(M,)``.
-    """
-    direction, previous, current = heading.direction, _columns(matches.rays_previous), _columns(matches.rays_current)
-    inverse_depth = np.nan_to_num(1.0 / matches.depth_previous)
-    turned = heading.R_current_previous @ previous
-    points = turned + length * inverse_depth * direction[:, None]  # over depth
-    expected = _image(points)
-    shift = (expected - _image(turned)) * focal_px
-    shift_px = np.hypot(*shift)
-    line = shift / np.maximum(shift_px, 1e-9)
-    along = ((expected - current[:2]) * line).sum(axis=0) * focal_px
-    by_point = np.stack([*line, -(line * expected).sum(axis=0)]) * (focal_px / _ahead(points))
-    by_direction = length * inverse_depth * (tangent.T @ by_point)
-    by_length = inverse_depth * (direction @ by_point)
-    return along, np.concatenate([cross(turned, by_point), by_direction, by_length[None]]).T, shift_px
-
-
-def _columns(rays: FloatArray) -> FloatArray:
-    """Rays ``(M, 3)`` as ``(3, M)``: arithmetic on whole coordinates is twice as fast."""
-    return np.ascontiguousarray(rays.T)
-
-
 def _image(points: FloatArray) -> FloatArray:
     """Where points ``(3, M)`` fall in the plane z = 1, ``(2, M)``."""
     return np.asarray(points[:2] / _ahead(points))
@@ -269,35 +246,3 @@ def _image(points: FloatArray) -> FloatArray:
 def _ahead(points: FloatArray) -> FloatArray:
     """z of points ``(3, M)``, kept off zero."""
     return np.asarray(np.maximum(points[2], 1e-6))
-
-
-def sampson(
-    rays_previous: FloatArray, rays_current: FloatArray, heading: Heading
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sampson distances ``(M,)``, their Jacobian ``(M, 5)`` and the tangent ``(3, 2)`` of the direction.
-
-    The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the motion by
-    the square of the corners' noise.
-    """
-    R, direction = heading.R_current_previous, heading.direction
-    current = _columns(rays_current)
-    turned = R @ _columns(rays_previous)
-    lines_current = cross(direction, turned)  # E x
-    across = cross(current, direction)
-    lines_previous = R.T @ across  # E^T x'
-    algebraic = (current * lines_current).sum(axis=0)
-    gradient = np.sqrt((lines_current[:2] ** 2).sum(axis=0) + (lines_previous[:2] ** 2).sum(axis=0))
-    gradient = np.maximum(gradient, 1e-9)
-    axis = np.eye(3)[np.abs(direction).argmin()]
-    first = cross(direction, axis)
-    first = first / np.linalg.norm(first)
-    tangent = np.stack([first, cross(direction, first)], axis=1)
-    distance = algebraic / gradient
-    # where a point lies in the image does not move a line's last coefficient
-    share = distance / gradient
-    slope_current = share * lines_current
-    slope_current[2] = 0.0
-    slope_previous = R[:, :2] @ (share * lines_previous[:2])
-    by_rotation = cross(turned, across - cross(slope_current, direction)) - cross(slope_previous, across)
-    by_direction = tangent.T @ (cross(turned, current - slope_current) - cross(slope_previous, current))
-    return distance, (np.concatenate([by_rotation, by_direction]) / gradient).T, tangent

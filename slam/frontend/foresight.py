@@ -62,7 +62,7 @@ class Foresight:
         moved = self.length * K @ self.heading.direction
         v, u = (np.arange(side, dtype=np.float32) for side in depth.shape)
         near = cv2.divide(1.0, depth)
-        near[depth <= 0] = 0.0
+        near[~(depth > 0)] = 0.0
         x, y, z = (
             cv2.scaleAdd(near, float(shift), np.add.outer(row[1] * v + row[2], row[0] * u))
             for row, shift in zip(turned, moved, strict=True)

@@ -23,7 +23,7 @@ from slam.records import Learner
 from slam.se3 import FloatArray
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
-_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32)  # where the search begins; refinement reaches the next
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # where the search begins; refinement reaches the next
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
 _REMEMBERED = 100
@@ -83,7 +83,7 @@ class RoadAligner(Learner):
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> RoadStep | Refusal:
-        if len(strip.rays) < self._config.min_points:
+        if len(strip.rows) < self._config.min_points:
             return Refusal("the image shows too little of the road")
         plane, likeness, standing = self._aligned(strip, previous, current, T_unit, expected)
         length = float(np.linalg.norm(plane))
@@ -140,19 +140,19 @@ class RoadAligner(Learner):
         self._seen.append((frame.image, layers))
         return layers
 
-    def _sampled(self, layer: _Layer, points_previous: FloatArray) -> FloatArray:
-        """Grey value and slopes ``(..., 3)`` of the earlier image where points ``(..., 3)`` of its camera fall."""
+    def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
+        """Grey value and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
         camera = self._intrinsics
-        u = camera.fx * points_previous[..., 0] / points_previous[..., 2] + camera.cx
-        v = camera.fy * points_previous[..., 1] / points_previous[..., 2] + camera.cy - self._top_row
-        columns, rows = (side.astype(np.float32).reshape(len(side), -1) for side in (u, v))
+        x, y, z = np.moveaxis(points_previous, -2, 0)
+        u = camera.fx * x / z + camera.cx
+        v = camera.fy * y / z + camera.cy - self._top_row
+        columns, rows = (side.astype(np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
         """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
-        rays = strip.rays[::3]
-        seen = now[strip.rows[::3], strip.columns[::3], 0]
-        turned, shift = rays @ T_unit[:3, :3].T, np.outer(rays @ normal, T_unit[:3, 3])
+        rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
+        turned, shift = _turned_and_shift(rays, T_unit, normal)
         difference = self._sampled(before, _ahead(turned + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
@@ -168,27 +168,25 @@ class RoadAligner(Learner):
         tilt: float,
     ) -> tuple[FloatArray, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
-        camera, t = self._intrinsics, T_unit[:3, 3]
-        turned = strip.rays @ T_unit[:3, :3].T
+        fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
         seen = now[strip.rows, strip.columns, 0]
         across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
-            points = _ahead(turned + np.outer(strip.rays @ plane, t))
-            values = self._sampled(before, points)
-            residual = values[:, 0] - seen
-            depth = points[:, 2]
-            slope_u = camera.fx * (t[0] - points[:, 0] / depth * t[2]) / depth
-            slope_v = camera.fy * (t[1] - points[:, 1] / depth * t[2]) / depth
-            jacobian = (values[:, 1] * slope_u + values[:, 2] * slope_v)[:, None] * strip.rays
+            turned, shift = _turned_and_shift(strip.rays, T_unit, plane)
+            points = _ahead(turned + shift)
+            grey, slope_x, slope_y = np.ascontiguousarray(self._sampled(before, points).T)
+            residual = grey - seen
+            x, y, z = points
+            slope = (slope_x * fx * (tx - x / z * tz) + slope_y * fy * (ty - y / z * tz)) / z
             sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 0.3)
-            weighted = jacobian / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2))[:, None]
+            weighted = strip.rays * (slope / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2)))
             prior = across / (tilt * float(np.linalg.norm(plane))) ** 2
-            information = weighted.T @ jacobian + prior + 1e-9 * np.eye(3)
-            step = -np.linalg.solve(information, weighted.T @ residual + prior @ plane)
+            information = (weighted * slope) @ strip.rays.T + prior + 1e-9 * np.eye(3)
+            step = -np.linalg.solve(information, weighted @ residual + prior @ plane)
             plane = plane + step
             if np.abs(step).max() < 1e-4 * np.linalg.norm(plane):
                 break
-        return plane, _correlation(values[:, 0], seen)
+        return plane, _correlation(grey, seen)
 
 
 @dataclass(frozen=True)
@@ -202,12 +200,12 @@ class _Shape:
 
 @dataclass(frozen=True)
 class _Strip:
-    """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(P, 3)``."""
+    """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``."""
 
     shape: _Shape
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
-    rays: FloatArray
+    rays: _Layer
 
 
 def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> _Strip:
@@ -217,13 +215,19 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> 
     seen = (depth_heights < shape.far_heights) & (np.abs(x * depth_heights) < shape.half_width_heights)
     step = max(round(float(np.sqrt(seen.sum() / points))), 1)
     rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
-    rays = np.stack([x[rows, columns], y[rows, columns], np.ones(len(rows))], axis=1)
+    rays = np.stack([x[rows, columns], y[rows, columns], np.ones(len(rows))]).astype(np.float32)
     return _Strip(shape, rows, columns, rays)
 
 
-def _ahead(points: FloatArray) -> FloatArray:
-    """Points ``(..., 3)`` with depths kept off zero, where a plane that is far from true would put them."""
-    points[..., 2] = np.maximum(points[..., 2], 1e-3)
+def _turned_and_shift(rays: _Layer, T_unit: FloatArray, plane: FloatArray) -> tuple[_Layer, _Layer]:
+    """What rays ``(3, P)`` to a plane become in the earlier camera, over their depth: ``R x`` and ``t (m . x)``."""
+    R, t, m = (part.astype(np.float32) for part in (T_unit[:3, :3], T_unit[:3, 3], plane))
+    return R @ rays, np.outer(t, m @ rays)
+
+
+def _ahead(points: _Layer) -> _Layer:
+    """Points ``(..., 3, P)`` with depths kept off zero, where a plane that is far from true would put them."""
+    np.maximum(points[..., 2, :], 1e-3, out=points[..., 2, :])
     return points
 
 

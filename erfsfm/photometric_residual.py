@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 _SIZE = (104, 32)  # width, height
 _LEAST_PIXELS = 100
+_NEAREST = np.float32(1e-6)
 _LEAST_DIFFERENCE = 1e-3  # grey levels
 
 
@@ -30,11 +31,11 @@ class PhotometricResidual:
             height: likewise.
         """
         shrink = np.array([_SIZE[0] / width, _SIZE[1] / height])
-        self._focal = shrink * [K[0, 0], K[1, 1]]
-        self._centre = shrink * (K[:2, 2] + 0.5) - 0.5
+        self._focal = (shrink * [K[0, 0], K[1, 1]]).tolist()
+        self._centre = (shrink * (K[:2, 2] + 0.5) - 0.5).tolist()
         u, v = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in _SIZE))
         x, y = (u - self._centre[0]) / self._focal[0], (v - self._centre[1]) / self._focal[1]
-        self._rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])  # (3, P)
+        self._rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float32)  # (3, P)
         self._seen: deque[tuple[NDArray[np.uint8], NDArray[np.float32]]] = deque(maxlen=8)
 
     def shares(
@@ -53,29 +54,21 @@ class PhotometricResidual:
         Returns:
             ``(N,)``: 0 where all is explained, 1 where nothing is, or where hardly a pixel is seen in both.
         """
-        greys = [self._small(image) for image in images]
-        target = greys.pop(len(images) // 2)
-        near = cv2.resize(disparity_target, _SIZE, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
-        return np.array([self._share(target, grey, near, T) for grey, T in zip(greys, T_source_target, strict=True)])
-
-    def _share(
-        self,
-        target: NDArray[np.float32],
-        source: NDArray[np.float32],
-        near: NDArray[np.float64],
-        T_source_target: NDArray[np.float64],
-    ) -> float:
-        x, y, z = T_source_target[:3, :3] @ self._rays + T_source_target[:3, 3:] * near
-        ahead = np.maximum(z, 1e-6)
+        sources = np.stack([self._small(image) for image in images])
+        target = sources[len(images) // 2]
+        sources = np.delete(sources, len(images) // 2, axis=0)  # (N, h, w)
+        near = cv2.resize(disparity_target, _SIZE, interpolation=cv2.INTER_AREA).ravel()
+        R, t = (part.astype(np.float32) for part in (T_source_target[:, :3, :3], T_source_target[:, :3, 3:]))
+        x, y, z = (R @ self._rays + t * near).swapaxes(0, 1)  # (N, P) each
+        ahead = np.maximum(z, _NEAREST)
         u, v = self._focal[0] * x / ahead + self._centre[0], self._focal[1] * y / ahead + self._centre[1]
         width, height = _SIZE
-        both = ((z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)).reshape(height, width)
-        if both.sum() < _LEAST_PIXELS:
-            return 1.0
-        columns, rows = (side.reshape(height, width).astype(np.float32) for side in (u, v))
-        warped = cv2.remap(source, columns, rows, cv2.INTER_LINEAR)
-        left, was = (float(np.abs(target - other)[both].mean()) for other in (warped, source))
-        return left / max(was, _LEAST_DIFFERENCE)
+        both = ((z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)).reshape(sources.shape)
+        places = zip(sources, u.reshape(sources.shape), v.reshape(sources.shape), strict=True)
+        warped = np.stack([cv2.remap(source, columns, rows, cv2.INTER_LINEAR) for source, columns, rows in places])
+        pixels = both.sum(axis=(1, 2))
+        left, was = ((np.abs(target - other) * both).sum(axis=(1, 2)) / pixels.clip(1) for other in (warped, sources))
+        return np.where(pixels < _LEAST_PIXELS, 1.0, left / np.maximum(was, _LEAST_DIFFERENCE)).astype(np.float64)
 
     def _small(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         for known, grey in self._seen:

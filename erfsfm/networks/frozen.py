@@ -7,6 +7,7 @@ in many of them, and other threads of Python go on meanwhile.
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +33,20 @@ class Frozen(nn.Module):
         if not self._is_frozen:
             self.network = _graph(self.network, *inputs)
             self._is_frozen = True
-        answer: Tensor = self.network(*inputs)
+        with torch.jit.optimized_execution(False):  # type: ignore[no-untyped-call]  # which would begin by being slow
+            answer: Tensor = self.network(*inputs)
+        return answer
+
+
+class _Function(nn.Module):
+    """A network without parts or parameters: these are constants, and tracing does not go from part to part."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.answer = partial(network.requires_grad_(False))
+
+    def forward(self, *inputs: Tensor | list[Tensor]) -> Tensor:
+        answer: Tensor = self.answer(*inputs)
         return answer
 
 
@@ -42,6 +56,6 @@ def _graph(network: nn.Module, *inputs: Tensor | list[Tensor]) -> nn.Module:
         return network
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # sizes become constants: that is meant
-        traced = torch.jit.trace(network, inputs, check_trace=False)
+        traced = torch.jit.trace(_Function(network).eval(), inputs, check_trace=False)
         graph: nn.Module = torch.jit.freeze(traced)  # type: ignore[no-untyped-call]
     return graph

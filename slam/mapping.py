@@ -25,7 +25,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.se3 import FloatArray, invert, rotation_angle
 
 _BLOCK_SIDE = 16
-_FIRST_BLOCKS = 1000
+_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street: each time that there are more costs Open3D a second
 _SEED_STRIDE = 4  # Open3D looks for blocks at these pixels alone, and raises where none of them has depth
 _ATTRIBUTES = ("tsdf", "weight", "color")
 

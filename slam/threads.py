@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
@@ -11,7 +11,9 @@ from typing import TypeVar
 import cv2
 from threadpoolctl import threadpool_limits
 
-T = TypeVar("T")
+S, T = TypeVar("S"), TypeVar("T")
+
+_CORES = 2
 
 
 def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
@@ -24,6 +26,12 @@ def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
                 yield waiting.popleft().result()
         for last in waiting:
             yield last.result()
+
+
+def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """What ``do`` gives for each item, in their order; each depends on its item alone."""
+    with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
+        return list(side.map(do, items))
 
 
 @contextmanager

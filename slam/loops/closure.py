@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,11 +16,11 @@ from slam.loops.descriptors import View
 from slam.loops.retrieval import find_candidates
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.se3 import FloatArray
+from slam.threads import side_by_side
 
 logger = logging.getLogger(__name__)
 
 MOST_REJECTED = 200
-_THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -107,8 +106,7 @@ def close_loops(
     path = np.concatenate([[0.0], np.cumsum(steps)])
     candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], config)
     verifier = LoopVerifier(config, intrinsics)
-    with ThreadPoolExecutor(_THREADS) as pool:  # a verdict depends on its candidate alone
-        verdicts = list(pool.map(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates))
+    verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
     accepted, lonely = agreeing(verified, T_world_camera, config)

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 from slam.config import LoopsConfig
 from slam.loops.descriptors import Descriptors, View, hamming
 from slam.se3 import FloatArray
+from slam.threads import side_by_side
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
@@ -97,8 +98,8 @@ def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
 
 def nearest_words(descriptors: Descriptors, words: Descriptors) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """The word ``(M,)`` of each descriptor by Hamming distance."""
-    blocks = range(0, len(descriptors), _BLOCK_DESCRIPTORS)
-    nearest = [hamming(descriptors[k : k + _BLOCK_DESCRIPTORS], words).argmin(axis=1) for k in blocks]
+    blocks = [descriptors[k : k + _BLOCK_DESCRIPTORS] for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)]
+    nearest = side_by_side(lambda block: hamming(block, words).argmin(axis=1), blocks)
     return np.concatenate([np.zeros(0, np.int64), *nearest])
 
 
@@ -109,7 +110,7 @@ def _word_weights(views: Sequence[View], words: Descriptors) -> csr_array:
 
 
 def _word_counts(views: Sequence[View], words: Descriptors) -> csr_array:
-    word = np.concatenate([nearest_words(view.descriptors, words) for view in views])
+    word = nearest_words(np.concatenate([view.descriptors for view in views]), words)
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
     counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), max(len(words), 1)))
     counts.sum_duplicates()

@@ -114,10 +114,11 @@ def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> Flo
     unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
     unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
     kept = np.ones(len(unit_previous), dtype=bool)
+    most = 3 * len(unit_previous) // 4
     for _ in range(_TRIMMINGS):
         R_current_previous = nearest_rotation(unit_current[kept].T @ unit_previous[kept])
         error = np.linalg.norm(unit_current - unit_previous @ R_current_previous.T, axis=1)
-        kept = error <= np.quantile(error, 0.75)
+        kept = error <= np.partition(error, most)[most]
     return R_current_previous
 
 

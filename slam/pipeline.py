@@ -162,7 +162,8 @@ class SlamPipeline:
         """Places seen before, looked for among all views after the last frame."""
         with self._watch.stage("loops"):
             scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in views]
-            return close_loops(scaled, measured.T_odometry, self._sequence.intrinsics, self._config.loops)
+            intrinsics, config = self._sequence.intrinsics, self._config.loops
+            return close_loops(scaled, measured.T_odometry, intrinsics, config, self._recall)
 
     def fuse(self, estimate: SlamResult) -> TsdfMap | None:
         """Learned depth at the optimised poses, fused into one surface; None where mapping is switched off."""

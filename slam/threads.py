@@ -11,7 +11,8 @@ from typing import TypeVar
 import cv2
 from threadpoolctl import threadpool_limits
 
-S, T = TypeVar("S"), TypeVar("T")
+S = TypeVar("S")
+T = TypeVar("T")
 
 _CORES = 2
 

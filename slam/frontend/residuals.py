@@ -36,23 +36,22 @@ class Residuals:
     def across(self, heading: Heading, tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sampson distances ``(M,)`` and their slopes ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
 
-        The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the motion
-        by the square of the corners' noise.
+        The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
+        motion by the square of the corners' noise.
         """
         essential = _essential(heading, tangent)
         algebraic = essential.reshape(6, 9) @ self._both
         # squared lengths of E x and E^T x' but for their last coefficients, and half the slopes of these
         lines_current = essential[:, :2].swapaxes(1, 2) @ essential[0, :2]
         lines_previous = essential[:, :, :2] @ essential[0, :, :2].T
-        squares = lines_current.reshape(6, 9) @ self._previous_twice + lines_previous.reshape(6, 9) @ self._current_twice
+        squares = lines_current.reshape(6, 9) @ self._previous_twice
+        squares += lines_previous.reshape(6, 9) @ self._current_twice
         gradient = np.sqrt(np.maximum(squares[0], 1e-18))
         distance = algebraic[0] / gradient
         slopes = (algebraic[1:] - distance / gradient * squares[1:]) / gradient
         return distance * self._focal_px, slopes * self._focal_px
 
-    def along(
-        self, heading: Heading, length: float, tangent: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def along(self, heading: Heading, length: float, tangent: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """How far corners lie along their lines from where learned depth puts them ``(M,)``.
 
         Also the slopes ``(6, M)``, and the shift along the line that learned depth expects ``(M,)``.
@@ -79,7 +78,7 @@ def _products(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def tangent_of(direction: FloatArray) -> FloatArray:
-    """Two axes ``(3, 2)`` of unit length across a ``direction`` ``(3,)`` and each other (Duff et al. 2017, listing 3)."""
+    """Two axes ``(3, 2)`` of unit length across a ``direction`` ``(3,)`` and each other (Duff et al. 2017)."""
     x, y, z = direction.tolist()
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)

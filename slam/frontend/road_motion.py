@@ -141,7 +141,7 @@ class RoadAligner(Learner):
         return layers
 
     def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
-        """Grey value and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
+        """Grey and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
         camera = self._intrinsics
         x, y, z = np.moveaxis(points_previous, -2, 0)
         u = camera.fx * x / z + camera.cx

@@ -9,7 +9,7 @@ and a vehicle moves the way it has moved.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from slam.config import GeometryConfig
 from slam.frontend.epipolar import Heading, heading_by_essential, heading_by_points, triangulated_depth
 from slam.frontend.residuals import Residuals, tangent_of
 from slam.frontend.steering import Steering
-from slam.memory import Answer, Recall, compute_anew
+from slam.memory import Answer, Given, Recall, compute_anew
 from slam.records import Learner
 from slam.se3 import FloatArray
 
@@ -97,13 +97,11 @@ class TwoViewEstimator(Learner):
         """Rotation and direction of the next motion; None where corners agree on none."""
         believed = matches.weights >= _LEAST_PROPOSING_WEIGHT
         first, second = matches.rays_previous[believed], matches.rays_current[believed]
-        proposed = self._proposed(first, second, self._config.inlier_px / self._focal_px)
+        proposed = self._proposed(first, second)
         belief = self._belief(matches, proposed)
         candidates = [self._refined(matches, proposed, belief)]
         if candidates[0] is None or candidates[0].inliers.mean() < self._config.clear_share:
-            by_points = heading_by_points(
-                first, second, matches.depth_previous[believed], _RESECTION_PX / self._focal_px
-            )
+            by_points = self._resected(first, second, matches.depth_previous[believed])
             candidates += [self._refined(matches, other, belief) for other in (by_points, self._last)]
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
@@ -127,12 +125,22 @@ class TwoViewEstimator(Learner):
         sigma = float(np.deg2rad(self._config.habit_sigma_deg))
         return self._refined(matches, start, _Belief(_PATCH_WIDENING * depth_share, start.direction, sigma))
 
-    def _proposed(self, first: FloatArray, second: FloatArray, tolerance: float) -> Heading | None:
-        def propose() -> Answer:
-            found = heading_by_essential(first, second, tolerance)
+    def _proposed(self, first: FloatArray, second: FloatArray) -> Heading | None:
+        tolerance = self._config.inlier_px / self._focal_px
+        given = first, second, repr(tolerance)
+        return self._recalled("motion by consensus", given, lambda: heading_by_essential(first, second, tolerance))
+
+    def _resected(self, first: FloatArray, second: FloatArray, depth: FloatArray) -> Heading | None:
+        tolerance = _RESECTION_PX / self._focal_px
+        given = first, second, depth, repr(tolerance)
+        return self._recalled("motion by depth", given, lambda: heading_by_points(first, second, depth, tolerance))
+
+    def _recalled(self, kind: str, given: tuple[Given, ...], find: Callable[[], Heading | None]) -> Heading | None:
+        def answer() -> Answer:
+            found = find()
             return () if found is None else (found.R_current_previous, found.direction)
 
-        known = self._recall("motion by consensus", (first, second, repr(tolerance)), propose)
+        known = self._recall(kind, given, answer)
         return Heading(*known) if known else None
 
     def _belief(self, matches: Matches, proposed: Heading | None) -> _Belief:

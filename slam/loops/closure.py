@@ -15,6 +15,7 @@ from slam.loops.consistency import agreeing
 from slam.loops.descriptors import View
 from slam.loops.retrieval import find_candidates
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
+from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray
 from slam.threads import side_by_side
 
@@ -88,7 +89,11 @@ def _entry(from_index: int, to_index: int, inliers: int, score: float) -> dict[s
 
 
 def close_loops(
-    views: Sequence[View], T_world_camera: FloatArray, intrinsics: Intrinsics, config: LoopsConfig
+    views: Sequence[View],
+    T_world_camera: FloatArray,
+    intrinsics: Intrinsics,
+    config: LoopsConfig,
+    recall: Recall = compute_anew,
 ) -> LoopClosures:
     """Find where the drive came back.
 
@@ -99,13 +104,14 @@ def close_loops(
         T_world_camera: odometry ``(N, 4, 4)``.
         intrinsics: of the images that the views were taken from.
         config: gates and bounds.
+        recall: what images alone determine.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], config)
-    verifier = LoopVerifier(config, intrinsics)
+    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], config, recall)
+    verifier = LoopVerifier(config, intrinsics, recall)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]

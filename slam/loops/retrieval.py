@@ -10,10 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from slam.config import LoopsConfig
 from slam.loops.descriptors import Descriptors, View, hamming
+from slam.memory import Answer, Recall, compute_anew
 from slam.se3 import FloatArray
 from slam.threads import side_by_side
 
@@ -32,18 +34,28 @@ class Candidate:
     score: float
 
 
-def find_candidates(views: Sequence[View], path_m: FloatArray, config: LoopsConfig) -> list[Candidate]:
+def find_candidates(
+    views: Sequence[View], path_m: FloatArray, config: LoopsConfig, recall: Recall = compute_anew
+) -> list[Candidate]:
     """For each view the earlier views that look most like it, the best first.
 
     Args:
         views: in time order.
         path_m: way driven up to each view ``(V,)``, in the unit of the trajectory.
         config: how many, and how far apart in time and on the way.
+        recall: what images alone determine.
     """
-    words = train_vocabulary(views, config.words)
-    if len(views) < 2 or len(words) == 0:
+    everything = _all_descriptors(views)
+    if len(views) < 2 or len(everything) == 0:
         return []
-    weighted = _word_weights(views, words)
+
+    def learn() -> Answer:
+        words = train_vocabulary(views, config.words)
+        return (nearest_words(everything, words),)
+
+    (word,) = recall("words of a drive", (everything, repr(config.words)), learn)
+    counts = _word_counts(views, word)
+    weighted = _weighted(counts, _inverse_frequency(counts))
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
@@ -66,7 +78,7 @@ class PlaceIndex:
     def __init__(self, views: Sequence[View], config: LoopsConfig) -> None:
         """Learn the words of the drive; at least one view."""
         self._words = train_vocabulary(views, config.words)
-        counts = _word_counts(views, self._words)
+        counts = _word_counts(views, nearest_words(_all_descriptors(views), self._words), len(self._words))
         self._inverse_frequency = _inverse_frequency(counts)
         self._weights = _weighted(counts, self._inverse_frequency)
 
@@ -74,7 +86,8 @@ class PlaceIndex:
         """Rows of at most ``count`` views that share words with this one, the most similar first."""
         if not len(self._words) or not len(view):
             return []
-        asked = _weighted(_word_counts([view], self._words), self._inverse_frequency)
+        word = nearest_words(view.descriptors, self._words)
+        asked = _weighted(_word_counts([view], word, len(self._words)), self._inverse_frequency)
         scores = (self._weights @ asked.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
@@ -82,7 +95,7 @@ class PlaceIndex:
 
 def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
     """Binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of all descriptors."""
-    everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
+    everything = _all_descriptors(views)
     take = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING_DESCRIPTORS)).astype(int)
     sample = everything[take]
     centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)
@@ -96,23 +109,21 @@ def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
     return centres
 
 
-def nearest_words(descriptors: Descriptors, words: Descriptors) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.int64]:
     """The word ``(M,)`` of each descriptor by Hamming distance."""
     blocks = [descriptors[k : k + _BLOCK_DESCRIPTORS] for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)]
     nearest = side_by_side(lambda block: hamming(block, words).argmin(axis=1), blocks)
     return np.concatenate([np.zeros(0, np.int64), *nearest])
 
 
-def _word_weights(views: Sequence[View], words: Descriptors) -> csr_array:
-    """Unit tf-idf vectors ``(V, K)``."""
-    counts = _word_counts(views, words)
-    return _weighted(counts, _inverse_frequency(counts))
+def _all_descriptors(views: Sequence[View]) -> Descriptors:
+    return np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
 
 
-def _word_counts(views: Sequence[View], words: Descriptors) -> csr_array:
-    word = nearest_words(np.concatenate([view.descriptors for view in views]), words)
+def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int | None = None) -> csr_array:
+    """How often each view ``(V, K)`` has each word, from the words of all descriptors one after the other."""
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
-    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), max(len(words), 1)))
+    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), words or int(word.max()) + 1))
     counts.sum_duplicates()
     return counts
 

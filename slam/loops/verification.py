@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.descriptors import View, hamming
+from slam.memory import Recall, compute_anew
 from slam.se3 import FloatArray, invert, make, rotation_angle
 
 _MAD_TO_SIGMA = 1.4826
@@ -54,13 +55,15 @@ class RejectedLoop:
 class LoopVerifier:
     """Measures ``T_earlier_later`` between two views of one camera, in the unit of their points."""
 
-    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics) -> None:
+    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
         self._config = config
         self._intrinsics = intrinsics
+        self._recall = recall
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or say why not."""
-        rows_earlier, rows_later = matches(earlier, later, self._config)
+        given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
+        rows_earlier, rows_later = self._recall("corners alike", given, lambda: matches(earlier, later, self._config))
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
             return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)

@@ -85,7 +85,7 @@ def test_slopes_along_are_those_that_differences_show(heading: Heading):
 
 
 @pytest.mark.parametrize(
-    "direction", [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, -0.8], [0.6, 0.8, 0.0]]
+    "direction", [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0, -0.8], [0.6, -0.8, 0]]
 )
 def test_a_tangent_and_its_direction_are_orthonormal(direction: list[float]):
     axes = np.column_stack([tangent_of(np.array(direction)), direction])

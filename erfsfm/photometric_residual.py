@@ -74,7 +74,7 @@ class PhotometricResidual:
         for known, grey in self._seen:
             if known is image:
                 return grey
-        small = cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA)
-        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.float32)
+        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _SIZE, interpolation=cv2.INTER_AREA)
+        grey = small.astype(np.float32)
         self._seen.append((image, grey))
         return grey

@@ -313,9 +313,13 @@ class Observer(Learner):
             self.seen.examples.append((frame.index, frame.image, depth))
         if not mapping.enabled or frame.index % mapping.frame_stride:
             return
+        thinned = self._beside.submit(self._thinned, frame, depth)
+        self._asked.append(_Asked("map", thinned, self.seen.keyframes.append))
+
+    def _thinned(self, frame: Frame, depth: DepthMap) -> Keyframe:
         height, width = depth.shape
-        thinned = min(mapping.width_px / width, 1.0)
+        thinned = min(self._config.mapping.width_px / width, 1.0)
         size = (max(round(width * thinned), 1), max(round(height * thinned), 1))
         small = depth if thinned == 1.0 else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         image = frame.image if thinned == 1.0 else cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
-        self.seen.keyframes.append(Keyframe(frame.index, self._spool.put(image), self._spool.put(small)))
+        return Keyframe(frame.index, self._spool.put(image), self._spool.put(small))

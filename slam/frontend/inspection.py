@@ -45,7 +45,7 @@ class FrameGate(Learner):
             # after darkness the picture before it is no measure of what comes
             self._usable = self._doubtful = None
             return Refusal("the image is blank")
-        grey = cv2.cvtColor(cv2.resize(image, _THUMB, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _THUMB, interpolation=cv2.INTER_AREA)
         thumb = grey.astype(np.float32) - np.float32(grey.mean())
         length = float(np.linalg.norm(thumb))
         if length / np.sqrt(thumb.size) < self._config.noise_contrast * contrast:

@@ -75,6 +75,6 @@ class PhotometricResidual:
             if known is image:
                 return grey
         small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _SIZE, interpolation=cv2.INTER_AREA)
-        grey = small.astype(np.float32)
+        grey = np.asarray(small, dtype=np.float32)
         self._seen.append((image, grey))
         return grey

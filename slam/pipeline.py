@@ -250,21 +250,21 @@ class SlamPipeline:
         own = {step: motion.own_noise for step, motion in seen.motions.items()}
         drive = drive_noise(by_corners, own, self._config.geometry)
         geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
-        networks = self._by_networks(seen)
+        networks = self._by_networks(seen, [rescaled(g, 1.0 / _unit_of(g, scale)) for g in geometric])
         if self._config.frontend.use == "bridge":
             networks = without_measured(networks, seen.geometric)
         unscaled = [*networks, *seen.bridges]
-        factors = [rescaled(f, float(scale.per_frame[min(f.from_index, f.to_index)])) for f in unscaled]
+        factors = [rescaled(f, _unit_of(f, scale)) for f in unscaled]
         if self._config.lidar.factors and lidar is not None:
             factors += lidar_steps(lidar, self._config.lidar)
         return factors + geometric
 
-    def _by_networks(self, seen: Observations) -> list[RelativePose]:
+    def _by_networks(self, seen: Observations, geometric: Sequence[RelativePose]) -> list[RelativePose]:
         """What the pose network measured, unscaled, with the noise beside its weights or else that of this drive."""
         config = self._config.frontend
         if self._noise is not None:
-            return calibrated_factors(seen.trusted, seen.geometric, self._noise, config)
-        return network_factors(seen.trusted, measured_noise(seen.trusted, seen.geometric, config))
+            return calibrated_factors(seen.trusted, geometric, self._noise, config)
+        return network_factors(seen.trusted, measured_noise(seen.trusted, geometric, config))
 
     def _with_length(
         self, measured: RelativePose, seen: Observations, scale: Scale, drive: Mapping[int, StepNoise]
@@ -275,7 +275,7 @@ class SlamPipeline:
             length, sigma_share = float(scale.lengths[step]), float(scale.length_sigmas[step])
             chain_sigma_share = float(scale.length_chain_sigmas[step])
             return seen.motions[step].with_length(length, sigma_share, chain_sigma_share, drive[step])
-        return rescaled(measured, float(scale.per_frame[min(step, measured.to_index)]))
+        return rescaled(measured, _unit_of(measured, scale))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
         """The front end without a graph: of each step the image geometry, else the network, chained."""
@@ -305,6 +305,11 @@ class SlamPipeline:
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)
+
+
+def _unit_of(measured: RelativePose, scale: Scale) -> float:
+    """What the networks' unit of length is worth there."""
+    return float(scale.per_frame[min(measured.from_index, measured.to_index)])
 
 
 def _steadied(seen: Observations) -> Observations:

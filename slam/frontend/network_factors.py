@@ -1,8 +1,9 @@
 """The pose network's snippets as relative-pose factors, and as the raw trajectory they chain to.
 
 Noise that lies beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
-overlapping snippets measured of it, with the correlation of their errors. On the drive it is widened, never narrowed,
-by how far the network is from image geometry, for roads may be unlike those that the noise was measured on.
+overlapping snippets measured of it, with the correlation of their errors. Roads may be unlike those that the noise was
+measured on: on the drive it is scaled to how far the network is from image geometry, apart for straights and turns, and
+what geometry does not know of itself the network does not know either (``docs/design/0019``).
 
 Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
 sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_sigma_share`` of the length
@@ -15,13 +16,13 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
+from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses, tangent
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
@@ -29,6 +30,8 @@ from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
 _MAD_TO_SIGMA = 1.4826
+# image geometry errs too: agreement beyond this is not believed
+_LEAST_SCALING = 0.3
 
 logger = logging.getLogger(__name__)
 
@@ -56,36 +59,62 @@ def calibrated_factors(
 
     Args:
         snippets: measured by the network.
-        geometric: what image geometry measured, unscaled.
+        geometric: what image geometry measured, unscaled, with all of its noise.
         noise: of this network.
-        config: ``noise_steps`` common steps are needed before the drive may widen the noise.
+        config: ``noise_steps`` common steps are needed before the drive may scale the noise.
     """
     pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
-    sigmas = [noise.sigmas(pair) for pair in pairs]
-    widening = _widening(pairs, sigmas, geometric, config.noise_steps)
+    if not pairs:
+        return []
+    law = np.stack([noise.sigmas(pair) for pair in pairs])
+    steps = {g.from_index: g for g in geometric if g.to_index == g.from_index + 1}
+    sigmas = np.hypot(_scaling(pairs, law, steps, config.noise_steps) * law, _unknown_to_geometry(pairs, steps))
     return [
-        RelativePose(pair.first, pair.last, pair.T_first_last, widening[pair.last - pair.first] * sigma, NETWORK_SOURCE)
-        for pair, sigma in zip(pairs, sigmas, strict=True)
+        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE)
+        for pair, own in zip(pairs, sigmas, strict=True)
     ]
 
 
-def _widening(
-    pairs: Sequence[PairPose], sigmas: Sequence[FloatArray], geometric: Sequence[RelativePose], least: int
-) -> dict[int, FloatArray]:
-    """Factors ``(6,)``, at least 1, on the sigmas of pairs so many frames apart, by chained steps of image geometry."""
-    steps = {g.from_index: g.T_from_to for g in geometric if g.to_index == g.from_index + 1}
-    widening = {pair.last - pair.first: np.ones(6) for pair in pairs}
-    for frames in sorted(widening):
-        alike = [k for k, pair in enumerate(pairs) if pair.last - pair.first == frames]
-        between = {k: [steps[step] for step in range(pairs[k].first, pairs[k].last) if step in steps] for k in alike}
-        measured = [k for k in alike if len(between[k]) == frames]
-        if len(measured) >= least:
-            T_geometric = np.stack([reduce(np.matmul, between[k]) for k in measured])
-            errors = difference(np.stack([pairs[k].T_first_last for k in measured]), T_geometric)
-            whitened = errors / np.stack([sigmas[k] for k in measured])
-            widening[frames] = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(whitened), axis=0), 1.0)
-            logger.info("pose network's noise over %d frames is widened by %s", frames, widening[frames].round(2))
-    return widening
+def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, RelativePose], least: int) -> FloatArray:
+    """Factors ``(P, 6)`` on the sigmas of pairs, by chained steps of image geometry; 1 where these are few.
+
+    One for each distance in frames and, where enough are measured, each third of the turns a frame.
+    """
+    scaling = np.ones_like(law)
+    frames = np.array([pair.last - pair.first for pair in pairs])
+    turns = np.array([np.linalg.norm(tangent(pair.T_first_last)[:3]) for pair in pairs]) / frames
+    between = [[steps[k] for k in range(pair.first, pair.last) if k in steps] for pair in pairs]
+    measured = np.array([len(chained) for chained in between]) == frames
+    for distance in np.unique(frames):
+        alike = frames == distance
+        seen = alike & measured
+        if seen.sum() < least:
+            continue
+        borders = np.quantile(turns[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
+        third = np.searchsorted(borders, turns)
+        for which in range(len(borders) + 1):
+            rows = np.flatnonzero(seen & (third == which))
+            T_geometric = np.stack([reduce(np.matmul, [g.T_from_to for g in between[k]]) for k in rows])
+            errors = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
+            factors = _MAD_TO_SIGMA * np.median(np.abs(errors / law[rows]), axis=0)
+            scaling[alike & (third == which)] = np.maximum(factors, _LEAST_SCALING)
+            logger.info(
+                "pose network's noise over %d frames, turns %d of %d: times %s",
+                distance,
+                which + 1,
+                len(borders) + 1,
+                factors.round(2),
+            )
+    return scaling
+
+
+def _unknown_to_geometry(pairs: Sequence[PairPose], steps: Mapping[int, RelativePose]) -> FloatArray:
+    """Sigmas ``(P, 6)`` of the steps that pairs span, as geometry states them; the usual ones where it has none."""
+    if not steps:
+        return np.zeros((len(pairs), 6))
+    usual = np.median([step.sigmas for step in steps.values()], axis=0)
+    own = [[steps[k].sigmas if k in steps else usual for k in range(pair.first, pair.last)] for pair in pairs]
+    return np.stack([np.linalg.norm(sigmas, axis=0) for sigmas in own])
 
 
 def without_measured(factors: Sequence[RelativePose], geometric: Sequence[RelativePose]) -> list[RelativePose]:

@@ -92,7 +92,7 @@ def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, Rel
             continue
         borders = np.quantile(turns[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
         third = np.searchsorted(borders, turns)
-        for which in range(len(borders) + 1):
+        for which in np.unique(third[seen]):
             rows = np.flatnonzero(seen & (third == which))
             T_geometric = np.stack([reduce(np.matmul, [g.T_from_to for g in between[k]]) for k in rows])
             errors = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)

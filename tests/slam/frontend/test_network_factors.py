@@ -207,3 +207,9 @@ def test_what_geometry_does_not_know_the_network_does_not_know():
     np.testing.assert_allclose(factors[50, 52], 0.4 * np.sqrt(2), rtol=1e-2)
     without_one = sigmas_of(calibrated_factors(snippets_of(T), geometric[:50] + geometric[51:], NOISE, CONFIG))
     np.testing.assert_allclose(without_one[50, 51], 0.4, rtol=1e-2)
+
+
+def test_turns_that_are_all_alike_are_one_kind():
+    T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
+    factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE, CONFIG))
+    np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)

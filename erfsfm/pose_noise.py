@@ -91,6 +91,11 @@ class PairPose:
         """1 or 2."""
         return len(self.directions)
 
+    @property
+    def turn(self) -> float:
+        """The angle between both frames, radians."""
+        return float(self.features[1, 0])
+
 
 def pair_poses(snippets: Sequence[Snippet]) -> list[PairPose]:
     """Every pair of frames that snippets measured, once."""

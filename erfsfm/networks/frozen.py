@@ -33,7 +33,8 @@ class Frozen(nn.Module):
         if not self._is_frozen:
             self.network = _graph(self.network, *inputs)
             self._is_frozen = True
-        with torch.jit.optimized_execution(False):  # type: ignore  # it begins by being slow, and gains nothing
+        # PyTorch's own optimiser begins with slow passes, and gains nothing here
+        with torch.jit.optimized_execution(False):  # type: ignore[attr-defined, no-untyped-call]
             answer: Tensor = self.network(*inputs)
         return answer
 

@@ -22,7 +22,7 @@ from functools import reduce
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses, tangent
+from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
@@ -82,7 +82,7 @@ def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, Rel
     """
     scaling = np.ones_like(law)
     frames = np.array([pair.last - pair.first for pair in pairs])
-    turns = np.array([np.linalg.norm(tangent(pair.T_first_last)[:3]) for pair in pairs]) / frames
+    turns = np.array([pair.turn for pair in pairs]) / frames
     between = [[steps[k] for k in range(pair.first, pair.last) if k in steps] for pair in pairs]
     measured = np.array([len(chained) for chained in between]) == frames
     for distance in np.unique(frames):

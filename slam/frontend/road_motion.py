@@ -146,14 +146,15 @@ class RoadAligner(Learner):
         x, y, z = np.moveaxis(points_previous, -2, 0)
         u = camera.fx * x / z + camera.cx
         v = camera.fy * y / z + camera.cy - self._top_row
-        columns, rows = (side.astype(np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
+        columns, rows = (np.asarray(side, np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
         """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
         rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
-        turned, shift = _turned_and_shift(rays, T_unit, normal)
-        difference = self._sampled(before, _ahead(turned + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
+        R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
+        shift = np.outer(t, n @ rays)
+        difference = self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
         costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
         return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
 
@@ -169,11 +170,12 @@ class RoadAligner(Learner):
     ) -> tuple[FloatArray, float]:
         """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
         fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
-        seen = now[strip.rows, strip.columns, 0]
+        R, t = _single(T_unit[:3, :3], T_unit[:3, 3])
+        turned, seen = R @ strip.rays, now[strip.rows, strip.columns, 0]
         across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
-            turned, shift = _turned_and_shift(strip.rays, T_unit, plane)
-            points = _ahead(turned + shift)
+            (m,) = _single(plane)
+            points = _ahead(turned + np.outer(t, m @ strip.rays))
             grey, slope_x, slope_y = np.ascontiguousarray(self._sampled(before, points).T)
             residual = grey - seen
             x, y, z = points
@@ -219,10 +221,9 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> 
     return _Strip(shape, rows, columns, rays)
 
 
-def _turned_and_shift(rays: _Layer, T_unit: FloatArray, plane: FloatArray) -> tuple[_Layer, _Layer]:
-    """What rays ``(3, P)`` to a plane become in the earlier camera, over their depth: ``R x`` and ``t (m . x)``."""
-    R, t, m = (part.astype(np.float32) for part in (T_unit[:3, :3], T_unit[:3, 3], plane))
-    return R @ rays, np.outer(t, m @ rays)
+def _single(*parts: FloatArray) -> tuple[_Layer, ...]:
+    """In single precision, as the strip's rays are: one double among them makes all of the arithmetic double."""
+    return tuple(part.astype(np.float32) for part in parts)
 
 
 def _ahead(points: _Layer) -> _Layer:

@@ -161,14 +161,14 @@ class TwoViewEstimator(Learner):
 
     def _depth_share(self, matches: Matches, heading: Heading) -> float:
         """By how much learned depth differs from that of the corners near their epipolar lines, scale aside."""
-        ratios = self._ratios(matches, heading)
+        ratios = self._ratios(matches, heading, self._residuals(matches))
         if len(ratios) < _LEAST_POINTS:
             return np.nan
         return _MAD_TO_SIGMA * float(np.median(np.abs(ratios - np.median(ratios))))
 
-    def _ratios(self, matches: Matches, heading: Heading) -> FloatArray:
+    def _ratios(self, matches: Matches, heading: Heading, residuals: Residuals) -> FloatArray:
         """Logarithms of learned over triangulated depth, of corners near their lines that shift along them."""
-        distance, _ = self._residuals(matches).across(heading, tangent_of(heading.direction))
+        distance, _ = residuals.across(heading, tangent_of(heading.direction))
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, heading)
         turned = _image(heading.R_current_previous @ matches.rays_previous.T)
         shift_px = np.hypot(*(matches.rays_current.T[:2] - turned)) * self._focal_px
@@ -202,11 +202,12 @@ class TwoViewEstimator(Learner):
 
         Across its epipolar line a corner has the noise of the image, along it that of learned depth.
         """
-        ratios = self._ratios(matches, start)
+        residuals = self._residuals(matches)
+        ratios = self._ratios(matches, start, residuals)
         if len(ratios) < _LEAST_POINTS:
             return None
         heading, length = start, float(np.exp(np.median(ratios)))
-        known, residuals = np.isfinite(matches.depth_previous), self._residuals(matches)
+        known = np.isfinite(matches.depth_previous)
         for iteration in range(_ITERATIONS):
             tangent = tangent_of(heading.direction)
             across, by_motion = residuals.across(heading, tangent)

@@ -50,11 +50,10 @@ def find_candidates(
         return []
 
     def learn() -> Answer:
-        words = train_vocabulary(views, config.words)
-        return (nearest_words(everything, words),)
+        return (nearest_words(everything, train_vocabulary(everything, config.words)),)
 
     (word,) = recall("words of a drive", (everything, repr(config.words)), learn)
-    counts = _word_counts(views, word)
+    counts = _word_counts(views, word, config.words)
     weighted = _weighted(counts, _inverse_frequency(counts))
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
@@ -77,8 +76,9 @@ class PlaceIndex:
 
     def __init__(self, views: Sequence[View], config: LoopsConfig) -> None:
         """Learn the words of the drive; at least one view."""
-        self._words = train_vocabulary(views, config.words)
-        counts = _word_counts(views, nearest_words(_all_descriptors(views), self._words), len(self._words))
+        everything = _all_descriptors(views)
+        self._words = train_vocabulary(everything, config.words)
+        counts = _word_counts(views, nearest_words(everything, self._words), config.words)
         self._inverse_frequency = _inverse_frequency(counts)
         self._weights = _weighted(counts, self._inverse_frequency)
 
@@ -87,17 +87,16 @@ class PlaceIndex:
         if not len(self._words) or not len(view):
             return []
         word = nearest_words(view.descriptors, self._words)
-        asked = _weighted(_word_counts([view], word, len(self._words)), self._inverse_frequency)
+        asked = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
         scores = (self._weights @ asked.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
 
 
-def train_vocabulary(views: Sequence[View], words: int) -> Descriptors:
-    """Binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of all descriptors."""
-    everything = _all_descriptors(views)
-    take = np.linspace(0, len(everything) - 1, min(len(everything), _TRAINING_DESCRIPTORS)).astype(int)
-    sample = everything[take]
+def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:
+    """Binary words ``(K, 32)``, at most so many, by k-majority (Grana et al. 2013) on an even sample of descriptors."""
+    take = np.linspace(0, len(descriptors) - 1, min(len(descriptors), _TRAINING_DESCRIPTORS)).astype(int)
+    sample = descriptors[take]
     centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)
     bits = np.unpackbits(sample, axis=1).astype(np.float32)
     for _ in range(_ROUNDS if len(centres) else 0):
@@ -120,10 +119,10 @@ def _all_descriptors(views: Sequence[View]) -> Descriptors:
     return np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
 
 
-def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int | None = None) -> csr_array:
-    """How often each view ``(V, K)`` has each word, from the words of all descriptors one after the other."""
+def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int) -> csr_array:
+    """How often each view has each of at most so many words ``(V, words)``, from those of all descriptors in a row."""
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
-    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), words or int(word.max()) + 1))
+    counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), words))
     counts.sum_duplicates()
     return counts
 

@@ -43,7 +43,7 @@ def test_hamming_counts_bits() -> None:
 def test_words_find_their_own() -> None:
     rng = np.random.default_rng(2)
     views = drive(10, 0)
-    words = train_vocabulary(views, 200)
+    words = train_vocabulary(np.concatenate([view.descriptors for view in views]), 200)
     assert words.shape[1] == 32 and 100 < len(words) <= 200
     descriptors = views[0].descriptors
     same = nearest_words(descriptors, words) == nearest_words(descriptors ^ (rng.random((80, 32)) < 0.01), words)

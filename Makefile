@@ -8,6 +8,9 @@ TORCH_INDEX ?=
 
 export OMP_WAIT_POLICY ?= PASSIVE
 
+# Tests are of one thread each; a file's tests stay together, for they share what they prepare
+PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+
 .PHONY: setup demo test test-all lint benchmark clean
 
 setup: $(READY)
@@ -23,10 +26,10 @@ demo: setup
 	$(BIN)/erfsfm-slam run
 
 test: lint
-	$(BIN)/python -m pytest -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
 test-all: lint
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 lint: setup
 	$(BIN)/ruff check .

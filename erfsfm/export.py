@@ -120,7 +120,6 @@ def _export(
             f"{path} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output of "
             f"{preset}, more than {TOLERANCE:.0e}; tell the authors the versions of torch, onnx and onnxruntime"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return Exported(path, kind, preset, difference)
 

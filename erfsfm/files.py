@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a file beside ``path``, then put it in place at once."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
+def write_atomically(path: Path, fill: Callable[[Path], object]) -> None:
+    """Let ``fill`` write a file beside ``path``, then put it in place at once; missing parent folders are made.
+
+    The temporary name ends as ``path`` does, for writers that look at the suffix.
+    """
+    partial = path.with_name(f".{os.getpid()}.{threading.get_ident()}.partial.{path.name}")
     try:
-        write(Path(temporary))
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
-        Path(temporary).replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fill(partial)
+        partial.replace(path)
     finally:
-        Path(temporary).unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

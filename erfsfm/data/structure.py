@@ -123,7 +123,6 @@ def _write(path: Path, structure: Structure) -> None:
         with part.open("wb") as file:  # given a path, savez would end its name in .npz
             np.savez(file, T_source_target=structure.T_source_target, least=structure.least, most=structure.most)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, fill)
 
 

@@ -29,8 +29,8 @@ class Section(BaseModel):
 class FrontendConfig(Section):
     """Noise of the pose network's direct snippet poses, see ``frontend/network_factors.py``."""
 
-    use: Literal["bridge", "always"] = Field(
-        default="bridge", description="bridge: only over steps that geometry did not measure"
+    use: Literal["calibrated", "bridge", "always"] = Field(
+        default="calibrated", description="always with a noise beside the weights, else bridge: where geometry has none"
     )
     rotation_sigma_deg: float = Field(default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step")
     translation_sigma_share: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
@@ -40,6 +40,7 @@ class FrontendConfig(Section):
     noise_steps: int = Field(
         default=20, ge=1, description="steps that image geometry must share before the noise is measured on them"
     )
+    noise_degrees: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which pairs then err")
 
 
 class GeometryConfig(Section):
@@ -89,6 +90,7 @@ class GeometryConfig(Section):
         default=0.25, ge=0, description="rotation sigma, share of the jump to neighbours"
     )
     jolt_direction_share: float = Field(default=1.0, ge=0, description="sigma of the direction, likewise")
+    noise_degrees: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which a step errs")
 
 
 class RoadConfig(Section):

@@ -6,6 +6,7 @@ The front end, the graph, the map and the evaluation never import each other; th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +128,7 @@ class RelativePose:
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
     translation in the units of the measurement. ``source`` names who measured it. ``chain_sigmas`` ``(6,)``, where
     errors of neighbours are alike: independent errors of these sigmas would add up along a chain as those do.
+    Errors are by Student's t of so many ``degrees`` of freedom; normal where infinite.
     """
 
     from_index: int
@@ -135,6 +137,7 @@ class RelativePose:
     sigmas: FloatArray
     source: str
     chain_sigmas: FloatArray | None = None
+    degrees: float = math.inf
 
     @property
     def graph_sigmas(self) -> FloatArray:

@@ -17,7 +17,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
@@ -258,36 +257,6 @@ def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: Flo
         residual = gtsam.Pose3.Logmap(_pose3(edge.T_from_to).between(_pose3(T_from_to)))
         squared.append(float(((residual / edge.sigmas) ** 2).sum()))
     return np.array(squared)
-
-
-def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float) -> dict[str, float]:
-    """Share of factors whose residual at the truth lies inside the 50, 90 and 95 % quantile of chi-square(6).
-
-    Args:
-        relative_poses: measurements with their sigmas, at least one.
-        T_world_camera_true: truth ``(N, 4, 4)``, metres.
-        scale: units of the measurements per metre; brings the truth to their scale.
-
-    Raises:
-        SlamError: if there is no measurement or the scale is not positive.
-    """
-    if not relative_poses or not scale > 0:
-        raise SlamError(f"coverage needs factors and a positive scale; got {len(relative_poses)} and {scale}")
-    T_world_camera = T_world_camera_true.copy()
-    T_world_camera[:, :3, 3] *= scale
-    squared = whitened_squared(relative_poses, T_world_camera)
-    return {str(level): float((squared <= chi2.ppf(level / 100, 6)).mean()) for level in (50, 90, 95)}
-
-
-def coverage_by_source(
-    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
-) -> dict[str, dict[str, float]]:
-    """Number of factors and `coverage` of each kind of measurement, by the name of its source."""
-    kinds = {edge.source: [e for e in relative_poses if e.source == edge.source] for edge in relative_poses}
-    return {
-        source: {"factors": len(edges), **coverage(edges, T_world_camera_true, scale)}
-        for source, edges in sorted(kinds.items())
-    }
 
 
 def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:

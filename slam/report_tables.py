@@ -197,7 +197,7 @@ def graph(metrics: Metrics) -> str:
         shown = MISSING if share is None else f"{100 * share:.0f} %"
         rows.append([f"inside the {level} % quantile", Cell(shown, why, "missing" if why else "")])
     words = (
-        "Share of factors whose residual at the truth lies inside a quantile of chi-square. A share below its "
+        "Share of factors whose error at the truth lies inside a quantile of their stated noise. A share below its "
         "quantile means sigmas that are too small, one above it sigmas that are too large."
     )
     return size + page.table(("factors", "share"), rows, "words") + page.text(words, "note")

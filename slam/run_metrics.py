@@ -13,11 +13,11 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
+from slam.coverage import coverage, coverage_by_source
 from slam.evaluation import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.refusal import Refusal
 from slam.pipeline import SlamResult
-from slam.pose_graph import coverage, coverage_by_source
 from slam.se3 import umeyama
 from slam.sequences.continued import Continued
 from slam.summary import SCHEMA, Provenance, describe_bridged, describe_sequence, describe_timing, finite, null

@@ -3,7 +3,8 @@
 Noise that lies beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
 overlapping snippets measured of it, with the correlation of their errors. Roads may be unlike those that the noise was
 measured on: on the drive it is scaled to how far the network is from image geometry, apart for straights and turns, and
-what geometry does not know of itself the network does not know either (``docs/design/0019``).
+what geometry does not know of itself the network does not know either (``docs/design/0019``). What is left has heavier
+tails than normal errors and lasts from snippet to snippet; the graph takes it for so much more (``docs/design/0020``).
 
 Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
 sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_sigma_share`` of the length
@@ -15,6 +16,7 @@ their sigmas times sqrt(m) and count as one.
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import reduce
@@ -32,6 +34,7 @@ NETWORK_SOURCE = "network"
 _MAD_TO_SIGMA = 1.4826
 # image geometry errs too: agreement beyond this is not believed
 _LEAST_SCALING = 0.3
+_STRETCHES = 4
 
 logger = logging.getLogger(__name__)
 
@@ -68,23 +71,37 @@ def calibrated_factors(
         return []
     law = np.stack([noise.sigmas(pair) for pair in pairs])
     steps = {g.from_index: g for g in geometric if g.to_index == g.from_index + 1}
-    sigmas = np.hypot(_scaling(pairs, law, steps, config.noise_steps) * law, _unknown_to_geometry(pairs, steps))
+    degrees = config.noise_degrees if len(steps) >= config.noise_steps else math.inf
+    from_geometry = _from_geometry(pairs, steps)
+    scaling = _scaling(pairs, from_geometry / law, config.noise_steps)
+    sigmas = np.hypot(scaling * law, _unknown_to_geometry(pairs, steps))
+    chain_sigmas = _persistence(pairs, from_geometry / sigmas, config.noise_steps) * sigmas
     return [
-        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE)
-        for pair, own in zip(pairs, sigmas, strict=True)
+        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, degrees)
+        for pair, own, chained in zip(pairs, sigmas, chain_sigmas, strict=True)
     ]
 
 
-def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, RelativePose], least: int) -> FloatArray:
-    """Factors ``(P, 6)`` on the sigmas of pairs, by chained steps of image geometry; 1 where these are few.
+def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[int, RelativePose]) -> FloatArray:
+    """What pairs differ from chained steps of image geometry by, ``(P, 6)``; NaN where it did not measure them all."""
+    differ = np.full((len(pairs), 6), np.nan)
+    between = [[steps[k].T_from_to for k in range(pair.first, pair.last) if k in steps] for pair in pairs]
+    rows = [k for k, pair in enumerate(pairs) if len(between[k]) == pair.last - pair.first]
+    if rows:
+        T_geometric = np.stack([reduce(np.matmul, between[k]) for k in rows])
+        differ[rows] = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
+    return differ
 
-    One for each distance in frames and, where enough are measured, each third of the turns a frame.
+
+def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
+    """Factors ``(P, 6)`` on the sigmas of pairs, by ``whitened`` ``(P, 6)`` differences from image geometry.
+
+    One for each distance in frames and, where enough are measured, each third of the turns a frame; 1 where few are.
     """
-    scaling = np.ones_like(law)
+    scaling = np.ones_like(whitened)
     frames = np.array([pair.last - pair.first for pair in pairs])
     turns = np.array([pair.turn for pair in pairs]) / frames
-    between = [[steps[k] for k in range(pair.first, pair.last) if k in steps] for pair in pairs]
-    measured = np.array([len(chained) for chained in between]) == frames
+    measured = np.isfinite(whitened).all(axis=1)
     for distance in np.unique(frames):
         alike = frames == distance
         seen = alike & measured
@@ -93,10 +110,7 @@ def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, Rel
         borders = np.quantile(turns[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
         third = np.searchsorted(borders, turns)
         for which in np.unique(third[seen]):
-            rows = np.flatnonzero(seen & (third == which))
-            T_geometric = np.stack([reduce(np.matmul, [g.T_from_to for g in between[k]]) for k in rows])
-            errors = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
-            factors = _MAD_TO_SIGMA * np.median(np.abs(errors / law[rows]), axis=0)
+            factors = _MAD_TO_SIGMA * np.median(np.abs(whitened[seen & (third == which)]), axis=0)
             scaling[alike & (third == which)] = np.maximum(factors, _LEAST_SCALING)
             logger.info(
                 "pose network's noise over %d frames, turns %d of %d: times %s",
@@ -106,6 +120,27 @@ def _scaling(pairs: Sequence[PairPose], law: FloatArray, steps: Mapping[int, Rel
                 factors.round(2),
             )
     return scaling
+
+
+def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
+    """Factors ``(P, 6)`` that make the noise of pairs add up along the drive as their errors do.
+
+    A network errs alike on neighbouring snippets. What stretches of a quarter of the drive add up to is compared with
+    what independent errors would; 1 where few pairs are measured. Every distance in frames says the same once more.
+    """
+    factors = np.ones_like(whitened)
+    frames = np.array([pair.last - pair.first for pair in pairs])
+    distances = np.unique(frames)
+    for distance in distances:
+        errors = whitened[(frames == distance) & np.isfinite(whitened).all(axis=1)]
+        stretch = len(errors) // _STRETCHES
+        if stretch < least:
+            continue
+        added = np.cumsum(np.vstack([np.zeros(6), errors]), axis=0)
+        grown = np.median(np.abs(added[stretch:] - added[:-stretch]), axis=0) * _MAD_TO_SIGMA / np.sqrt(stretch)
+        factors[frames == distance] = np.maximum(grown, 1.0)
+        logger.info("pose network's noise over %d frames, along the drive: times %s", distance, grown.round(2))
+    return np.asarray(factors * np.sqrt(len(distances)))
 
 
 def _unknown_to_geometry(pairs: Sequence[PairPose], steps: Mapping[int, RelativePose]) -> FloatArray:

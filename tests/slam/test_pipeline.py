@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.pose_noise import PoseNoise
 from slam import se3
 from slam.config import load_config
 from slam.errors import SlamError
@@ -213,15 +214,20 @@ def street() -> Excerpt:
     return Excerpt(SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64)), 4, 29)
 
 
-def drive_street(street: Excerpt, progress: Callable[[str, int, int], None] | None = None) -> SlamResult:
+def drive_street(
+    street: Excerpt,
+    progress: Callable[[str, int, int], None] | None = None,
+    noise: PoseNoise | None = None,
+    use: str = "calibrated",
+) -> SlamResult:
     oracle = OraclePredictor(
         street.reference,
         lambda k: np.where((depth := street.base.street.render(street.start + k).depth) > 0, depth, 200.0),
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
-    settings = load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20"])
-    return SlamPipeline(street, oracle, settings, progress).run()
+    settings = load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", f"frontend.use={use}"])
+    return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
 
 
 def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
@@ -255,6 +261,26 @@ def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
+
+
+def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt) -> None:
+    six = (0.002, 0.002, 0.002, 0.02, 0.02, 0.02)
+    none = (0.0,) * 6
+    noise = PoseNoise(
+        frame=six,
+        turn=none,
+        length=none,
+        disagreement=none,
+        correlation=none,
+        pose_sha256="",
+        measured_on=["simulated/600"],
+        pairs=99,
+    )
+    every, bridging = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "bridge"))
+    pairs = {(f.from_index, f.to_index) for f in every.factors if f.source == "network"}
+    assert pairs == {(k, k + 1) for k in range(1, 23)} | {(k, k + 2) for k in range(23)}
+    assert len(bridging.factors) < len(every.factors)
+    assert ate(every.optimised, every.reference) < 1.3 * ate(bridging.optimised, bridging.reference)
 
 
 def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:

@@ -59,7 +59,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
         "geometry.jolt_direction_share=0",
     ),
     "no bridging": ("bridging.enabled=false",),
-    "network factors on every step": ("frontend.use=always",),
+    "network factors only where geometry has none": ("frontend.use=bridge",),
     "no loops": ("loops.enabled=false",),
     "no support among loops": ("loops.min_support=0",),
     "no robust noise": ("pose_graph.kernel=none",),

@@ -184,8 +184,9 @@ def test_a_drive_scales_measured_noise_both_ways():
     scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
     assert scaled[50, 51][0] == pytest.approx(0.05 / np.sqrt(2), rel=0.25)
     assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # no further, however well both agree
-    few = sigmas_of(calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG))
-    np.testing.assert_allclose(few[50, 51], promised, rtol=1e-3)
+    few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG)
+    np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
+    assert {f.degrees for f in few} == {np.inf}  # the law as it lies beside the weights
 
 
 def test_turns_are_scaled_apart_from_straights():
@@ -213,3 +214,25 @@ def test_turns_that_are_all_alike_are_one_kind():
     T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
     factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE, CONFIG))
     np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)
+
+
+def test_the_graph_takes_errors_that_last_for_more_than_errors_that_change():
+    """The pitch of each step errs anew, its roll always to the same side; both by about as much."""
+    rng, count = np.random.default_rng(2), 400
+    ahead = np.tile([0.0, 0.0, 1.0], (count - 1, 1))
+    T, wrong = se3.chain(se3.from_rotation_vector(0 * ahead, ahead)), 0.01 * rng.normal(size=(count - 1, 3))
+    wrong[:, 1], wrong[:, 2] = 0.0, 0.01 + 0.1 * wrong[:, 2]
+    seen = snippets_of(se3.chain(se3.from_rotation_vector(wrong, ahead)))
+    factors = calibrated_factors(seen, exact_geometry(T), NOISE, CONFIG)
+    longer = {
+        distance: np.median(
+            [f.graph_sigmas / f.sigmas for f in factors if f.to_index - f.from_index == distance], axis=0
+        )
+        for distance in (1, 2)
+    }
+    # pairs of both distances say the same twice; of a hundred steps' equal errors a graph would expect ten
+    assert longer[1][0] == pytest.approx(np.sqrt(2), rel=0.3)
+    assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
+    assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)
+    few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE, CONFIG)
+    np.testing.assert_allclose([f.graph_sigmas / f.sigmas for f in few], np.sqrt(2))

@@ -126,19 +126,22 @@ def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) ->
     """Factors ``(P, 6)`` that make the noise of pairs add up along the drive as their errors do.
 
     A network errs alike on neighbouring snippets. What stretches of a quarter of the drive add up to is compared with
-    what independent errors would; 1 where few pairs are measured. Every distance in frames says the same once more.
+    what independent errors would; where few pairs are measured, errors are taken to last for as long. Every distance in
+    frames says the same once more.
     """
     factors = np.ones_like(whitened)
     frames = np.array([pair.last - pair.first for pair in pairs])
     distances = np.unique(frames)
     for distance in distances:
-        errors = whitened[(frames == distance) & np.isfinite(whitened).all(axis=1)]
+        alike = frames == distance
+        errors = whitened[alike & np.isfinite(whitened).all(axis=1)]
         stretch = len(errors) // _STRETCHES
         if stretch < least:
+            factors[alike] = np.sqrt(max(alike.sum() // _STRETCHES, 1))
             continue
         added = np.cumsum(np.vstack([np.zeros(6), errors]), axis=0)
         grown = np.median(np.abs(added[stretch:] - added[:-stretch]), axis=0) * _MAD_TO_SIGMA / np.sqrt(stretch)
-        factors[frames == distance] = np.maximum(grown, 1.0)
+        factors[alike] = np.maximum(grown, 1.0)
         logger.info("pose network's noise over %d frames, along the drive: times %s", distance, grown.round(2))
     return np.asarray(factors * np.sqrt(len(distances)))
 

@@ -235,4 +235,6 @@ def test_the_graph_takes_errors_that_last_for_more_than_errors_that_change():
     assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
     assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)
     few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE, CONFIG)
-    np.testing.assert_allclose([f.graph_sigmas / f.sigmas for f in few], np.sqrt(2))
+    for distance, pairs in ((1, 397), (2, 398)):  # nothing is known of them: as if they lasted for a quarter
+        ratios = [f.graph_sigmas / f.sigmas for f in few if f.to_index - f.from_index == distance]
+        np.testing.assert_allclose(ratios, np.sqrt(pairs // 4) * np.sqrt(2))

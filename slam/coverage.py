@@ -52,7 +52,9 @@ def coverage_by_source(
     relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
 ) -> dict[str, dict[str, float]]:
     """Number of factors and `coverage` of each kind of measurement, by the name of its source."""
-    kinds = {edge.source: [e for e in relative_poses if e.source == edge.source] for edge in relative_poses}
+    kinds: dict[str, list[RelativePose]] = {}
+    for edge in relative_poses:
+        kinds.setdefault(edge.source, []).append(edge)
     return {
         source: {"factors": len(edges), **coverage(edges, T_world_camera_true, scale)}
         for source, edges in sorted(kinds.items())

@@ -13,6 +13,7 @@ from slam.frames import RelativePose
 from slam.se3 import FloatArray
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
+_UPPER = np.triu_indices(6)
 
 
 def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera: FloatArray) -> None:
@@ -43,7 +44,7 @@ def _g2o_poses(T_a_b: FloatArray) -> list[str]:
 def _g2o_information(sigmas: FloatArray) -> str:
     """Upper triangle row by row; g2o puts translation first."""
     information = np.diag(1.0 / sigmas[_TRANSLATION_FIRST] ** 2)
-    return _numbers(information[np.triu_indices(6)])
+    return _numbers(information[_UPPER])
 
 
 def _numbers(row: FloatArray) -> str:

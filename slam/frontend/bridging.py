@@ -60,10 +60,10 @@ def bridge(
         why = next(iter(unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
-    frozen, geometric = _frozen(snippets, geometric, repeated, new)
+    by_network = network_steps(snippets)
+    frozen, geometric = _frozen(by_network, geometric, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     trusted = [s for s in snippets if not frozen.intersection((s.target, *s.sources))]
-    by_network = network_steps(snippets)
     filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
     by_image = {g.from_index: g.T_from_to for g in geometric if g.to_index - g.from_index == 1}
     # a network that saw only a frozen image still gives the best guess there is
@@ -84,13 +84,14 @@ def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
         T_target = {i: invert(T) for i, T in zip(snippet.sources, snippet.T_source_target, strict=True)}
         T_target[snippet.target] = np.eye(4)
         ends = range(min(snippet.sources), max(snippet.sources))
-        measured = {k: invert(T_target[k]) @ T_target[k + 1] for k in ends}
-        steps = measured | steps | {snippet.target: measured[snippet.target]}
+        for k in ends:
+            if k == snippet.target or k not in steps:
+                steps[k] = invert(T_target[k]) @ T_target[k + 1]
     return steps
 
 
 def _frozen(
-    snippets: Sequence[SnippetPoses],
+    by_network: Mapping[int, FloatArray],
     geometric: Sequence[RelativePose],
     repeated: Collection[int],
     new: Collection[int],
@@ -102,7 +103,6 @@ def _frozen(
     """
     frozen: set[int] = set()
     kept = list(geometric)
-    by_network = network_steps(snippets)
     for first, last in runs(repeated):
         before = [T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1]
         if not before or last + 1 not in new:

@@ -112,7 +112,6 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
         model: what to write.
         half: store weights in half precision (BatchNorm statistics stay in single precision).
     """
-    folder.mkdir(parents=True, exist_ok=True)
     for name, net in zip(FILES, (model.depth_net, model.pose_net)):
         if isinstance(net, Absent):
             continue

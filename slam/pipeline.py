@@ -275,7 +275,8 @@ class SlamPipeline:
         if measured.to_index == step + 1 and step in seen.motions and np.isfinite(scale.lengths[step]):
             length, sigma_share = float(scale.lengths[step]), float(scale.length_sigmas[step])
             chain_sigma_share = float(scale.length_chain_sigmas[step])
-            return seen.motions[step].with_length(length, sigma_share, chain_sigma_share, drive[step])
+            known = seen.motions[step].with_length(length, sigma_share, chain_sigma_share, drive[step])
+            return replace(known, degrees=self._config.geometry.noise_degrees)
         return rescaled(measured, _unit_of(measured, scale))
 
     def _dead_reckon(self, factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

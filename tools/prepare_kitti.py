@@ -162,7 +162,6 @@ def _write(job: Job) -> None:
         small = resize_image(image, job.size.height, job.size.width)
         options = [] if job.target.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPG_QUALITY]
         content = cv2.imencode(job.target.suffix, small, options)[1].tobytes()
-    job.target.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(job.target, lambda path: path.write_bytes(content))
 
 

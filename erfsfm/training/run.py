@@ -225,7 +225,6 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``."""
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_atomically(Path(path), lambda part: torch.save(checkpoint, part))
 
 

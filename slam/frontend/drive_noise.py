@@ -9,7 +9,6 @@ corners' own noise does not explain. The shares in ``GeometryConfig`` were fitte
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -32,12 +31,10 @@ class StepNoise:
     """Sigmas that add in squares: ``rotation`` and ``direction`` ``(3,)`` in radians.
 
     The direction is of the earlier camera as the later one sees it, where GTSAM perturbs; along it there is no error.
-    Errors are by Student's t of ``degrees`` degrees of freedom.
     """
 
     rotation: FloatArray
     direction: FloatArray
-    degrees: float = math.inf
 
 
 def drive_noise(
@@ -65,7 +62,7 @@ def drive_noise(
         rotation.append(config.jolt_rotation_share * jolted)
         aside = config.shake_direction_share * np.linalg.norm(shake) * np.sqrt(np.maximum(1.0 - along[k] ** 2, 0.0))
         direction = np.hypot(aside, config.jolt_direction_share * swerved)
-        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction, config.noise_degrees)
+        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction)
     return noise
 
 

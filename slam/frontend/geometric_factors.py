@@ -91,13 +91,7 @@ class Motion:
         sigmas, chain_sigmas = (
             _sigmas(T_previous_current, rotation, direction, share) for share in (sigma_share, chain_sigma_share)
         )
-        return replace(
-            self.relative_pose,
-            T_from_to=T_previous_current,
-            sigmas=sigmas,
-            chain_sigmas=chain_sigmas,
-            degrees=noise.degrees,
-        )
+        return replace(self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, chain_sigmas=chain_sigmas)
 
 
 class GeometricOdometry(Learner):

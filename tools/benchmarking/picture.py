@@ -45,5 +45,4 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     light = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: light.save(file, format="png", optimize=True))

@@ -143,11 +143,11 @@ def receptive_field(
     from erfsfm.checkpoint import load_model
     from erfsfm.data.images import image_files, resize_image
     from erfsfm.errors import ConfigError, DataError
-    from erfsfm.fields.figure import draw_survey
-    from erfsfm.fields.street import street_snippet
-    from erfsfm.fields.survey import survey
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
+    from erfsfm.receptive_field.figure import draw_fields
+    from erfsfm.receptive_field.measure import measure_fields
+    from erfsfm.receptive_field.street import street_snippet
 
     if output.suffix not in (".png", ".pdf", ".svg"):
         raise ConfigError(f"--output must end in .png, .pdf or .svg; got {output}")
@@ -160,9 +160,9 @@ def receptive_field(
         snippet = [resize_image(read_image(file), height, width) for file in files]
     torch.manual_seed(seed)
     learned = None if weights == "none" else (weights, load_model(weights))
-    rows = survey(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
+    rows = measure_fields(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
     output.parent.mkdir(parents=True, exist_ok=True)
-    draw_survey(rows, snippet[2], output)
+    draw_fields(rows, snippet[2], output)
     summaries = [row.summary() for row in rows]
     if as_json:
         typer.echo(json.dumps(summaries, indent=2))

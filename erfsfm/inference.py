@@ -30,7 +30,7 @@ DeviceChoice = Literal["auto", "cpu", "cuda"]
 _THREADS = max(torch.get_num_threads() - 1, 1)
 
 
-def leave_a_core() -> None:
+def limit_torch_threads() -> None:
     """Let networks asked in this thread compute on all cores but one, for whatever goes on beside them."""
     torch.set_num_threads(_THREADS)
 

@@ -12,7 +12,7 @@ __all__ = ["Slam", "run_slam"]
 def __getattr__(name: str) -> Any:
     """Load the system when it is asked for: ``import slam`` alone stays light."""
     if name == "Slam":
-        from slam.incremental import Slam
+        from slam.pipeline.live import Slam
 
         return Slam
     if name == "run_slam":

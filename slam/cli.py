@@ -14,12 +14,12 @@ import typer
 
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
-from slam.progress import progress_bar
+from slam.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from slam.run_folder import RunFolder
+    from slam.results.folder import RunFolder
 
 app = typer.Typer(
     add_completion=False,
@@ -129,9 +129,9 @@ def export(
 
     Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
     """
-    from slam.export import export as export_run
     from slam.mapping import rotate_ply
-    from slam.run_folder import RunFolder
+    from slam.results.export import export as export_run
+    from slam.results.folder import RunFolder
 
     written = export_run(RunFolder.open(run), what, output, up, rotate_ply)
     typer.echo(f"{what} of {run} in {written}")
@@ -151,9 +151,9 @@ def localize(
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
-    from slam.localisation import localise
-    from slam.localisation_tables import localisation_json, localisation_table, write_localisations
-    from slam.run_folder import RunFolder
+    from slam.localisation.localiser import localise
+    from slam.localisation.tables import localisation_json, localisation_table, write_localisations
+    from slam.results.folder import RunFolder
 
     run_folder = RunFolder.open(map)
     with progress_bar() as progress:
@@ -186,7 +186,7 @@ def simulate(
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
-    from slam.sequences.simulated import SimulatedStreet, parse_options, write_kitti_root
+    from slam.sequences.simulation.street import SimulatedStreet, parse_options, write_kitti_root
 
     street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards))
     with progress_bar() as progress:
@@ -206,8 +206,8 @@ def plot(
 
     Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
     """
-    from slam.plots import plot_runs
-    from slam.run_folder import RunFolder
+    from slam.results.folder import RunFolder
+    from slam.results.plots import plot_runs
 
     plot_runs([RunFolder.open(path) for path in runs], what.split(","), output)
     typer.echo(f"figure in {output}")
@@ -241,8 +241,8 @@ def doctor(
 def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
     from rich.console import Console
 
-    from slam.comparison import comparison_json, comparison_table
-    from slam.run_folder import RunFolder
+    from slam.results.comparison import comparison_json, comparison_table
+    from slam.results.folder import RunFolder
 
     runs = [RunFolder.open(path) for path in paths]
     if as_json:
@@ -254,8 +254,8 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
     from rich.console import Console
 
-    from slam.evaluation import evo_commands, exceeded, trajectory_metrics
-    from slam.tables import metrics_table
+    from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
+    from slam.results.tables import metrics_table
     from slam.trajectory import associate, read_trajectory
 
     pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
@@ -274,8 +274,8 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
 def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     from rich.console import Console
 
-    from slam.comparison import unit_notes
-    from slam.tables import metrics_table
+    from slam.results.comparison import unit_notes
+    from slam.results.tables import metrics_table
 
     provenance, scale, timing = metrics["provenance"], metrics["scale"], metrics["timing"]
     known = {k: v for k, v in metrics["trajectories"].items() if isinstance(v, dict)}
@@ -299,7 +299,7 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
 def _print_localisations(run_folder: RunFolder, table: Table) -> None:
     from rich.console import Console
 
-    from slam.comparison import unit_notes
+    from slam.results.comparison import unit_notes
 
     Console(width=_table_width()).print(table)
     for note in unit_notes(run_folder.metrics()):

@@ -14,8 +14,8 @@ from typing import Literal, Self
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
+from slam.config_file import override, read_tree
 from slam.errors import ConfigError
-from slam.yaml_tree import override, read_tree
 
 ScaleMode = Literal["none", "camera-height", "lidar", "reference"]
 
@@ -33,18 +33,18 @@ class FrontendConfig(Section):
         default="calibrated", description="always with a noise beside the weights, else bridge: where geometry has none"
     )
     rotation_sigma_deg: float = Field(default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step")
-    translation_sigma_share: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
-    translation_floor_share: float = Field(
+    translation_relative_sigma: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
+    translation_floor_ratio: float = Field(
         default=0.05, gt=0, le=10, description="floor, as a share of the median one-frame step"
     )
     noise_steps: int = Field(
         default=20, ge=1, description="steps that image geometry must share before the noise is measured on them"
     )
-    noise_degrees: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which pairs then err")
+    student_t_dof: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which pairs then err")
 
 
 class GeometryConfig(Section):
-    """Relative poses from tracked corners, see ``frontend/geometric_factors.py``."""
+    """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
 
     enabled: bool = Field(default=True, description="add geometric factors beside the network's")
     steps: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1, description="frame distances to measure")
@@ -55,23 +55,23 @@ class GeometryConfig(Section):
     wide_window_px: int = Field(default=31, ge=5, le=63, description="its side where few corners could be followed")
     few_corners: int = Field(default=60, ge=0, description="fewer are few: they are sought again, exposure made alike")
     pyramid_levels: int = Field(default=4, ge=0, le=8, description="levels above the full image")
-    foresight: bool = Field(
+    predicted_flow: bool = Field(
         default=True, description="follow corners also through the view that learned depth and the last motion foretell"
     )
-    span_steps: int = Field(
+    rotation_baseline_steps: int = Field(
         default=2, ge=1, le=3, description="turns are also measured across so many steps at once; 1: they are not"
     )
-    mover_sharpness: float = Field(
+    dynamic_mask_sharpness: float = Field(
         default=4.0, ge=0, description="power of the share of corners that fit near one lately; 0: believe all alike"
     )
     forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward error")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier")
     reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier")
     along_px: float = Field(default=0.4, gt=0, description="noise of a corner along its line, beside learned depth's")
-    clear_share: float = Field(default=0.75, ge=0, le=1, description="share of inliers that ends the search")
-    depth_sigma_share: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
-    habit_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the direction around the usual one")
-    steering_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the direction that a turn tells")
+    early_exit_inlier_ratio: float = Field(default=0.75, ge=0, le=1, description="inlier ratio that ends the search")
+    depth_relative_sigma: float = Field(default=0.2, gt=0, description="least error of learned depth along a line")
+    direction_prior_sigma_deg: float = Field(default=8.0, gt=0, description="least sigma of the motion prior")
+    heading_prior_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the heading prior")
     min_inliers: int = Field(default=20, ge=8, description="fewer refuse the measurement")
     still_flow_px: float = Field(default=0.3, ge=0, description="a median flow below means standing still")
     min_parallax_px: float = Field(
@@ -83,37 +83,37 @@ class GeometryConfig(Section):
         default=0.002, gt=0, description="least rotation sigma of a motion by all corners"
     )
     direction_floor_deg: float = Field(default=0.045, gt=0, description="least sigma of the translation's direction")
-    shake_rotation_share: float = Field(default=0.33, ge=0, description="rotation sigma, share of the camera's shake")
-    shake_direction_share: float = Field(default=8.5, ge=0, description="sigma of the direction, likewise")
-    turn_rotation_share: float = Field(default=0.015, ge=0, description="rotation sigma, share of the step's turn")
-    jolt_rotation_share: float = Field(
+    jitter_rotation_ratio: float = Field(default=0.33, ge=0, description="rotation sigma, share of the camera's shake")
+    jitter_direction_ratio: float = Field(default=8.5, ge=0, description="sigma of the direction, likewise")
+    turn_rotation_ratio: float = Field(default=0.015, ge=0, description="rotation sigma, share of the step's turn")
+    neighbour_rotation_ratio: float = Field(
         default=0.25, ge=0, description="rotation sigma, share of the jump to neighbours"
     )
-    jolt_direction_share: float = Field(default=1.0, ge=0, description="sigma of the direction, likewise")
-    noise_degrees: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which a step errs")
+    neighbour_direction_ratio: float = Field(default=1.0, ge=0, description="sigma of the direction, likewise")
+    student_t_dof: float = Field(default=12.0, gt=2, description="of freedom of Student's t by which a step errs")
 
 
 class RoadConfig(Section):
-    """Lengths of steps from the road's motion in the image, see ``frontend/road_motion.py``."""
+    """Lengths of steps from the road's motion in the image, see ``frontend/scale/road_homography.py``."""
 
     enabled: bool = Field(default=True, description="measure steps on the road, in camera heights")
     far_heights: float = Field(default=9.0, gt=0, description="farthest road used, in camera heights")
     half_width_heights: float = Field(default=1.0, gt=0, description="half the width of the strip, likewise")
     near_heights: float = Field(default=4.5, gt=0, description="farthest road of the short strip behind a car ahead")
     near_half_width_heights: float = Field(default=2.0, gt=0, description="half the width of the short strip")
-    near_sigma_share: float = Field(default=0.1, gt=0, description="least relative sigma of a length by it")
+    near_relative_sigma: float = Field(default=0.1, gt=0, description="least relative sigma of a length by it")
     points: int = Field(default=4000, ge=100, description="about how many pixels to align")
     min_points: int = Field(default=300, ge=50, description="fewer refuse the measurement")
     tilt_sigma_deg: float = Field(default=0.1, gt=0, description="tilt to expect against the direction of motion")
     max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="a plane tilted by more is not the road")
-    min_likeness: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
+    min_correlation: float = Field(default=0.3, ge=0, le=1, description="a lower correlation refuses the step")
     min_gain: float = Field(default=0.25, ge=0, le=1, description="least share of an unmoved image's error explained")
-    sigma_share: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
+    relative_sigma: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma for a radian of unexpected tilt")
 
 
 class LengthConfig(Section):
-    """Lengths of all steps at once, see ``frontend/step_lengths.py``; sigmas of logarithms."""
+    """Lengths of all steps at once, see ``frontend/scale/step_lengths.py``; sigmas of logarithms."""
 
     ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of a step over the one before")
     ratio_widening: float = Field(default=1.5, gt=0, description="sigmas that points give, widened by this")
@@ -122,21 +122,21 @@ class LengthConfig(Section):
     unit_sigma: float = Field(default=0.2, gt=0, description="of that unit as the learned road gives it")
     max_contradiction: float = Field(default=2.5, gt=1, description="largest factor from the length by learned depth")
     outlier_sigmas: float = Field(default=2.0, gt=0, description="residual where a measurement has half its weight")
-    chain_widening: float = Field(
+    correlated_widening: float = Field(
         default=1.5, gt=0, description="sigmas along the graph, widened by this: what ails a stretch of road lasts"
     )
 
 
-class BridgingConfig(Section):
-    """Frames that show nothing usable, see ``frontend/inspection.py`` and ``frontend/bridging.py``."""
+class GapsConfig(Section):
+    """Frames that show nothing usable, see ``frontend/image_gate.py`` and ``frontend/gap_interpolation.py``."""
 
     enabled: bool = Field(default=True, description="bridge unusable frames; else they are measured and may end a run")
     blank_contrast: float = Field(default=3.0, ge=0, description="a standard deviation of grey levels below is blank")
     noise_contrast: float = Field(default=0.3, ge=0, lt=1, description="share of contrast that survives blurring")
-    min_likeness: float = Field(default=0.2, ge=-1, le=1, description="correlation with the frames before")
+    min_correlation: float = Field(default=0.2, ge=-1, le=1, description="correlation with the frames before")
     max_unread_frames: int = Field(default=30, ge=1, description="more unreadable images in a row end the run")
     rotation_sigma_deg: float = Field(default=2.0, gt=0, le=90, description="rotation sigma of a bridged step")
-    translation_sigma_share: float = Field(default=0.5, gt=0, le=10, description="share of a bridged step's length")
+    translation_relative_sigma: float = Field(default=0.5, gt=0, le=10, description="share of a bridged step's length")
 
 
 class LidarConfig(Section):
@@ -148,7 +148,7 @@ class LidarConfig(Section):
 
 
 class ScaleConfig(Section):
-    """Metric scale, see ``frontend/scale.py``."""
+    """Metric scale, see ``frontend/scale/road_plane.py``."""
 
     mode: Literal["auto"] | ScaleMode = Field(
         default="auto", description="auto: camera-height where a height is known, else none"
@@ -157,23 +157,23 @@ class ScaleConfig(Section):
     min_frames: int = Field(default=5, ge=1, description="fewer usable frames refuse a scale")
     rejection_mads: float = Field(default=3.0, gt=0, description="frames farther from the median are left out")
     smoothing_frames: int = Field(default=41, ge=1, description="window in which the scale may differ from the drive's")
-    road_top_share: float = Field(
+    road_top_ratio: float = Field(
         default=0.35,
         ge=0,
         lt=1,
         description="top edge of the road trapezoid, from horizon (0) to image bottom (1)",
     )
-    road_bottom_share: float = Field(default=0.97, gt=0, le=1, description="bottom edge, likewise")
+    road_bottom_ratio: float = Field(default=0.97, gt=0, le=1, description="bottom edge, likewise")
     road_top_width: float = Field(default=0.16, gt=0, le=1, description="width of the top edge, share of the image")
     road_bottom_width: float = Field(default=0.5, gt=0, le=1, description="width of the bottom edge, likewise")
     max_tilt_deg: float = Field(default=12.0, gt=0, lt=90, description="plane normal from the camera's y axis")
-    inlier_share_of_depth: float = Field(default=0.05, gt=0, lt=1, description="depth error of a plane inlier")
-    min_inlier_share: float = Field(default=0.5, gt=0, le=1, description="fewer inliers refuse the frame")
+    inlier_relative_depth: float = Field(default=0.05, gt=0, lt=1, description="depth error of a plane inlier")
+    min_inlier_ratio: float = Field(default=0.5, gt=0, le=1, description="fewer inliers refuse the frame")
 
     @model_validator(mode="after")
     def _top_above_bottom(self) -> Self:
-        if self.road_top_share >= self.road_bottom_share:
-            raise ValueError("a road trapezoid with road_top_share < road_bottom_share")
+        if self.road_top_ratio >= self.road_bottom_ratio:
+            raise ValueError("a road trapezoid with road_top_ratio < road_bottom_ratio")
         return self
 
 
@@ -196,20 +196,20 @@ class LoopsConfig(Section):
     ransac_iterations: int = Field(default=200, ge=10, description="samples of perspective-n-point")
     reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier")
     min_inliers: int = Field(default=20, ge=6, description="fewer refuse the loop")
-    min_inlier_share: float = Field(default=0.4, gt=0, le=1, description="share of the matches with depth that agree")
-    min_spread_share: float = Field(default=0.1, ge=0, lt=1, description="standard deviation of the inliers' columns")
+    min_inlier_ratio: float = Field(default=0.4, gt=0, le=1, description="share of the matches with depth that agree")
+    min_spread_ratio: float = Field(default=0.1, ge=0, lt=1, description="standard deviation of the inliers' columns")
     agreement_deg: float = Field(default=2.0, gt=0, description="largest difference of both directions' rotations")
-    agreement_share: float = Field(default=0.1, gt=0, description="of their positions, as a share of the depth")
+    agreement_ratio: float = Field(default=0.1, gt=0, description="of their positions, as a share of the depth")
     corner_sigma_widening: float = Field(default=1.25, gt=0, description="corners' own sigmas are widened by this")
     rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma")
-    translation_floor_share: float = Field(default=0.0003, gt=0, description="least translation sigma, share of depth")
-    length_sigma_share: float = Field(default=0.04, gt=0, description="translation sigma, share of the translation")
-    max_drift_share: float = Field(default=0.3, gt=0, description="largest correction, as a share of the way between")
+    translation_floor_ratio: float = Field(default=0.0003, gt=0, description="least translation sigma, share of depth")
+    length_relative_sigma: float = Field(default=0.04, gt=0, description="translation sigma, share of the translation")
+    max_drift_ratio: float = Field(default=0.3, gt=0, description="largest correction, as a share of the way between")
     support_frames: int = Field(default=20, ge=1, description="loops with ends this near must agree")
     min_support: int = Field(default=2, ge=0, description="images whose loops must agree with a loop")
     alone_inliers: int = Field(default=120, ge=6, description="a loop with this many inliers may stand alone")
     support_sigmas: float = Field(default=3.0, gt=0, description="sigmas that agreeing loops may differ by")
-    support_drift_share: float = Field(default=0.1, ge=0, description="drift of the odometry between their ends")
+    support_drift_ratio: float = Field(default=0.1, ge=0, description="drift of the odometry between their ends")
     support_drift_deg: float = Field(default=0.1, ge=0, description="likewise, a frame")
 
 
@@ -268,7 +268,7 @@ class SlamConfig(Section):
 
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
-    bridging: BridgingConfig = BridgingConfig()
+    gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()
     lidar: LidarConfig = LidarConfig()

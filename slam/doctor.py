@@ -11,7 +11,7 @@ from pathlib import Path
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
 from slam.errors import SlamError
-from slam.foreign import import_open3d
+from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_names
 
 PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")

@@ -1,7 +1,7 @@
 """What travels between the parts of the system: small frozen records and two protocols.
 
 The front end, the graph, the map and the evaluation never import each other; they meet in
-``slam/pipeline.py`` through these.
+``slam/pipeline/batch.py`` through these.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,17 @@ class Intrinsics:
     def K(self) -> FloatArray:
         """The camera matrix ``(3, 3)``, pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self, pixels: NDArray[Any]) -> FloatArray:
+        """Rays ``(..., 3)`` with z = 1 through pixels ``(..., 2)``."""
+        u, v = np.moveaxis(np.asarray(pixels), -1, 0)
+        x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def pixel_grid(self) -> FloatArray:
+        """Every pixel ``(H, W, 2)`` as (u, v)."""
+        v, u = np.mgrid[: self.height, : self.width]
+        return np.stack([u, v], axis=-1).astype(np.float64)
 
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same camera after its image is resized, half-pixel exact."""
@@ -126,9 +137,9 @@ class RelativePose:
     """A measured ``T_from_to`` between two frames and its noise.
 
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
-    translation in the units of the measurement. ``source`` names who measured it. ``chain_sigmas`` ``(6,)``, where
+    translation in the units of the measurement. ``source`` names who measured it. ``correlated_sigmas`` ``(6,)``, where
     errors of neighbours are alike: independent errors of these sigmas would add up along a chain as those do.
-    Errors are by Student's t of so many ``degrees`` of freedom; normal where infinite.
+    Errors are by Student's t of so many ``student_t_dof`` of freedom; normal where infinite.
     """
 
     from_index: int
@@ -136,13 +147,13 @@ class RelativePose:
     T_from_to: FloatArray
     sigmas: FloatArray
     source: str
-    chain_sigmas: FloatArray | None = None
-    degrees: float = math.inf
+    correlated_sigmas: FloatArray | None = None
+    student_t_dof: float = math.inf
 
     @property
     def graph_sigmas(self) -> FloatArray:
         """Sigmas ``(6,)`` for a graph, which takes the errors of its factors to be independent."""
-        return self.sigmas if self.chain_sigmas is None else self.chain_sigmas
+        return self.sigmas if self.correlated_sigmas is None else self.correlated_sigmas
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

@@ -19,10 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config import MappingConfig
 from slam.errors import SlamError
-from slam.files import write_atomically
-from slam.foreign import import_open3d
 from slam.frames import DepthMap, Image, Intrinsics
+from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray, invert, rotation_angle
+from slam.storage.files import write_atomically
 
 _BLOCK_SIDE = 16
 _FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street: each time that there are more costs Open3D a second
@@ -275,9 +275,8 @@ def _thinned(intrinsics: Intrinsics, step: int) -> Intrinsics:
 
 def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
     """Rays ``(3, H*W)`` with z = 1."""
-    v, u = np.mgrid[: intrinsics.height, : intrinsics.width].reshape(2, -1)
-    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
-    return np.stack([x, y, np.ones_like(x)]).astype(np.float32)
+    rays = intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3)
+    return np.ascontiguousarray(rays.T, dtype=np.float32)
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:

@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
+from slam.formats.g2o import write_g2o
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.g2o import write_g2o
 from slam.se3 import FloatArray, invert, is_se3
 
 _ANCHOR_SIGMA = 1e-6
@@ -30,7 +30,7 @@ _OUTLYING = 3.0
 _RELINEARISE = 1e-3
 _SETTLED = 1e-4
 _MOST_UPDATES = 20
-_SAME_SHARE = 0.01
+_SAME_RATIO = 0.01
 
 logger = logging.getLogger(__name__)
 
@@ -274,7 +274,7 @@ def _differ(old: RelativePose, new: RelativePose) -> bool:
     """Whether a measurement has changed by more than nothing to speak of."""
     moved = np.abs(old.T_from_to - new.T_from_to).max()
     widened = np.abs(old.graph_sigmas / new.graph_sigmas - 1.0).max()
-    return bool(moved > _SAME_SHARE * new.sigmas.min() or widened > _SAME_SHARE)
+    return bool(moved > _SAME_RATIO * new.sigmas.min() or widened > _SAME_RATIO)
 
 
 def _anchor(pose: Any) -> Any:

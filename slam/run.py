@@ -16,34 +16,34 @@ from erfsfm import __version__, photometric_residual
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit, overlapping
 from slam import frontend, loops, se3
-from slam.cache import CachedNetworks
 from slam.config import OutputConfig, SlamConfig, dump_yaml, load_config
-from slam.drive import DRIVE, KEYFRAMES, Drive, write_keyframes
 from slam.errors import ConfigError, RunError, SlamError
-from slam.foreign import import_rerun
 from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
-from slam.memory import Memory, Recollection, compute_anew, fingerprint
-from slam.networks import NetworkPredictor
-from slam.pipeline import Progress, SlamPipeline, SlamResult
-from slam.places import PLACES, Places
-from slam.report import DepthExample, write_report
-from slam.rerun_file import write_rerun
-from slam.run_folder import RunFolder
-from slam.run_map import write_map
-from slam.run_metrics import lidar_trajectory, run_metrics
-from slam.sequences.catalogue import open_sequence
-from slam.summary import (
+from slam.loops.places import PLACES, Places
+from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
+from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
+from slam.prediction.cached import CachedNetworks
+from slam.prediction.networks import NetworkPredictor
+from slam.results.folder import RunFolder
+from slam.results.map import write_map
+from slam.results.metrics import lidar_trajectory, run_metrics
+from slam.results.report import DepthExample, write_report
+from slam.results.rerun import write_rerun
+from slam.results.summary import (
     Provenance,
     as_json,
     describe_failure,
 )
-from slam.threads import one_thread_each
+from slam.runtime.imports import import_rerun
+from slam.runtime.threads import limit_library_threads
+from slam.sequences.catalogue import open_sequence
+from slam.storage.cache import CacheNamespace, DiskCache, fingerprint, without_cache
 
 logger = logging.getLogger(__name__)
 
 # what a pass over the frames depends on
-_SETTLED = ("geometry", "bridging", "road", "scale", "loops")
+_SETTLED = ("geometry", "gaps", "road", "scale", "loops")
 
 
 def run_slam(
@@ -98,10 +98,10 @@ def run_slam(
     drive = None if continues is None else _drive(continues, networks.sha256, recording)
     if drive is not None:
         recording = drive.continued(recording)
-    memory = None if cache is None else Memory(cache)
-    recall = compute_anew if memory is None else Recollection(memory, _code()).recall
+    memory = None if cache is None else DiskCache(cache)
+    get_or_compute = without_cache if memory is None else CacheNamespace(memory, _code()).get_or_compute
     asked = networks if memory is None else _cached(networks, memory)
-    predictor = NetworkPredictor(asked, recording.intrinsics, recall)
+    predictor = NetworkPredictor(asked, recording.intrinsics, get_or_compute)
     provenance = Provenance(
         version=__version__,
         commit=commit(),
@@ -119,8 +119,8 @@ def run_slam(
     with _logging_to(folder.path / "run.log"):
         try:
             _seed(seed)
-            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, recall, drive)
-            with one_thread_each():
+            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, get_or_compute, drive)
+            with limit_library_threads():
                 result = _run(folder, pipeline, recording, provenance, settings.output)
             if rerun is not None:
                 write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
@@ -144,9 +144,9 @@ def _continued(continues: Path, config: str | Path | None, overrides: Sequence[s
     return settings
 
 
-def _drive(continues: Path, weights_sha256: str, following: FrameSequence) -> Drive:
+def _drive(continues: Path, weights_sha256: str, following: FrameSequence) -> SessionCheckpoint:
     """What is kept of a run to continue, if these networks and frames can go on with it."""
-    drive = Drive.open(continues)
+    drive = SessionCheckpoint.open(continues)
     if drive.weights_sha256 != weights_sha256:
         raise RunError(f"{continues} was run with other weights: continue it with the same --weights")
     ranges = [name for name in following.provenance() if name.endswith("]")]  # a simulated world has none
@@ -167,7 +167,7 @@ def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, erro
             write_report(folder, [], None, None)
 
 
-def _cached(networks: DepthPosePredictor, memory: Memory) -> CachedNetworks:
+def _cached(networks: DepthPosePredictor, memory: DiskCache) -> CachedNetworks:
     """The networks with a memory of their answers; GPU and CPU answer a little differently and share none."""
     network = networks.record.network.model_dump_json()
     return CachedNetworks(networks, f"{networks.sha256} {network} {networks.device.type}", memory)
@@ -176,7 +176,7 @@ def _cached(networks: DepthPosePredictor, memory: Memory) -> CachedNetworks:
 def _code() -> str:
     """Whatever measures images: an entry names it, so that there is no version to forget."""
     folders = (Path(package.__path__[0]) for package in (frontend, loops))
-    sources = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+    sources = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
     versions = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
     return " ".join((fingerprint(*sources, Path(se3.__file__), Path(photometric_residual.__file__)), *versions))
 
@@ -192,7 +192,7 @@ def _run(
     estimate = pipeline.estimate()
     _write_estimate(folder, estimate, sequence.intrinsics)
     if output.keep != "nothing":
-        folder.write(DRIVE, Drive.of(sequence, estimate.observer, provenance.weights_sha256).write)
+        folder.write(DRIVE, SessionCheckpoint.of(sequence, estimate.observer, provenance.weights_sha256).write)
     if output.keep == "keyframes":
         folder.write(KEYFRAMES, lambda path: write_keyframes(path, estimate.observer.seen.keyframes))
     result = replace(estimate, map=pipeline.fuse(estimate))

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from slam import se3
 from slam.errors import TrajectoryError
-from slam.files import write_atomically
 from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -87,8 +87,8 @@ def test_only_command_lines_and_tools_print() -> None:
 
 def test_each_heavy_library_has_one_home() -> None:
     assert uses("gtsam") == {"slam/pose_graph.py"}
-    assert uses("evo") == {"slam/evaluation.py"}
-    assert uses("open3d") == set()  # through the door of slam/foreign.py
+    assert uses("evo") == {"slam/evaluation/trajectory.py"}
+    assert uses("open3d") == set()  # through the door of slam/runtime/imports.py
     assert all(name.startswith("erfsfm/training/") for name in uses("lightning"))
     assert not [name for name in uses("torch") if name.startswith("slam/")]
 

@@ -18,15 +18,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-from benchmarking.marks import marks
+from benchmarking.metric_definitions import rows
 from benchmarking.page import PICTURE, section, with_section
 from benchmarking.picture import draw, drawable
 from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Condition, Job, excerpts, plan, recordings, worlds
-from benchmarking.quantities import rows
+from benchmarking.summary import marks
 from benchmarking.work import ROOT, measured, workers
 
 from slam.errors import SlamError
-from slam.files import write_atomically
+from slam.storage.files import write_atomically
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -22,18 +22,18 @@ from rich.console import Console
 
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
-from slam.cache import CachedNetworks
 from slam.config import load_config
 from slam.errors import SlamError
-from slam.evaluation import trajectory_metrics
+from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import DepthMap, Intrinsics
-from slam.networks import NetworkPredictor
-from slam.observation import Keyframe
-from slam.pipeline import SlamPipeline
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.observer import Keyframe
+from slam.prediction.cached import CachedNetworks
+from slam.prediction.networks import NetworkPredictor
+from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
-from slam.tables import metrics_table
 from slam.trajectory import Trajectory
 
 SEED = 0

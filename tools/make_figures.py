@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor
-from slam.foreign import import_open3d
-from slam.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
-from slam.run_folder import RunFolder
+from slam.results.folder import RunFolder
+from slam.results.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
+from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600

@@ -24,9 +24,9 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import FrameRange, overlapping
 from erfsfm.data.standstill import moving_parts
-from erfsfm.data.structure import StructureCache
 from erfsfm.data.weather import weathered
 from erfsfm.errors import DataError
+from erfsfm.teacher.structure import StructureCache
 
 logger = logging.getLogger(__name__)
 

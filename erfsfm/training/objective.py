@@ -30,7 +30,7 @@ HEIGHTS = 10.0  # camera heights in a taught network's unit: steps are hundredth
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    What classical geometry measured, where it was asked (`erfsfm.data.structure`): ``T_source_target``
+    What classical geometry measured, where it was asked (`erfsfm.teacher.structure`): ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
     Where the networks see them otherwise: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order.
     """

@@ -7,7 +7,7 @@ what geometry does not know of itself the network does not know either (``docs/d
 tails than normal errors and lasts from snippet to snippet; the graph takes it for so much more (``docs/design/0020``).
 
 Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
-sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_sigma_share`` of the length
+sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length
 plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
 nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
 their sigmas times sqrt(m) and count as one.
@@ -28,10 +28,10 @@ from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
 from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
+from slam.robust import mad_sigma, mad_sigmas
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
-_MAD_TO_SIGMA = 1.4826
 # image geometry errs too: agreement beyond this is not believed
 _LEAST_SCALING = 0.3
 _STRETCHES = 4
@@ -42,14 +42,14 @@ logger = logging.getLogger(__name__)
 def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
     """Every direct pose of every snippet as ``T_source_target``, unscaled, with its noise."""
     multiplicity = Counter(_pair(source, s.target) for s in snippets for source in s.sources)
-    floor = max(config.translation_floor_share * _median_step(snippets), 1e-9)
+    floor = max(config.translation_floor_ratio * _median_step(snippets), 1e-9)
     factors = []
     for snippet in snippets:
         for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
             repeated = np.sqrt(multiplicity[_pair(source, snippet.target)])
             rotation = np.deg2rad(config.rotation_sigma_deg) * np.sqrt(abs(snippet.target - source))
             length = float(np.linalg.norm(T_source_target[:3, 3]))
-            translation = config.translation_sigma_share * length + floor
+            translation = config.translation_relative_sigma * length + floor
             sigmas = repeated * np.repeat([rotation, translation], 3)
             factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
     return factors
@@ -71,14 +71,14 @@ def calibrated_factors(
         return []
     law = np.stack([noise.sigmas(pair) for pair in pairs])
     steps = {g.from_index: g for g in geometric if g.to_index == g.from_index + 1}
-    degrees = config.noise_degrees if len(steps) >= config.noise_steps else math.inf
+    student_t_dof = config.student_t_dof if len(steps) >= config.noise_steps else math.inf
     from_geometry = _from_geometry(pairs, steps)
     scaling = _scaling(pairs, from_geometry / law, config.noise_steps)
     sigmas = np.hypot(scaling * law, _unknown_to_geometry(pairs, steps))
-    chain_sigmas = _persistence(pairs, from_geometry / sigmas, config.noise_steps) * sigmas
+    correlated_sigmas = _persistence(pairs, from_geometry / sigmas, config.noise_steps) * sigmas
     return [
-        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, degrees)
-        for pair, own, chained in zip(pairs, sigmas, chain_sigmas, strict=True)
+        RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, student_t_dof)
+        for pair, own, chained in zip(pairs, sigmas, correlated_sigmas, strict=True)
     ]
 
 
@@ -110,7 +110,7 @@ def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> Flo
         borders = np.quantile(turns[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
         third = np.searchsorted(borders, turns)
         for which in np.unique(third[seen]):
-            factors = _MAD_TO_SIGMA * np.median(np.abs(whitened[seen & (third == which)]), axis=0)
+            factors = mad_sigmas(whitened[seen & (third == which)])
             scaling[alike & (third == which)] = np.maximum(factors, _LEAST_SCALING)
             logger.info(
                 "pose network's noise over %d frames, turns %d of %d: times %s",
@@ -140,7 +140,7 @@ def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) ->
             factors[alike] = np.sqrt(max(alike.sum() // _STRETCHES, 1))
             continue
         added = np.cumsum(np.vstack([np.zeros(6), errors]), axis=0)
-        grown = np.median(np.abs(added[stretch:] - added[:-stretch]), axis=0) * _MAD_TO_SIGMA / np.sqrt(stretch)
+        grown = mad_sigmas(added[stretch:] - added[:-stretch]) / np.sqrt(stretch)
         factors[alike] = np.maximum(grown, 1.0)
         logger.info("pose network's noise over %d frames, along the drive: times %s", distance, grown.round(2))
     return np.asarray(factors * np.sqrt(len(distances)))
@@ -191,11 +191,11 @@ def measured_noise(
             shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
     if len(turns) < config.noise_steps:
         return config
-    rotation, shift = (_MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(e)))) for e in (turns, shifts))
+    rotation, shift = (mad_sigma(np.concatenate(e)) for e in (turns, shifts))
     return config.model_copy(
         update={
             "rotation_sigma_deg": max(config.rotation_sigma_deg, float(np.rad2deg(rotation))),
-            "translation_sigma_share": max(config.translation_sigma_share, shift),
+            "translation_relative_sigma": max(config.translation_relative_sigma, shift),
         }
     )
 

@@ -15,9 +15,9 @@ from slam.loops.consistency import agreeing
 from slam.loops.descriptors import View
 from slam.loops.retrieval import find_candidates
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
-from slam.memory import Recall, compute_anew
+from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
-from slam.threads import side_by_side
+from slam.storage.cache import GetOrCompute, without_cache
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def close_loops(
     T_world_camera: FloatArray,
     intrinsics: Intrinsics,
     config: LoopsConfig,
-    recall: Recall = compute_anew,
+    get_or_compute: GetOrCompute = without_cache,
 ) -> LoopClosures:
     """Find where the drive came back.
 
@@ -110,8 +110,10 @@ def close_loops(
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], config, recall)
-    verifier = LoopVerifier(config, intrinsics, recall)
+    candidates = find_candidates(
+        views, path[np.array([view.index for view in views], dtype=int)], config, get_or_compute
+    )
+    verifier = LoopVerifier(config, intrinsics, get_or_compute)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]

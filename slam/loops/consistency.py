@@ -32,15 +32,15 @@ def agreeing(
         T_earlier_later = invert(T_world_camera[earlier]) @ T_world_camera[later]
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         way = path[later] - path[earlier]
-        if drift > config.max_drift_share * way:
+        if drift > config.max_drift_ratio * way:
             refused.append(loop.refused(f"moves the trajectory by {drift:.1f} on a way of {way:.0f}"))
         else:
             possible.append(loop)
-    for loop, (friends, foes) in zip(possible, _votes(possible, T_world_camera, config), strict=True):
-        if foes > friends:
-            refused.append(loop.refused(f"contradicted by {foes} of {foes + friends} loops nearby"))
-        elif friends < config.min_support and loop.inliers < config.alone_inliers:
-            refused.append(loop.refused(f"stands alone: {friends} loops nearby agree"))
+    for loop, (supporting, conflicting) in zip(possible, _votes(possible, T_world_camera, config), strict=True):
+        if conflicting > supporting:
+            refused.append(loop.refused(f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"))
+        elif supporting < config.min_support and loop.inliers < config.alone_inliers:
+            refused.append(loop.refused(f"stands alone: {supporting} loops nearby agree"))
         else:
             kept.append(loop)
     return kept, refused
@@ -64,6 +64,6 @@ def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfi
         way = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
         drift = np.deg2rad(config.support_drift_deg) * distance[near].sum(axis=1)
         agrees = turned < config.support_sigmas * own[:, 0] + drift
-        agrees &= moved < config.support_sigmas * own[:, 3] + config.support_drift_share * way
+        agrees &= moved < config.support_sigmas * own[:, 3] + config.support_drift_ratio * way
         votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
     return votes

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from slam.config import LoopsConfig
 from slam.frames import DepthMap, Frame, Image, Intrinsics
-from slam.memory import Answer, Recall, compute_anew
-from slam.se3 import FloatArray
+from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 Descriptors = NDArray[np.uint8]
 _CELL_PX = 32
@@ -44,10 +43,12 @@ class View:
 class FeatureExtractor:
     """Takes the features of frames of one sequence, the strongest of each part of the image."""
 
-    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
+    def __init__(
+        self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+    ) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._recall = recall
+        self._get_or_compute = get_or_compute
         self._orb = cv2.ORB.create(
             nfeatures=_DETECTED_PER_KEPT * config.max_features,
             nlevels=6,
@@ -65,7 +66,7 @@ class FeatureExtractor:
                 ``max_depth_heights`` of it are not trusted.
         """
         settings = (self._config.max_features, self._config.corner_contrast)
-        pixels, descriptors = self._recall(
+        pixels, descriptors = self._get_or_compute(
             "features", (frame.image, repr(settings)), lambda: self._features(frame.image)
         )
         points = self._points(pixels, depth_unscaled, height_unscaled)
@@ -84,16 +85,12 @@ class FeatureExtractor:
     def _points(
         self, pixels: NDArray[np.float32], depth: DepthMap, height_unscaled: float | None
     ) -> NDArray[np.float32]:
-        camera = self._intrinsics
         columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, depth.shape[1] - 1)
         rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, depth.shape[0] - 1)
         z = depth[rows, columns].astype(np.float64)
         farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
         z = np.where(np.isfinite(z) & (z > 0) & (z < farthest), z, np.nan)
-        points: FloatArray = np.stack(
-            [(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1
-        )
-        return points.astype(np.float32)
+        return np.asarray(self._intrinsics.rays(pixels) * z[:, None], dtype=np.float32)
 
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:

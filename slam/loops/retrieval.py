@@ -15,9 +15,9 @@ from scipy.sparse import csr_array
 
 from slam.config import LoopsConfig
 from slam.loops.descriptors import Descriptors, View, hamming
-from slam.memory import Answer, Recall, compute_anew
+from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
-from slam.threads import side_by_side
+from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
@@ -35,7 +35,7 @@ class Candidate:
 
 
 def find_candidates(
-    views: Sequence[View], path_m: FloatArray, config: LoopsConfig, recall: Recall = compute_anew
+    views: Sequence[View], path_m: FloatArray, config: LoopsConfig, get_or_compute: GetOrCompute = without_cache
 ) -> list[Candidate]:
     """For each view the earlier views that look most like it, the best first.
 
@@ -52,7 +52,7 @@ def find_candidates(
     def learn() -> Answer:
         return (nearest_words(everything, train_vocabulary(everything, config.words)),)
 
-    (word,) = recall("words of a drive", (everything, repr(config.words)), learn)
+    (word,) = get_or_compute("words of a drive", (everything, repr(config.words)), learn)
     counts = _word_counts(views, word, config.words)
     weighted = _weighted(counts, _inverse_frequency(counts))
     indices = np.array([view.index for view in views])

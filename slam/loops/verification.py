@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.descriptors import View, hamming
-from slam.memory import Recall, compute_anew
+from slam.robust import mad_sigma
 from slam.se3 import FloatArray, invert, make, rotation_angle
+from slam.storage.cache import GetOrCompute, without_cache
 
-_MAD_TO_SIGMA = 1.4826
 _LEAST_PIXEL_SIGMA = 0.1
 
 
@@ -55,15 +55,19 @@ class RejectedLoop:
 class LoopVerifier:
     """Measures ``T_earlier_later`` between two views of one camera, in the unit of their points."""
 
-    def __init__(self, config: LoopsConfig, intrinsics: Intrinsics, recall: Recall = compute_anew) -> None:
+    def __init__(
+        self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+    ) -> None:
         self._config = config
         self._intrinsics = intrinsics
-        self._recall = recall
+        self._get_or_compute = get_or_compute
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or say why not."""
         given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
-        rows_earlier, rows_later = self._recall("corners alike", given, lambda: matches(earlier, later, self._config))
+        rows_earlier, rows_later = self._get_or_compute(
+            "corners alike", given, lambda: matches(earlier, later, self._config)
+        )
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
             return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)
@@ -81,9 +85,9 @@ class LoopVerifier:
         difference = forward.T_image_points @ backward.T_image_points
         turned_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, backward.depth)
-        moved_share = float(np.linalg.norm(difference[:3, 3])) / depth
-        if turned_deg > self._config.agreement_deg or moved_share > self._config.agreement_share:
-            reason = f"both directions differ by {turned_deg:.1f} degrees and {moved_share:.0%} of the depth"
+        moved_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
+        if turned_deg > self._config.agreement_deg or moved_ratio > self._config.agreement_ratio:
+            reason = f"both directions differ by {turned_deg:.1f} degrees and {moved_ratio:.0%} of the depth"
             return refused(reason, inliers, T_earlier_later)
         T_middle = _halfway(T_earlier_later, backward.T_image_points)
         sigmas = self._sigmas(T_middle, depth, difference, forward, backward)
@@ -111,11 +115,11 @@ class LoopVerifier:
             confidence=0.999,
         )
         count = 0 if not found or chosen is None else len(chosen)
-        if count < config.min_inliers or count < config.min_inlier_share * len(points):
+        if count < config.min_inliers or count < config.min_inlier_ratio * len(points):
             return f"only {count} of {len(points)} matches agree"
         chosen = chosen.ravel()
         extent = pixels[chosen].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
-        if extent[0] < config.min_spread_share or extent[1] < config.min_spread_share / 2:
+        if extent[0] < config.min_spread_ratio or extent[1] < config.min_spread_ratio / 2:
             return f"{count} agreeing matches in a corner of the image"
         rotation, translation = cv2.solvePnPRefineLM(
             points[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
@@ -135,9 +139,9 @@ class LoopVerifier:
         corners = config.corner_sigma_widening * np.hypot(forward.sigmas, backward.sigmas)
         turned = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
         disagreement = np.concatenate([turned, difference[:3, 3]]) / 2
-        way = config.length_sigma_share * float(np.linalg.norm(T_a_b[:3, 3]))
+        way = config.length_relative_sigma * float(np.linalg.norm(T_a_b[:3, 3]))
         floors = np.repeat(
-            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_share * depth, way)], 3
+            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_ratio * depth, way)], 3
         )
         return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
 
@@ -161,7 +165,7 @@ def _resection_sigmas(
     """Sigmas ``(6,)`` of a resection from the Jacobian and the size of its reprojection residuals."""
     projected, jacobian = cv2.projectPoints(points, rotation, translation, K, None)
     residual = (projected.reshape(-1, 2) - pixels).ravel()
-    sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), _LEAST_PIXEL_SIGMA)
+    sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
     J = jacobian[:, :6]
     return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6)))))
 

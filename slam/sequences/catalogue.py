@@ -8,10 +8,12 @@ from pathlib import Path
 
 from slam.errors import SequenceError
 from slam.frames import Sequence
-from slam.sequences import kitti_odometry, kitti_raw, tum
+from slam.sequences import tum
 from slam.sequences.camera_file import CameraFile, find_camera_file, read_explicit
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.folder import image_folder, open_folder
+from slam.sequences.kitti import odometry as kitti_odometry
+from slam.sequences.kitti import raw as kitti_raw
 from slam.sequences.video import VIDEO_SUFFIXES, list_videos, open_video
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
@@ -67,8 +69,8 @@ def sequence_names(dataset: Path) -> list[str]:
 
 def _open_embedded() -> SourcedSequence:
     # Rendering needs Open3D, which nobody else should wait for.
-    from slam.sequences.simulated import SimulationOptions
-    from slam.sequences.simulated_sequence import SimulatedSequence
+    from slam.sequences.simulation.sequence import SimulatedSequence
+    from slam.sequences.simulation.street import SimulationOptions
 
     return SimulatedSequence(SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED))
 

@@ -11,21 +11,21 @@ import pytest
 
 from slam import run_slam, se3
 from slam.config import load_config
-from slam.evaluation import trajectory_metrics
+from slam.evaluation.map import pose_similarity
+from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
-from slam.frontend.geometric_factors import ESSENTIAL_SOURCE
-from slam.frontend.refusal import Refusal
-from slam.map_metrics import pose_similarity
-from slam.oracle import OracleNoise, OraclePredictor
-from slam.pipeline import SlamPipeline, SlamResult
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
+from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
-from slam.sequences.simulated import SimulatedFrame, SimulationOptions
-from slam.sequences.simulated_sequence import SimulatedSequence
+from slam.sequences.simulation.sequence import SimulatedSequence
+from slam.sequences.simulation.street import SimulatedFrame, SimulationOptions
 from slam.trajectory import Trajectory, read_trajectory
 
 FACTOR = 0.2  # unscaled lengths per metre
-NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_sigma_share": 0.05, "depth_sigma_share": 0.03}
+NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_relative_sigma": 0.05, "depth_relative_sigma": 0.03}
 
 
 class Rendered(SimulatedSequence):
@@ -79,7 +79,7 @@ def test_images_and_graph_cut_the_noise_of_the_network(round_trip: SlamResult) -
 
 def test_the_camera_height_gives_metres(street: Rendered, round_trip: SlamResult) -> None:
     estimate = round_trip.scale.estimate
-    assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, Refusal)
+    assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, MeasurementFailure)
     assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
     assert estimate.frames_used > 200
     assert round_trip.optimised.length_m == pytest.approx(round_trip.reference.length_m, rel=0.03)

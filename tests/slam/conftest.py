@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.run_folder import RunFolder
+from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, chain, from_rotation_vector
-from slam.sequences.simulated import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 from slam.trajectory import Trajectory
 
 MakeRun = Callable[..., RunFolder]

@@ -18,8 +18,8 @@ import pytest
 import slam.run
 from slam.cli import main
 from slam.config import load_config
-from slam.evaluation import trajectory_metrics
-from slam.run_folder import RunFolder
+from slam.evaluation.trajectory import trajectory_metrics
+from slam.results.folder import RunFolder
 from slam.trajectory import read_trajectory
 
 Call = Callable[..., tuple[int, str, str]]
@@ -231,7 +231,7 @@ def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: st
 def test_export_turned_up(call: Call, make_run: MakeRun) -> None:
     """Open3D reads the run's mesh and writes it turned: y down becomes z up."""
     assert call("export", make_run().path, "--what", "mesh", "--output", "up.ply", "--up", "z")[0] == 0
-    from slam.foreign import import_open3d
+    from slam.runtime.imports import import_open3d
 
     vertices = np.asarray(import_open3d().io.read_triangle_mesh("up.ply").vertices)
     np.testing.assert_allclose(vertices, [[0, 1, 0], [1, 1, 0], [0, 1, 2]], atol=1e-6)

@@ -6,9 +6,9 @@ import pytest
 from slam import se3
 from slam.config import MappingConfig
 from slam.errors import SlamError
-from slam.foreign import import_open3d
 from slam.frames import Intrinsics
 from slam.mapping import TsdfMap
+from slam.runtime.imports import import_open3d
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]

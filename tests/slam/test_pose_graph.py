@@ -104,16 +104,16 @@ def test_world_stays_at_the_first_pose():
 
 
 def test_a_chain_that_errs_together_yields_to_a_loop_and_boasts_of_no_more():
-    """The graph weighs ``chain_sigmas``; what a single factor promises stays."""
+    """The graph weighs ``correlated_sigmas``; what a single factor promises stays."""
     truth, edges, _, loops, initial = noisy_problem()
-    chained = [replace(each, chain_sigmas=4.0 * each.sigmas) for each in edges]
+    chained = [replace(each, correlated_sigmas=4.0 * each.sigmas) for each in edges]
     looser = [replace(each, sigmas=4.0 * each.sigmas) for each in edges]
     solved, solved_looser, stiff = (solve([*each, *loops], initial)[1] for each in (chained, looser, edges))
     np.testing.assert_array_equal(solved, solved_looser)
     assert np.abs(solved - stiff).max() > 1e-3
     np.testing.assert_array_equal(*(whitened_squared(each, truth) for each in (chained, edges)))
     with pytest.raises(SlamError, match="six positive sigmas"):
-        PoseGraph(PoseGraphConfig()).add_relative(replace(edges[0], chain_sigmas=np.zeros(6)))
+        PoseGraph(PoseGraphConfig()).add_relative(replace(edges[0], correlated_sigmas=np.zeros(6)))
 
 
 def test_whitened_residual_by_hand():

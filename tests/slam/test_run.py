@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 import yaml
 
+import slam.results.metrics
 import slam.run
-import slam.run_metrics
 from slam import run_slam
 from slam.config import PoseGraphConfig, load_config
 from slam.errors import RunError, SlamError
-from slam.pipeline import SlamPipeline
+from slam.pipeline.batch import SlamPipeline
 from slam.pose_graph import PoseGraph
-from slam.run_folder import RunFolder
+from slam.results.folder import RunFolder
 
 CheckRun = Callable[[Path], dict[str, Any]]
 CopyRoot = Callable[[], Path]
@@ -235,7 +235,7 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)
-    graph = slam.run_metrics._graph(Result)  # type: ignore[arg-type]
+    graph = slam.results.metrics._graph(Result)  # type: ignore[arg-type]
     assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
 
 

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slam.config import SlamConfig, load_config
-from slam.run_folder import RunFolder
+from slam.results.folder import RunFolder
 from slam.se3 import from_rotation_vector, invert
 from slam.trajectory import Trajectory
 
@@ -56,17 +56,17 @@ def page(tools: Callable[[str], ModuleType]) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def quantities(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.quantities")
+    return tools("benchmarking.metric_definitions")
 
 
 @pytest.fixture(scope="module")
 def judgement(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.judgement")
+    return tools("benchmarking.derived_metrics")
 
 
 @pytest.fixture(scope="module")
 def marks(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.marks")
+    return tools("benchmarking.summary")
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[st
 
 @pytest.fixture
 def job(plan: ModuleType, tmp_path: Path) -> Any:
-    drive = plan.Drive("loop 610", tmp_path / "world")
+    drive = plan.BenchmarkSequence("loop 610", tmp_path / "world")
     return plan.Job(tmp_path / "runs", drive, "sim", plan.EVERYTHING, 0)
 
 
@@ -112,7 +112,7 @@ def cells(table: str) -> list[list[str]]:
 
 
 def test_plan_has_every_combination_and_first_what_fills_the_cache(plan: ModuleType, tmp_path: Path) -> None:
-    drives = [plan.Drive(name, tmp_path) for name in ("a", "b")]
+    drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
     jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.words=20"])
     assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
     assert {job.configuration.name for job in jobs[:12]} == {plan.EVERYTHING.name}

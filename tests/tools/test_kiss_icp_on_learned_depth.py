@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
-from slam.sequences.simulated import SimulatedStreet, SimulationOptions
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 TOOL = Path(__file__).parents[2] / "tools" / "kiss_icp_on_learned_depth.py"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean, median, stdev
 
-from benchmarking.quantities import Quantity
+from benchmarking.metric_definitions import Quantity
 from benchmarking.work import Outcome
 
-from slam.comparison import MISSING, lookup
+from slam.results.comparison import MISSING, lookup
 
 Label = Callable[[Outcome], str]
 Cell = Callable[[Sequence[Outcome]], str]

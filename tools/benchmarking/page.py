@@ -22,11 +22,8 @@ from benchmarking.cells import (
     values,
     weights,
 )
-from benchmarking.judgement import FALSE_DEG, FALSE_M
-from benchmarking.marks import marks
-from benchmarking.picture import drawable
-from benchmarking.plan import EVERYTHING, GROWTH
-from benchmarking.quantities import (
+from benchmarking.derived_metrics import FALSE_DEG, FALSE_M
+from benchmarking.metric_definitions import (
     ATE_6,
     ATE_7,
     COMMAND,
@@ -49,9 +46,12 @@ from benchmarking.quantities import (
     Quantity,
     stages,
 )
+from benchmarking.picture import drawable
+from benchmarking.plan import EVERYTHING, GROWTH
+from benchmarking.summary import marks
 from benchmarking.work import Outcome
 
-from slam.comparison import MISSING, lookup
+from slam.results.comparison import MISSING, lookup
 
 PICTURE = "images/trajectories.png"  # beside the page
 PAGE = """# Benchmarks

@@ -13,9 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from slam.files import write_atomically
-from slam.plots import draw_trajectories, trajectories_of
-from slam.run_folder import RunFolder
+from slam.results.folder import RunFolder
+from slam.results.plots import draw_trajectories, trajectories_of
+from slam.storage.files import write_atomically
 
 SIDE_IN = 1.9
 DPI = 90

@@ -12,7 +12,7 @@ Condition = Literal["clean", "hazards"]
 
 
 @dataclass(frozen=True)
-class Drive:
+class BenchmarkSequence:
     """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options.
 
     Drives of one ``kind`` are counted together; ``clean`` names the same drive without hazards.
@@ -43,22 +43,22 @@ ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("geometry.enabled=false",),
-    "corners followed as they are": ("geometry.foresight=false",),
-    "turns of single steps alone": ("geometry.span_steps=1",),
-    "nothing moves by itself": ("geometry.mover_sharpness=0",),
-    "no direction from turns": (f"geometry.steering_sigma_deg={_NEVER}",),
+    "corners followed as they are": ("geometry.predicted_flow=false",),
+    "turns of single steps alone": ("geometry.rotation_baseline_steps=1",),
+    "nothing moves by itself": ("geometry.dynamic_mask_sharpness=0",),
+    "no direction from turns": (f"geometry.heading_prior_sigma_deg={_NEVER}",),
     "no lengths from the road's motion": ("road.enabled=false",),
     "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
     "no noise from the drive": (
-        "geometry.shake_rotation_share=0",
-        "geometry.shake_direction_share=0",
-        "geometry.turn_rotation_share=0",
-        "geometry.jolt_rotation_share=0",
-        "geometry.jolt_direction_share=0",
+        "geometry.jitter_rotation_ratio=0",
+        "geometry.jitter_direction_ratio=0",
+        "geometry.turn_rotation_ratio=0",
+        "geometry.neighbour_rotation_ratio=0",
+        "geometry.neighbour_direction_ratio=0",
     ),
-    "no bridging": ("bridging.enabled=false",),
+    "no bridging": ("gaps.enabled=false",),
     "network factors only where geometry has none": ("frontend.use=bridge",),
     "no loops": ("loops.enabled=false",),
     "no support among loops": ("loops.min_support=0",),
@@ -81,7 +81,7 @@ class Job:
     """One run of ``erfsfm-slam run``; ``folder`` holds the benchmark's runs and cache."""
 
     folder: Path
-    drive: Drive
+    drive: BenchmarkSequence
     weights: str
     configuration: Configuration
     seed: int
@@ -115,7 +115,7 @@ class Job:
 
 def plan(
     folder: Path,
-    drives: Sequence[Drive],
+    drives: Sequence[BenchmarkSequence],
     configurations: Sequence[Configuration],
     weights: Sequence[str],
     seeds: Sequence[int],
@@ -129,35 +129,40 @@ def plan(
 
 def worlds(
     folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int, conditions: Sequence[Condition] = ("clean",)
-) -> list[Drive]:
+) -> list[BenchmarkSequence]:
     """Simulated drives, in folders that name everything that decides them; ``hazards`` are all of them at once."""
-    from slam.sequences.simulated import VERSION
     from slam.sequences.simulation.hazards import Hazard
+    from slam.sequences.simulation.street import VERSION
 
     every_hazard = ",".join(get_args(Hazard))
 
-    def world(route: str, seed: int, condition: Condition) -> Drive:
+    def world(route: str, seed: int, condition: Condition) -> BenchmarkSequence:
         name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames))
         if condition == "clean":
-            return Drive(name, folder / f"{route}-{seed}-{frames}-v{VERSION}", simulate=words, kind=route)
+            return BenchmarkSequence(name, folder / f"{route}-{seed}-{frames}-v{VERSION}", simulate=words, kind=route)
         root = folder / f"{route}-{seed}-{frames}-{condition}-v{VERSION}"
         simulate = (*words, "--hazards", every_hazard)
-        return Drive(f"{name}, {condition}", root, simulate=simulate, kind=f"{route}, {condition}", clean=name)
+        return BenchmarkSequence(
+            f"{name}, {condition}", root, simulate=simulate, kind=f"{route}, {condition}", clean=name
+        )
 
     return [world(route, seed, condition) for condition in conditions for route in routes for seed in seeds]
 
 
-def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[Drive]:
+def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[BenchmarkSequence]:
     """The sequences of a KITTI odometry root, all of them or those named."""
     from slam.sequences.catalogue import sequence_names
 
     chosen = names or sequence_names(kitti)
-    return [Drive(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
+    return [BenchmarkSequence(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
 
 
-def excerpts(drive: Drive, counts: Sequence[int]) -> list[Drive]:
+def excerpts(drive: BenchmarkSequence, counts: Sequence[int]) -> list[BenchmarkSequence]:
     """The first frames of a drive."""
-    return [Drive(f"{drive.name}, {n} frames", drive.root, frames=f"0:{n}", simulate=drive.simulate) for n in counts]
+    return [
+        BenchmarkSequence(f"{drive.name}, {n} frames", drive.root, frames=f"0:{n}", simulate=drive.simulate)
+        for n in counts
+    ]
 
 
 def slug(text: str) -> str:

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarking import plan
-from benchmarking.judgement import judged
-from benchmarking.plan import Drive, Job
+from benchmarking.derived_metrics import judged
+from benchmarking.plan import BenchmarkSequence, Job
 
-from slam.comparison import failure
-from slam.files import write_atomically
+from slam.results.comparison import failure
+from slam.storage.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # what decides the numbers
@@ -41,7 +41,7 @@ class Outcome:
     reason: str = ""
 
 
-def simulate(drive: Drive) -> None:
+def simulate(drive: BenchmarkSequence) -> None:
     """Make a world where it is missing; what becomes of it is seen by looking for it."""
     if not drive.root.exists():
         subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)

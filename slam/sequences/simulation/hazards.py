@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from slam import se3
 from slam.sequences.simulation.geometry import Bend, Float32Array, FloatArray, Mesh, Soup
 from slam.sequences.simulation.objects import car, frame_at
-from slam.sequences.simulation.route import STEP, Drive
+from slam.sequences.simulation.route import STEP, Route
 
 Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 
@@ -69,9 +69,9 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
 class Traffic:
     """Cars that drive: one ahead of the camera for a while, others that come towards it."""
 
-    def __init__(self, drive: Drive, seed: int) -> None:
+    def __init__(self, drive: Route, seed: int) -> None:
         rng = np.random.default_rng([seed, 33])
-        self._drive = drive
+        self._route = drive
         self._starts: list[tuple[float, float, float]] = []  # offset in lane samples, per frame, side in metres
         meets = float(rng.uniform(4.0, 15.0))
         while meets < len(drive.sample):
@@ -91,7 +91,7 @@ class Traffic:
 
     def placed(self, index: int) -> Mesh | None:
         """The cars within sight at a frame, in the street frame; None if there are none."""
-        camera = self._drive.T_street_camera[index, :3, 3]
+        camera = self._route.T_street_camera[index, :3, 3]
         T_street_cars = [self._leader(index), *(self._oncoming(start, index) for start in self._starts)]
         parts = []
         for number, T_street_car in enumerate(T_street_cars):
@@ -131,14 +131,14 @@ class Traffic:
     def _leader(self, index: int) -> FloatArray | None:
         """A car in the camera's lane that keeps its distance, until it drives away."""
         faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
-        return self._at(float(self._drive.sample[index]) + self._gap + faster, 0.0, 1.0)
+        return self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)
 
     def _oncoming(self, start: tuple[float, float, float], index: int) -> FloatArray | None:
         return self._at(start[0] + start[1] * index, start[2], -1.0)
 
     def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
         """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""
-        lane = self._drive.lane_street
+        lane = self._route.lane_street
         k = int(np.floor(sample))
         if not 2 <= k < len(lane) - 3:
             return None

@@ -18,7 +18,7 @@ from slam.sequences.simulation.streets import (
     town_plan,
 )
 
-Route = Literal["loop", "grid", "straight"]
+RouteKind = Literal["loop", "grid", "straight"]
 
 STEP = 0.25  # between samples of a path in the plan, metres
 OVERLAP = 67.0  # how far a loop drives its own start again, metres
@@ -31,7 +31,7 @@ FEWEST_LOOP_FRAMES = 250
 
 
 @dataclass(frozen=True)
-class Drive:
+class Route:
     """Where the camera is at each frame.
 
     Attributes:
@@ -53,7 +53,7 @@ class Drive:
     sample: FloatArray
 
 
-def plan_drive(route: Route, frames: int, seed: int, still_frames: int = 0) -> Drive:
+def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) -> Route:
     """Lay out streets and drive over them in ``frames`` frames.
 
     Args:
@@ -85,10 +85,10 @@ def plan_drive(route: Route, frames: int, seed: int, still_frames: int = 0) -> D
         order = np.insert(np.arange(moving), rest, [rest] * still_frames)
         sample, T_street_camera = sample[order], T_street_camera[order]
     lane_street = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
-    return Drive(plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample)
+    return Route(plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample)
 
 
-def _layout(route: Route, moving: int, seed: int, stops: bool) -> tuple[StreetPlan, Bend, FloatArray]:
+def _layout(route: RouteKind, moving: int, seed: int, stops: bool) -> tuple[StreetPlan, Bend, FloatArray]:
     """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
     rng = np.random.default_rng([seed, 0])
     if route == "straight":

@@ -26,7 +26,7 @@ from erfsfm.data.snippets import (
     usable,
 )
 from erfsfm.errors import DataError
-from slam.sequences.simulated import SimulatedStreet, SimulationOptions
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 FRAMES = 9
 

@@ -8,7 +8,7 @@ from slam.config import LidarConfig
 from slam.errors import SlamError
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.simulated import SimulatedStreet, SimulationOptions
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 FRAMES = 15
 

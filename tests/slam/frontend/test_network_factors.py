@@ -16,7 +16,7 @@ from slam.frontend.network_factors import (
     without_measured,
 )
 
-CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_sigma_share=0.1, translation_floor_share=0.05)
+CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_relative_sigma=0.1, translation_floor_ratio=0.05)
 
 
 def drive(count: int) -> np.ndarray:
@@ -115,7 +115,7 @@ def test_noise_is_measured_where_geometry_saw_the_same_steps():
             pose[:] = pose @ se3.from_rotation_vector(turn, np.zeros(3))
     measured = measured_noise(snippets, geometry_of(T), CONFIG)
     assert measured.rotation_sigma_deg == pytest.approx(sigma_deg, rel=0.15)
-    assert measured.translation_sigma_share == CONFIG.translation_sigma_share
+    assert measured.translation_relative_sigma == CONFIG.translation_relative_sigma
 
 
 def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_saw_little():
@@ -186,7 +186,7 @@ def test_a_drive_scales_measured_noise_both_ways():
     assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # no further, however well both agree
     few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG)
     np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
-    assert {f.degrees for f in few} == {np.inf}  # the law as it lies beside the weights
+    assert {f.student_t_dof for f in few} == {np.inf}  # the law as it lies beside the weights
 
 
 def test_turns_are_scaled_apart_from_straights():

@@ -75,7 +75,7 @@ def test_sigmas_grow_with_the_error_of_corners_and_hold_it() -> None:
             rng = np.random.default_rng(seed)
             for view in views:
                 view.pixels[:] += rng.normal(size=view.pixels.shape) * sigma_px
-            loop = verify(*views, length_sigma_share=1e-6)
+            loop = verify(*views, length_relative_sigma=1e-6)
             assert isinstance(loop, Loop)
             T_error = invert(from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0])))
             T_error = T_error @ loop.measured.T_from_to

@@ -1,0 +1,163 @@
+"""Receptive fields of networks side by side: in theory, by gradients, and weighted by what was learned."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from erfsfm.checkpoint import Model
+from erfsfm.config import Fidelity
+from erfsfm.errors import ConfigError
+from erfsfm.networks.presets import PRESETS, build
+from erfsfm.networks.receptive_field import (
+    MeasuredField,
+    Network,
+    effective,
+    measured,
+    theoretical,
+    theoretical_corner,
+)
+
+# Supports do not depend on the width; effective fields of untrained networks hardly do.
+_PROBE_WIDTH = 0.1
+_UNTRAINED_WIDTH = 0.25
+HELD = 0.95
+
+
+@dataclass(frozen=True)
+class FieldRow:
+    """One network's fields, of the middle pixel of its last encoder layer.
+
+    Attributes:
+        name: preset.
+        fidelity: ``paper`` or ``default``.
+        offsets_px: how far deformable taps are pushed outwards in `seen`; 0 for other networks.
+        side_px: theoretical side, taps pushed by `offsets_px`.
+        side_at_rest_px: theoretical side at zero offsets.
+        corner: image row and column of the theoretical box, taps pushed.
+        seen: what the layer can read, by gradients with constant weights.
+        union_share: share of the image that some pixel of the layer can read.
+        weighed: what it does read on an image, with the weights named by `weights`.
+        weights: name of the learned weights, or ``untrained``.
+    """
+
+    name: str
+    fidelity: Fidelity
+    offsets_px: float
+    side_px: int
+    side_at_rest_px: int
+    corner: tuple[int, int]
+    seen: MeasuredField
+    union_share: float
+    weighed: MeasuredField
+    weights: str
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers by name, pixels and shares of the image."""
+        return {
+            "name": self.name,
+            "fidelity": self.fidelity,
+            "offsets_px": self.offsets_px,
+            "theoretical_px": self.side_px,
+            "theoretical_at_rest_px": self.side_at_rest_px,
+            "rows": self.seen.rows,
+            "columns": self.seen.columns,
+            "share": self.seen.coverage,
+            "share_of_all_outputs": self.union_share,
+            "effective_share_95": self.weighed.share_holding(HELD),
+            "weights": self.weights,
+        }
+
+
+def measure_fields(
+    names: Sequence[str],
+    fidelity: Fidelity,
+    snippet: Sequence[NDArray[np.uint8]],
+    offsets_px: float = 1.0,
+    learned: tuple[str, Model] | None = None,
+    device: torch.device | None = None,
+) -> list[FieldRow]:
+    """Fields of presets; beside our dilated pose network the paper's, which skips three pixels of four.
+
+    Args:
+        names: keys of `PRESETS`.
+        fidelity: of all networks.
+        snippet: five images ``(H, W, 3)`` uint8 RGB in time order; depth networks see the middle one.
+        offsets_px: how far deformable taps are pushed outwards.
+        learned: name and weights to take effective fields from, for the presets that they are of.
+        device: where to compute; None is the CPU.
+
+    Raises:
+        ConfigError: an unknown name, or a snippet that is not five images.
+    """
+    if len(snippet) != 5:
+        raise ConfigError(f"a receptive field is looked at on 5 consecutive images; got {len(snippet)}")
+    wanted: list[tuple[str, Fidelity]] = []
+    for name in names:
+        wanted.append((name, fidelity))
+        if name == "erf-posenet-dilated" and fidelity == "default":
+            wanted.append((name, "paper"))
+    return [_row(*which, snippet, offsets_px, learned, device or torch.device("cpu")) for which in wanted]
+
+
+def _row(
+    name: str,
+    fidelity: Fidelity,
+    snippet: Sequence[NDArray[np.uint8]],
+    offsets_px: float,
+    learned: tuple[str, Model] | None,
+    device: torch.device,
+) -> FieldRow:
+    probe = build(name, fidelity, _PROBE_WIDTH).to(device)
+    size = snippet[0].shape[:2]
+    pushed = offsets_px if any(layer.deformable for layer in probe.encoder_layers()) else 0.0
+    seen = measured(probe, size, offsets_px=pushed)
+    network, weights = _with_weights(name, fidelity, learned)
+    return FieldRow(
+        name=name,
+        fidelity=fidelity,
+        offsets_px=pushed,
+        side_px=theoretical(probe, pushed),
+        side_at_rest_px=theoretical(probe),
+        corner=theoretical_corner(probe, seen.pixel, pushed),
+        seen=seen,
+        union_share=_union_share(probe, size, pushed, seen.map_size),
+        weighed=effective(network.to(device), _encoder_input(snippet, network).to(device)),
+        weights=weights,
+    )
+
+
+def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | None) -> tuple[Network, str]:
+    """The learned network if it is of this preset, else a fresh one."""
+    if learned is not None:
+        title, model = learned
+        config, kind = model.record.network, PRESETS[name].kind
+        trained = model.depth_net if kind == "depth" else model.pose_net
+        same = (config.depth if kind == "depth" else config.pose) == name and config.fidelity == fidelity
+        if same and isinstance(trained, Network):
+            return trained, title
+    return build(name, fidelity, _UNTRAINED_WIDTH), "untrained"
+
+
+def _union_share(network: Network, size: tuple[int, int], offsets_px: float, map_size: tuple[int, int]) -> float:
+    """Share of the image's pixels with a gradient to any output pixel."""
+    pixels = itertools.product(range(map_size[0]), range(map_size[1]))
+    fields = [measured(network, size, pixel, offsets_px).gradient > 0 for pixel in pixels]
+    return float(torch.stack(fields).any(dim=0).double().mean())
+
+
+def _encoder_input(snippet: Sequence[NDArray[np.uint8]], network: Network) -> Tensor:
+    """``(1, C, H, W)`` in [-1, 1]: the middle image, for a pose network with its sources behind it."""
+    sources = network.input_channels // 3 - 1
+    middle = len(snippet) // 2
+    around = [i for i in range(middle - sources // 2, middle + (sources + 1) // 2 + 1) if i != middle]
+    images = np.stack([snippet[middle], *(snippet[i] for i in around)])
+    stacked = torch.from_numpy(images).permute(0, 3, 1, 2)  # (1 + N, 3, H, W)
+    return stacked.reshape(1, -1, *images.shape[1:3]).float() / 127.5 - 1

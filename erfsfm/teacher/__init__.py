@@ -1,0 +1,1 @@
+"""Two-view geometry of the training images, as a teacher without labels."""

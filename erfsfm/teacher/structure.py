@@ -1,0 +1,165 @@
+"""What classical geometry sees in a snippet: a teacher for both networks that needs no label.
+
+Each source and the target give depth up to the length of their motion; the lengths are compared where both are
+sure, the depths averaged, and everything is put in heights of the camera over the road.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.files import write_atomically
+from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
+from erfsfm.teacher.two_view import TwoView, rays, two_view
+
+VERSION = 4
+SURE = 5.0  # inverse depth over its sigma
+OUTLIER = 3.0  # sigmas from the average
+LEAST_SHARED = 100  # pixels
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Lengths are in heights of the camera over the road.
+
+    Attributes:
+        T_source_target: ``(N, 4, 4)``, NaN where nothing was measured; where only the translation's length
+            is unknown, the translation alone is NaN.
+        least: smallest inverse depth that agrees with the images, ``(H, W)`` float16, 0 where any does.
+        most: largest one, infinite where any does.
+    """
+
+    T_source_target: NDArray[np.float32]
+    least: NDArray[np.float16]
+    most: NDArray[np.float16]
+
+
+def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> Structure:
+    """From the N + 1 images ``(H, W, 3)`` of a snippet, the target in the middle."""
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+    middle = len(images) // 2
+    views = [two_view(grey[middle], image, K, fine=abs(k - middle) > 1) for k, image in enumerate(grey) if k != middle]
+    lengths = _relative_lengths(views)
+    T_source_target = np.full((len(views), 4, 4), np.nan)
+    for T, view, length in zip(T_source_target, views, lengths):
+        if view is not None:
+            T[:] = view.T_second_first
+            T[:3, 3] *= length
+    inverse_depth, sigma = _average(views, lengths, grey[middle].shape)
+    forward = _forward(T_source_target)
+    sure = inverse_depth > SURE * sigma
+    p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
+    plane = None if forward is None else road_plane(inverse_depth, sure, p, forward)
+    height, at_least = 1.0, np.zeros_like(inverse_depth)
+    if plane is None:
+        sigma[:] = np.inf
+        moved = np.array([view is not None and not view.still for view in views])
+        T_source_target[moved, :3, 3] = np.nan
+    else:
+        height = float(1 / np.linalg.norm(plane))
+        road = p @ plane.astype(np.float32)
+        under = under_road(inverse_depth, sigma, road)
+        sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
+        level = on_road(inverse_depth, sure, road) & ~under
+        inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
+    T_source_target[:, :3, 3] /= height
+    with np.errstate(over="ignore"):
+        least = (np.maximum(inverse_depth - sigma, at_least) * height).astype(np.float16)
+        most = ((np.maximum(inverse_depth, 0) + sigma) * height).astype(np.float16)
+    return Structure(T_source_target.astype(np.float32), least, most)
+
+
+def _forward(T_source_target: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Direction of travel at the target, in its frame: from the frames before to the frames after, ``(3,)``."""
+    places = -np.swapaxes(T_source_target[:, :3, :3], 1, 2) @ T_source_target[:, :3, 3:]  # of the sources, (N, 3, 1)
+    middle = len(places) // 2
+    travelled = np.concatenate([-places[:middle, :, 0], places[middle:, :, 0]])
+    travelled = travelled[np.isfinite(travelled).all(axis=1)]
+    length = float(np.linalg.norm(travelled.sum(axis=0)))
+    return travelled.sum(axis=0) / length if length > 0 else None
+
+
+class StructureCache:
+    """Structures already measured, as files named by the bytes of their images; None keeps nothing."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+
+    def structure(self, images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> Structure:
+        """``measure_structure``, at most once for the same images and camera."""
+        if self._folder is None:
+            return measure_structure(images, K)
+        digest = hashlib.sha256(f"{VERSION} {cv2.__version__}".encode() + K.tobytes())
+        for image in images:
+            digest.update(f"{image.shape}".encode() + image.tobytes())
+        name = digest.hexdigest()[:32]
+        path = self._folder / name[:2] / f"{name}.npz"
+        kept = _read(path)
+        if kept is None:
+            kept = measure_structure(images, K)
+            _write(path, kept)
+        return kept
+
+
+def _read(path: Path) -> Structure | None:
+    """None if there is no whole structure."""
+    try:
+        with np.load(path, allow_pickle=False) as entry:
+            return Structure(entry["T_source_target"], entry["least"], entry["most"])
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, structure: Structure) -> None:
+    def fill(part: Path) -> None:
+        with part.open("wb") as file:  # given a path, savez would end its name in .npz
+            np.savez(file, T_source_target=structure.T_source_target, least=structure.least, most=structure.most)
+
+    write_atomically(path, fill)
+
+
+def _relative_lengths(views: Sequence[TwoView | None]) -> list[float]:
+    """Length of each view's translation over that of the surest view; 0 of a still one, NaN where unknown."""
+    sure = [None if v is None or v.still else v.inverse_depth > SURE * v.sigma for v in views]
+    counts = [0 if s is None else int(s.sum()) for s in sure]
+    best = int(np.argmax(counts))
+    reference, sure_reference = views[best], sure[best]
+    lengths: list[float] = []
+    for view, sure_view in zip(views, sure):
+        if view is None or reference is None or sure_reference is None:
+            lengths.append(0.0 if view is not None and view.still else np.nan)
+        elif sure_view is None:
+            lengths.append(0.0)
+        else:
+            both = sure_view & sure_reference
+            ratio = view.inverse_depth[both] / reference.inverse_depth[both]
+            lengths.append(float(np.median(ratio)) if both.sum() >= LEAST_SHARED else np.nan)
+    return lengths
+
+
+def _average(
+    views: Sequence[TwoView | None], lengths: Sequence[float], shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse depth and sigma of all views in the reference's unit; those far from the average are left out."""
+    usable = [(v, s) for v, s in zip(views, lengths) if v is not None and s > 0]
+    if not usable:
+        return np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32)
+    values = np.stack([v.inverse_depth / np.float32(s) for v, s in usable])
+    weights = np.stack([(np.float32(s) / v.sigma) ** 2 for v, s in usable])
+
+    def mean(weights: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        total = weights.sum(axis=0)
+        return (values * weights).sum(axis=0) / np.maximum(total, np.float32(1e-12)), total
+
+    average, _ = mean(weights)
+    average, total = mean(weights * (np.abs(values - average) * np.sqrt(weights) < OUTLIER))
+    with np.errstate(divide="ignore"):
+        return average, (1 / np.sqrt(total)).astype(np.float32)

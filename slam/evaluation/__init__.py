@@ -1,0 +1,1 @@
+"""Errors of trajectories, of stated noise and of maps against the truth."""

@@ -1,0 +1,74 @@
+"""A run as a COLMAP model in text form: cameras.txt, images.txt, points3D.txt.
+
+COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slam.errors import RunError
+from slam.frames import Intrinsics
+from slam.se3 import FloatArray, invert
+from slam.storage.files import write_atomically
+
+_HALF_PIXEL = 0.5
+
+
+def write_colmap(
+    folder: Path,
+    intrinsics: Intrinsics,
+    T_world_camera: FloatArray,
+    points_world: FloatArray,
+    colours: NDArray[np.uint8],
+) -> None:
+    """Write the three files; points have no tracks.
+
+    Args:
+        folder: made where missing; other files in it stay.
+        intrinsics: the one camera.
+        T_world_camera: poses ``(N, 4, 4)``; image k is ``<k>.png`` with six digits, as KITTI names it.
+        points_world: ``(P, 3)``.
+        colours: ``(P, 3)`` RGB.
+
+    Raises:
+        RunError: a file cannot be written.
+    """
+    contents = {
+        "cameras.txt": _camera(intrinsics),
+        "images.txt": _images(T_world_camera),
+        "points3D.txt": _points(points_world, colours),
+    }
+    for name, text in contents.items():
+        _write(folder / name, text)
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda file: file.write_text(text, encoding="ascii"), RunError)
+
+
+def _camera(camera: Intrinsics) -> str:
+    principal = [camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
+    numbers = " ".join(map(repr, [float(value) for value in (camera.fx, camera.fy, *principal)]))
+    return f"# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
+
+
+def _images(T_world_camera: FloatArray) -> str:
+    T_camera_world = invert(T_world_camera)
+    quaternions_xyzw = Rotation.from_matrix(T_camera_world[:, :3, :3]).as_quat(canonical=True)
+    rows = np.concatenate([quaternions_xyzw[:, [3, 0, 1, 2]], T_camera_world[:, :3, 3]], axis=1)
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of its points (none)"]
+    for k, row in enumerate(rows):
+        lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", ""]
+    return "\n".join(lines) + "\n"
+
+
+def _points(points_world: FloatArray, colours: NDArray[np.uint8]) -> str:
+    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK (none)"]
+    for k, (point, colour) in enumerate(zip(points_world.tolist(), colours.tolist(), strict=True)):
+        lines.append(f"{k + 1} {' '.join(f'{x:.6g}' for x in point)} {' '.join(map(str, colour))} 0")
+    return "\n".join(lines) + "\n"

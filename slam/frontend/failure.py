@@ -1,0 +1,12 @@
+"""The honest answer of a measurement that could not be made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MeasurementFailure:
+    """Nothing was measured; ``reason`` says why, in words for the log and the report."""
+
+    reason: str

@@ -1,0 +1,197 @@
+"""What connects the frames around those that measured nothing: constant motion, with the doubt it deserves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam.config import GapsConfig
+from slam.errors import SlamError
+from slam.frames import RelativePose, SnippetPoses, runs
+from slam.se3 import FloatArray, from_rotation_vector, invert
+
+INTERPOLATED_SOURCE = "bridge"
+_STEPS_OF_A_MOTION = 3
+_SIGMA_FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class InterpolatedGaps:
+    """A run's measurements with their gaps closed, unscaled.
+
+    ``snippets`` has one entry a target, gaps filled with constant motion; ``trusted`` are those that the network
+    measured on usable frames. ``interpolated`` are the factors of steps that nothing measured.
+    """
+
+    snippets: list[SnippetPoses]
+    trusted: list[SnippetPoses]
+    geometric: list[RelativePose]
+    interpolated: list[RelativePose]
+    frames: dict[int, str]
+
+
+def interpolate_gaps(
+    count: int,
+    sources: int,
+    snippets: Sequence[SnippetPoses],
+    geometric: Sequence[RelativePose],
+    unusable: Mapping[int, str],
+    repeated: Collection[int],
+    config: GapsConfig,
+) -> InterpolatedGaps:
+    """Close the gaps of a run.
+
+    Args:
+        count: frames of the sequence.
+        sources: sources of a snippet.
+        snippets: measured, none of them on an unusable frame.
+        geometric: measured between usable frames; over a gap, between its two ends.
+        unusable: frames that measured nothing, and why.
+        repeated: frames with the very image of the frame before.
+        config: noise of a bridge.
+
+    Raises:
+        SlamError: no snippet was measured, so there is no motion to go on with.
+    """
+    if not snippets:
+        why = next(iter(unusable.values()), "the sequence is too short")
+        raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
+    new = set(range(count)).difference(unusable, repeated)
+    by_network = network_steps(snippets)
+    frozen, geometric = _frozen(by_network, geometric, repeated, new)
+    frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
+    trusted = [s for s in snippets if not frozen.intersection((s.target, *s.sources))]
+    filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
+    by_image = {g.from_index: g.T_from_to for g in geometric if g.to_index - g.from_index == 1}
+    # a network that saw only a frozen image still gives the best guess there is
+    known = network_steps(trusted) | by_image or by_network
+    covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
+    loose = [step for step in range(count - 1) if step not in covered]
+    motion = _completed(known, loose)
+    motion |= _equal_steps(geometric, set(loose))
+    typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
+    interpolated = [_interpolated_step(step, motion[step], typical, config) for step in loose]
+    return InterpolatedGaps(filled, trusted, list(geometric), interpolated, dict(sorted(frames.items())))
+
+
+def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
+    """``T_k_next`` by k of each snippet's target to its next source, and of the steps before the first target."""
+    steps: dict[int, FloatArray] = {}
+    for snippet in snippets:
+        T_target = {i: invert(T) for i, T in zip(snippet.sources, snippet.T_source_target, strict=True)}
+        T_target[snippet.target] = np.eye(4)
+        ends = range(min(snippet.sources), max(snippet.sources))
+        for k in ends:
+            if k == snippet.target or k not in steps:
+                steps[k] = invert(T_target[k]) @ T_target[k + 1]
+    return steps
+
+
+def _frozen(
+    by_network: Mapping[int, FloatArray],
+    geometric: Sequence[RelativePose],
+    repeated: Collection[int],
+    new: Collection[int],
+) -> tuple[set[int], list[RelativePose]]:
+    """Repeated frames during which the camera went on, and the geometric factors that remain without them.
+
+    The next new picture tells: from a standing camera it lies at most a step away, from one that drove on as many
+    steps as images were repeated. Where no new picture comes, the camera is taken at its word and stands.
+    """
+    frozen: set[int] = set()
+    kept = list(geometric)
+    for first, last in runs(repeated):
+        before = [T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1]
+        if not before or last + 1 not in new:
+            continue
+        expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
+        jump = next((g for g in kept if (g.from_index, g.to_index) == (last, last + 1)), None)
+        repeats = last - first + 1
+        if jump is not None and np.linalg.norm(jump.T_from_to[:3, 3]) <= (1 + repeats / 2) * expected:
+            continue
+        frozen |= set(range(first, last + 1))
+        kept = [g for g in kept if not _touches(g, first, last)]
+        if jump is not None:
+            kept.append(replace(jump, from_index=first - 1))
+    return frozen, kept
+
+
+def _touches(factor: RelativePose, first: int, last: int) -> bool:
+    return any(first <= end <= last for end in (factor.from_index, factor.to_index))
+
+
+def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:
+    """Motions of all steps: unknown ones go over from the mean motion before them to that after them."""
+    numbers = np.array(sorted(known))
+    complete = dict(known)
+    for step in steps:
+        if step in known:
+            continue
+        before, after = numbers[numbers < step], numbers[numbers > step]
+        tangents, distances = [], []
+        for near in (before[::-1][:_STEPS_OF_A_MOTION], after[:_STEPS_OF_A_MOTION]):
+            if len(near):
+                tangents.append(np.mean([_tangent(known[k]) for k in near], axis=0))
+                distances.append(abs(int(near[0]) - step))
+        weights = np.array(distances[::-1], dtype=np.float64)
+        turned, moved = np.split(weights @ np.array(tangents) / weights.sum(), 2)
+        complete[step] = from_rotation_vector(turned, moved)
+    return complete
+
+
+def _equal_steps(geometric: Sequence[RelativePose], loose: set[int]) -> dict[int, FloatArray]:
+    """Equal steps over each gap whose two ends image geometry has linked."""
+    shares: dict[int, FloatArray] = {}
+    for factor in geometric:
+        steps = range(factor.from_index, factor.to_index)
+        if len(steps) > 1 and loose.issuperset(steps):
+            T_step = _root(factor.T_from_to, len(steps))
+            shares |= dict.fromkeys(steps, T_step)
+    return shares
+
+
+def _root(T_a_b: FloatArray, n: int) -> FloatArray:
+    """The transform whose n-th power is ``T_a_b``."""
+    turned = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
+    powers = Rotation.from_rotvec(np.arange(n)[:, None] * turned).as_matrix()
+    return from_rotation_vector(turned, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
+
+
+def _filled(
+    snippets: Sequence[SnippetPoses], steps: Mapping[int, FloatArray], count: int, sources: int
+) -> list[SnippetPoses]:
+    """One snippet a target; missing ones are chained from single steps."""
+    by_target = {snippet.target: snippet for snippet in snippets}
+    filled, half = [], sources // 2
+    for target in range(half, count - sources + half):
+        snippet = by_target.get(target)
+        if snippet is None:
+            around = tuple(k for k in range(target - half, target - half + sources + 1) if k != target)
+            T_source_target = np.stack([_between(steps, source, target) for source in around])
+            snippet = SnippetPoses(target, around, T_source_target)
+        filled.append(snippet)
+    return filled
+
+
+def _between(steps: Mapping[int, FloatArray], a: int, b: int) -> FloatArray:
+    """``T_a_b`` from ``T_k_next``."""
+    if a > b:
+        return invert(_between(steps, b, a))
+    T_a_b = np.eye(4)
+    for k in range(a, b):
+        T_a_b = T_a_b @ steps[k]
+    return T_a_b
+
+
+def _interpolated_step(step: int, T_from_to: FloatArray, typical: float, config: GapsConfig) -> RelativePose:
+    length = max(float(np.linalg.norm(T_from_to[:3, 3])), typical, _SIGMA_FLOOR)
+    rotation, translation = np.deg2rad(config.rotation_sigma_deg), config.translation_relative_sigma * length
+    return RelativePose(step, step + 1, T_from_to, np.repeat([rotation, translation], 3), INTERPOLATED_SOURCE)
+
+
+def _tangent(T_a_b: FloatArray) -> FloatArray:
+    """Rotation vector and translation ``(6,)``."""
+    return np.concatenate([Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec(), T_a_b[:3, 3]])

@@ -1,0 +1,1 @@
+"""Lengths of steps and their unit: ground plane, road homography, triangulated points."""

@@ -1,0 +1,242 @@
+"""The length of a step in camera heights, from how the road before the car moves through the image.
+
+A plane ``n . X = h`` of the current camera moves by the homography ``R + t n^T / h`` to the previous one
+(Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
+``m = |t| n / h`` is what aligns both images of the road, and its norm is the length sought. Learned depth
+plays no part, so this length neither shares the networks' bias nor drifts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import RoadConfig
+from slam.frames import Frame, Image, Intrinsics
+from slam.frontend.failure import MeasurementFailure
+from slam.robust import mad_sigma
+from slam.se3 import FloatArray
+from slam.storage.cache import Answer, GetOrCompute, without_cache
+from slam.storage.serialisation import Learner
+
+_LEVEL = np.array([0.0, 1.0, 0.0])
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # where the search begins; refinement reaches the next
+_CLIPPED_GREY = 8.0
+_ITERATIONS = 6
+_REMEMBERED = 100
+
+_Layer = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class RoadStep:
+    """``length_heights`` of a step with its relative sigma, and the road's ``normal`` ``(3,)``, down, unit."""
+
+    length_heights: float
+    relative_sigma: float
+    normal: FloatArray
+
+
+class RoadHomography(Learner):
+    """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it.
+
+    A car ahead hides most of a long strip of road and stands still in the image. Where the long strip is refused, a
+    short and wide one is asked, which ends before such a car; it is less sure.
+    """
+
+    remembers = ("_directions",)
+
+    def __init__(
+        self, config: RoadConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+    ) -> None:
+        self._config = config
+        self._intrinsics = intrinsics
+        self._get_or_compute = get_or_compute
+        long = _Shape(config.far_heights, config.half_width_heights, config.relative_sigma)
+        near = _Shape(config.near_heights, config.near_half_width_heights, config.near_relative_sigma)
+        self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
+        self._strips = [_strip(intrinsics, self._top_row, shape, config.points) for shape in (long, near)]
+        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
+
+    def measure(self, previous: Frame, current: Frame, T_previous_current: FloatArray) -> RoadStep | MeasurementFailure:
+        """Measure the length of a step whose rotation and direction are known.
+
+        Args:
+            previous: the earlier frame, at the size of the intrinsics.
+            current: the next frame.
+            T_previous_current: its pose in the earlier camera, of any length but zero.
+        """
+        T_unit = T_previous_current.copy()
+        T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
+        self._directions.append(T_unit[:3, 3])
+        expected = self._expected()
+        long, near = self._strips
+        measured = self._measured_on(long, previous, current, T_unit, expected)
+        if isinstance(measured, RoadStep):
+            return measured
+        nearby = self._measured_on(near, previous, current, T_unit, expected)
+        return nearby if isinstance(nearby, RoadStep) else measured
+
+    def _measured_on(
+        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+    ) -> RoadStep | MeasurementFailure:
+        if len(strip.rows) < self._config.min_points:
+            return MeasurementFailure("the image shows too little of the road")
+        plane, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
+        length = float(np.linalg.norm(plane))
+        normal = plane / length
+        deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
+        if not np.isfinite(length) or deviation > np.deg2rad(self._config.max_tilt_deg):
+            return MeasurementFailure(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
+        if correlation < self._config.min_correlation:
+            return MeasurementFailure(f"the road looks different in both images (correlation {correlation:.2f})")
+        if 1.0 - correlation > (1.0 - self._config.min_gain) * (1.0 - standing):
+            return MeasurementFailure(f"what is before the car stands still in the image (correlation {standing:.2f})")
+        return RoadStep(length, float(np.hypot(strip.shape.relative_sigma, self._config.tilt_gain * deviation)), normal)
+
+    def _aligned(
+        self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
+    ) -> tuple[FloatArray, float, float]:
+        """The plane ``m`` ``(3,)`` that aligns the road, how alike both views of it are then, and as they are."""
+        config = self._config
+
+        def align() -> Answer:
+            before, now = self._layers(previous), self._layers(current)
+            plane = self._search(strip, before[0], now[0], T_unit, expected)
+            for layer_before, layer_now in zip(before, now, strict=True):
+                plane, correlation = self._refine(
+                    strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
+                )
+            standing = _correlation(*(layers[-1][strip.rows, strip.columns, 0] for layers in (before, now)))
+            return plane, np.array([correlation, standing])
+
+        settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
+        given = (previous.image, current.image, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
+        plane, alike = self._get_or_compute("road aligned", given, align)
+        return plane, float(alike[0]), float(alike[1])
+
+    def _expected(self) -> FloatArray:
+        """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.
+
+        The images hardly tell pitch from length, and the direction of motion tells it well.
+        """
+        direction = np.median(self._directions, axis=0)
+        along = direction / max(float(np.linalg.norm(direction)), 1e-9)
+        normal = _LEVEL - (_LEVEL @ along) * along
+        return np.asarray(normal / np.linalg.norm(normal))
+
+    def _layers(self, frame: Frame) -> list[_Layer]:
+        """Coarse and fine image ``(H', W, 3)`` below the horizon, freed of slow shading, each with its slopes."""
+        for image, layers in self._seen:
+            if image is frame.image:
+                return layers
+        grey = cv2.cvtColor(frame.image[self._top_row :], cv2.COLOR_RGB2GRAY).astype(np.float32)
+        fine = grey - cv2.GaussianBlur(grey, (0, 0), max(0.01 * self._intrinsics.fx, 1.5))
+        coarse = cv2.GaussianBlur(fine, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
+        layers = [_with_slopes(layer) for layer in (coarse, fine)]
+        self._seen.append((frame.image, layers))
+        return layers
+
+    def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
+        """Grey and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
+        camera = self._intrinsics
+        x, y, z = np.moveaxis(points_previous, -2, 0)
+        u = camera.fx * x / z + camera.cx
+        v = camera.fy * y / z + camera.cy - self._top_row
+        columns, rows = (np.asarray(side, np.float32).reshape(-1, u.shape[-1]) for side in (u, v))
+        return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
+
+    def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
+        """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
+        rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
+        R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
+        shift = np.outer(t, n @ rays)
+        difference = self._sampled(before, _ahead(R @ rays + _LENGTHS_HEIGHTS[:, None, None] * shift))[..., 0] - seen
+        costs = np.minimum(np.abs(difference), _CLIPPED_GREY).mean(axis=1)
+        return np.asarray(_LENGTHS_HEIGHTS[int(np.argmin(costs))] * normal)
+
+    def _refine(
+        self,
+        strip: _Strip,
+        before: _Layer,
+        now: _Layer,
+        T_unit: FloatArray,
+        plane: FloatArray,
+        expected: FloatArray,
+        tilt: float,
+    ) -> tuple[FloatArray, float]:
+        """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
+        fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
+        R, t = _single(T_unit[:3, :3], T_unit[:3, 3])
+        turned, seen = R @ strip.rays, now[strip.rows, strip.columns, 0]
+        across = np.eye(3) - np.outer(expected, expected)
+        for _ in range(_ITERATIONS):
+            (m,) = _single(plane)
+            points = _ahead(turned + np.outer(t, m @ strip.rays))
+            grey, slope_x, slope_y = np.ascontiguousarray(self._sampled(before, points).T)
+            residual = grey - seen
+            x, y, z = points
+            slope = (slope_x * fx * (tx - x / z * tz) + slope_y * fy * (ty - y / z * tz)) / z
+            sigma = max(mad_sigma(residual), 0.3)
+            weighted = strip.rays * (slope / (sigma**2 * (1.0 + (residual / (2.0 * sigma)) ** 2)))
+            prior = across / (tilt * float(np.linalg.norm(plane))) ** 2
+            information = (weighted * slope) @ strip.rays.T + prior + 1e-9 * np.eye(3)
+            step = -np.linalg.solve(information, weighted @ residual + prior @ plane)
+            plane = plane + step
+            if np.abs(step).max() < 1e-4 * np.linalg.norm(plane):
+                break
+        return plane, _correlation(grey, seen)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """How far a strip of road reaches, half its width, in camera heights, and the least sigma of a length by it."""
+
+    far_heights: float
+    half_width_heights: float
+    relative_sigma: float
+
+
+@dataclass(frozen=True)
+class _Strip:
+    """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``."""
+
+    shape: _Shape
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    rays: _Layer
+
+
+def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> _Strip:
+    v, u = np.mgrid[top_row : intrinsics.height, : intrinsics.width]
+    rays = intrinsics.rays(np.stack([u, v], axis=-1))
+    depth_heights = 1.0 / np.maximum(rays[..., 1], 1e-6)
+    seen = (depth_heights < shape.far_heights) & (np.abs(rays[..., 0] * depth_heights) < shape.half_width_heights)
+    step = max(round(float(np.sqrt(seen.sum() / points))), 1)
+    rows, columns = np.nonzero(seen & (v % step == 0) & (u % step == 0))
+    return _Strip(shape, rows, columns, np.ascontiguousarray(rays[rows, columns].T, dtype=np.float32))
+
+
+def _single(*parts: FloatArray) -> tuple[_Layer, ...]:
+    """In single precision, as the strip's rays are: one double among them makes all of the arithmetic double."""
+    return tuple(part.astype(np.float32) for part in parts)
+
+
+def _ahead(points: _Layer) -> _Layer:
+    """Points ``(..., 3, P)`` with depths kept off zero, where a plane that is far from true would put them."""
+    np.maximum(points[..., 2, :], 1e-3, out=points[..., 2, :])
+    return points
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
+
+
+def _with_slopes(layer: _Layer) -> _Layer:
+    slopes = [cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
+    return np.asarray(cv2.merge([layer, *slopes]))

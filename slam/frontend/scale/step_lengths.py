@@ -1,0 +1,203 @@
+"""The lengths of all steps at once, from everything that measures them, with the networks' drifting unit as a state.
+
+A monocular step has a direction and no length. Three things measure it: points triangulated on both sides
+of a frame fix it relative to the step before; the road gives it in camera heights; learned depth gives it in
+a unit that wanders. In logarithms all of them are linear in the lengths ``x`` and the unit's deviation ``b``:
+
+    x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
+
+so that one robust sparse least squares holds the whole drive (``docs/design/0006-lengths-before-the-graph.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse.linalg import spsolve
+
+from slam.config import LengthConfig
+from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.odometry import Motion
+from slam.robust import mad_sigma, weighted_median
+from slam.se3 import FloatArray
+
+_LEAST_COMMON = 12
+_ITERATIONS = 20
+_HUBER_ITERATIONS = 5
+_HUBER_K = 1.345
+_MOST_ALIKE = 0.999
+
+
+@dataclass(frozen=True)
+class StepEvidence:
+    """What was measured of S steps, logarithms and their sigmas ``(S,)`` each, NaN where nothing was.
+
+    ``ratio`` is the length over that of the step before; ``absolute`` the length in the unit wanted; ``learned``
+    the length by learned depth, already in the unit that the networks are believed to have.
+    """
+
+    ratio: FloatArray
+    ratio_sigma: FloatArray
+    absolute: FloatArray
+    absolute_sigma: FloatArray
+    learned: FloatArray
+
+    @classmethod
+    def empty(cls, steps: int) -> StepEvidence:
+        """Nothing measured yet."""
+        return cls(*(np.full(steps, np.nan) for _ in range(5)))
+
+    def without_contradicted(self, factor: float) -> StepEvidence:
+        """The same without absolute lengths that are more than ``factor`` times longer or shorter than learned ones."""
+        contradicted = np.abs(self.absolute - self.learned) > np.log(factor)
+        return replace(self, absolute=np.where(contradicted, np.nan, self.absolute))
+
+
+@dataclass(frozen=True)
+class StepLengths:
+    """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN where nothing measured it.
+
+    Steps that are tied by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
+    would add up along the drive as those do. ``unit_correction`` ``(S,)`` times the prior unit of learned depth is its
+    unit near that step.
+    """
+
+    length: FloatArray
+    relative_sigma: FloatArray
+    relative_correlated_sigma: FloatArray
+    unit_correction: FloatArray
+
+
+def gather_evidence(
+    motions: Mapping[int, Motion], absolute: Mapping[int, tuple[float, float]], believed_unit: FloatArray
+) -> StepEvidence:
+    """All evidence on the lengths of the steps ``k -> k + 1`` of a drive.
+
+    Args:
+        motions: what corners measured of step k.
+        absolute: length of step k in the unit wanted, and its relative sigma.
+        believed_unit: that unit per unscaled length near each frame ``(N,)``.
+    """
+    evidence = StepEvidence.empty(len(believed_unit) - 1)
+    triangulated: dict[int, TriangulatedPoints] = {}
+    for step, motion in motions.items():
+        if motion.triangulated is None:
+            continue
+        triangulated[step] = motion.triangulated
+        unscaled = float(np.linalg.norm(motion.relative_pose.T_from_to[:3, 3]))
+        evidence.learned[step] = np.log(unscaled * believed_unit[step])
+        if step in absolute:
+            length, evidence.absolute_sigma[step] = absolute[step]
+            evidence.absolute[step] = np.log(length)
+    for step in triangulated:
+        ratio = length_ratio(triangulated[step - 1], triangulated[step]) if step - 1 in triangulated else None
+        if ratio is not None:
+            evidence.ratio[step], evidence.ratio_sigma[step] = ratio
+    return evidence
+
+
+def length_ratio(earlier: TriangulatedPoints, later: TriangulatedPoints) -> tuple[float, float] | None:
+    """Log of the later step's length over the earlier's, with its sigma, from points that both triangulated.
+
+    In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
+    """
+    _, first, second = np.intersect1d(earlier.track_ids, later.track_ids, assume_unique=True, return_indices=True)
+    if len(first) < _LEAST_COMMON:
+        return None
+    logarithms = np.log(earlier.depth_current[first] / later.depth_previous[second])
+    weights = 1.0 / (earlier.relative_sigma[first] ** 2 + later.relative_sigma[second] ** 2)
+    middle = weighted_median(logarithms, weights)
+    deviation = mad_sigma(logarithms - middle)
+    return middle, deviation / float(np.sqrt(len(first)))
+
+
+def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
+    """The lengths that explain all evidence best: Huber first, then Cauchy weights against what is wrong."""
+    steps = len(evidence.learned)
+    lengths, units = np.arange(steps), steps + np.arange(steps)
+    ratio_sigma = np.hypot(config.ratio_widening * evidence.ratio_sigma, config.ratio_sigma)
+    ones = np.ones(steps)
+    rows = [
+        _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
+        _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
+        _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
+        _Rows(units[1:], units[:-1], 0.0 * ones[1:], config.unit_walk_sigma * ones[1:]),
+        # one belief about the whole drive, spread over its steps
+        _Rows(units, None, 0.0 * ones, config.unit_sigma * np.sqrt(steps) * ones),
+    ]
+    A, target = _whitened(rows, 2 * steps)
+    measured = np.zeros(steps, dtype=bool)
+    for row in rows[:3]:
+        measured[row.plus[np.isfinite(row.value)]] = True
+    idle = csr_array((np.where(np.concatenate([measured, ones > 0]), 0.0, 1.0), (range(2 * steps),) * 2))
+    state, weights = np.zeros(2 * steps), np.ones(len(target))
+    for iteration in range(_ITERATIONS):
+        weighted = A.multiply(weights[:, None]).T.tocsr()
+        information = (weighted @ A + idle).tocsc()
+        state = np.atleast_1d(spsolve(information, weighted @ target))
+        residual = np.abs(A @ state - target)
+        robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
+        weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
+    known = np.where(measured, 1.0, np.nan)
+    sigmas, alike = marginals(information, steps)
+    correlated_sigmas = config.correlated_widening * sigmas * np.sqrt((1.0 + alike) / (1.0 - alike))
+    return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * correlated_sigmas, np.exp(state[steps:]))
+
+
+def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArray]:
+    """What an information matrix ``(2 S, 2 S)`` of lengths, then units, leaves of every length.
+
+    Only neighbours are tied to each other, so what all steps before and all steps after say of one are two chains of
+    2x2 Schur complements.
+
+    Returns:
+        Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
+        Errors whose correlation falls by a factor r from step to step have a sum of ``(1 + r) / (1 - r)`` times the
+        variance of independent ones.
+    """
+    main, neighbour = information.diagonal(), information.diagonal(1)
+    own = np.zeros((steps, 2, 2))
+    own[:, 0, 0], own[:, 1, 1] = main[:steps], main[steps:]
+    own[:, 0, 1] = own[:, 1, 0] = information.diagonal(steps)
+    tie = np.zeros((steps, 2, 2))  # of a step and the next
+    tie[:-1, 0, 0], tie[:-1, 1, 1] = neighbour[: steps - 1], neighbour[steps:]
+    before, after = own.copy(), own.copy()
+    for k in range(1, steps):
+        before[k] -= tie[k - 1] @ np.linalg.inv(before[k - 1]) @ tie[k - 1]
+        after[-k - 1] -= tie[-k - 1] @ np.linalg.inv(after[-k]) @ tie[-k - 1]
+    sigmas = np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0])
+    pairs = np.block([[before[:-1], tie[:-1]], [tie[:-1], after[1:]]])  # (S - 1, 4, 4)
+    alike = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_ALIKE)
+    ends = alike[:1], alike[-1:]
+    return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], alike]) + np.concatenate([alike, ends[1]]))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Equations ``state[plus] - state[minus] = value``, each with its sigma; NaN values say nothing."""
+
+    plus: np.ndarray[tuple[int], np.dtype[np.int64]]
+    minus: np.ndarray[tuple[int], np.dtype[np.int64]] | None
+    value: FloatArray
+    sigma: FloatArray
+
+
+def _whitened(rows: list[_Rows], states: int) -> tuple[csr_array, FloatArray]:
+    """Matrix and right side of all equations divided by their sigmas."""
+    columns, entries, places, values = [], [], [], []
+    count = 0
+    for row in rows:
+        known = np.isfinite(row.value) & np.isfinite(row.sigma)
+        place = count + np.arange(int(known.sum()))
+        count += len(place)
+        for side, sign in ((row.plus, 1.0), (row.minus, -1.0)):
+            if side is not None:
+                places.append(place)
+                columns.append(side[known])
+                entries.append(sign / row.sigma[known])
+        values.append(row.value[known] / row.sigma[known])
+    A = coo_array((np.concatenate(entries), (np.concatenate(places), np.concatenate(columns))), shape=(count, states))
+    return A.tocsr(), np.concatenate(values)

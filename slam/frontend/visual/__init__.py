@@ -1,0 +1,1 @@
+"""Relative poses from optical flow: tracking, two-view geometry and their noise."""

@@ -1,0 +1,148 @@
+"""Two-view geometry of calibrated points: motions proposed by consensus, and what they triangulate.
+
+A motion is ``x_current ~ R_current_previous @ X_previous + direction``; ``frontend/visual/two_view.py`` refines it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import Intrinsics
+from slam.se3 import FloatArray, nearest_rotation
+
+_TRIMMINGS = 4
+_RESECTIONS = 200
+
+
+@dataclass(frozen=True)
+class UnitRelativePose:
+    """A motion between two views apart from its length: ``direction`` ``(3,)`` in the current camera, unit length."""
+
+    R_current_previous: FloatArray
+    direction: FloatArray
+
+
+@dataclass(frozen=True)
+class TriangulatedPoints:
+    """``M`` scene points that a motion triangulated, by the names of their tracks ``(M,)``.
+
+    z-depths ``(M,)`` in both cameras are in units of the motion's length; ``relative_sigma`` ``(M,)`` is relative.
+    """
+
+    track_ids: NDArray[np.int64]
+    depth_previous: FloatArray
+    depth_current: FloatArray
+    relative_sigma: FloatArray
+
+
+def unit_pose_by_essential(
+    rays_previous: FloatArray, rays_current: FloatArray, tolerance: float
+) -> UnitRelativePose | None:
+    """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` of z = 1."""
+    cv2.setRNGSeed(0)
+    E, mask = cv2.findEssentialMat(
+        rays_previous[:, :2].copy(),
+        rays_current[:, :2].copy(),
+        np.eye(3),
+        method=cv2.USAC_MAGSAC,
+        prob=0.999,
+        threshold=tolerance,
+        maxIters=1000,
+    )
+    if E is None or E.shape != (3, 3) or int(mask.sum()) < 8:
+        return None
+    agreeing = mask.ravel().astype(bool)
+    return _facing(E, rays_previous[agreeing], rays_current[agreeing])
+
+
+def _facing(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) -> UnitRelativePose:
+    """Of the four motions of an essential matrix the one with most points before both cameras."""
+    R, R_twisted, direction = cv2.decomposeEssentialMat(E)
+    unit_poses = [
+        UnitRelativePose(turned, sign * direction.ravel()) for turned in (R, R_twisted) for sign in (1.0, -1.0)
+    ]
+
+    def before_both(unit_pose: UnitRelativePose) -> int:
+        depth = triangulated_depth(rays_previous, rays_current, unit_pose)
+        return int(((depth > 0) & (depth_in_current(rays_previous, depth, unit_pose) > 0)).sum())
+
+    return max(unit_poses, key=before_both)
+
+
+def unit_pose_by_pnp(
+    rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, tolerance: float
+) -> UnitRelativePose | None:
+    """The motion with most support among the same rays where their depths ``(M,)`` are known, else NaN.
+
+    What moves by itself cannot join with the scene here: its depth tells it apart.
+    """
+    known = np.isfinite(depth_previous)
+    if known.sum() < 8:
+        return None
+    cv2.setRNGSeed(0)
+    found, turned, moved, _ = cv2.solvePnPRansac(
+        rays_previous[known] * depth_previous[known, None],
+        rays_current[known, :2].copy(),
+        np.eye(3),
+        None,
+        iterationsCount=_RESECTIONS,
+        reprojectionError=tolerance,
+        confidence=0.999,
+    )
+    length = float(np.linalg.norm(moved)) if found else 0.0
+    return UnitRelativePose(cv2.Rodrigues(turned)[0], moved.ravel() / length) if length > 0 else None
+
+
+def parallax_px(
+    rays_previous: FloatArray,
+    rays_current: FloatArray,
+    R_current_previous: FloatArray,
+    intrinsics: Intrinsics,
+) -> FloatArray:
+    """Motion of each point in pixels ``(M,)`` that the rotation does not explain."""
+    turned = rays_previous @ R_current_previous.T
+    turned = turned[:, :2] / np.where(turned[:, 2:] > 1e-6, turned[:, 2:], 1e-6)
+    difference = (rays_current[:, :2] - turned) * [intrinsics.fx, intrinsics.fy]
+    return np.asarray(np.linalg.norm(difference, axis=1))
+
+
+def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> FloatArray:
+    """``R_current_previous`` that explains the matched rays ``(M, 3)`` best without any translation.
+
+    Orthogonal Procrustes on unit rays, trimmed to the better three quarters so that movers do not turn it.
+    """
+    unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
+    unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
+    kept = np.ones(len(unit_previous), dtype=bool)
+    most = 3 * len(unit_previous) // 4
+    for _ in range(_TRIMMINGS):
+        R_current_previous = nearest_rotation(unit_current[kept].T @ unit_previous[kept])
+        error = np.linalg.norm(unit_current - unit_previous @ R_current_previous.T, axis=1)
+        kept = error <= np.partition(error, most)[most]
+    return R_current_previous
+
+
+def triangulated_depth(rays_previous: FloatArray, rays_current: FloatArray, unit_pose: UnitRelativePose) -> FloatArray:
+    """z-depth ``(M,)`` in the previous camera in units of the motion's length; negative behind the camera.
+
+    From ``z R x + t = z' x'``: the cross product with x' leaves ``z (x' x R x) = -(x' x t)``.
+    """
+    current = rays_current.T
+    across = cross(current, unit_pose.R_current_previous @ rays_previous.T)
+    along = -cross(current, unit_pose.direction)
+    return np.asarray((across * along).sum(axis=0) / np.maximum((across**2).sum(axis=0), 1e-18))
+
+
+def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, unit_pose: UnitRelativePose) -> FloatArray:
+    """z-depth ``(M,)`` in the current camera of points at ``depth_previous`` ``(M,)``, both in the motion's length."""
+    return np.asarray(depth_previous * (rays_previous @ unit_pose.R_current_previous[2]) + unit_pose.direction[2])
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """``a x b`` of ``(3,)`` or ``(3, M)``; NumPy's own spends most of its time on choosing axes."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -1,0 +1,71 @@
+"""The next image as learned depth and the motion so far foretell it, so that corners can be followed through it.
+
+Seen from a moving car a window on the road stretches by a fifth from frame to frame, one on a near wall by a tenth. A
+tracker that only shifts windows follows whatever part of one has most texture: single corners err by half a pixel, and
+those on the road all together upwards, which looks like a camera that pitches (``docs/design/0013``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import DepthMap, Intrinsics
+from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.storage.cache import Given
+
+_NEAREST = 1e-6
+
+Grey = NDArray[np.uint8]
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedFlow:
+    """Where the pixels of an image go by a motion of ``unit_pose`` and ``length`` through ``depth_previous``.
+
+    ``length`` and depth ``(H, W)`` are in one unit; where there is no depth, the scene is taken to be far.
+    """
+
+    unit_pose: UnitRelativePose
+    length: float
+    depth_previous: DepthMap
+    intrinsics: Intrinsics
+
+    @property
+    def given(self) -> tuple[Given, ...]:
+        """All that it depends on, for a memory."""
+        moved = self.length * self.unit_pose.direction
+        return self.unit_pose.R_current_previous, moved, self.depth_previous, repr(self.intrinsics)
+
+    def undone(self, current: Grey) -> Grey:
+        """The later image ``(H, W)`` with the foreseen motion undone: what is foreseen right stands where it stood."""
+        return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+    def in_current(self, pixels: Pixels) -> Pixels:
+        """Where pixels ``(M, 2)`` of the undone image lie in the later one."""
+        if len(pixels) == 0:
+            return pixels
+        u, v = np.ascontiguousarray(pixels.T)
+        moved = cv2.remap(self._current, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(moved, dtype=np.float32).reshape(-1, 2)
+
+    @cached_property
+    def _current(self) -> NDArray[np.float32]:
+        """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
+        K, depth = self.intrinsics.K, self.depth_previous
+        turned = (K @ self.unit_pose.R_current_previous @ np.linalg.inv(K)).astype(np.float32)
+        moved = self.length * K @ self.unit_pose.direction
+        v, u = (np.arange(side, dtype=np.float32) for side in depth.shape)
+        near = cv2.divide(1.0, depth)
+        near[~(depth > 0)] = 0.0
+        x, y, z = (
+            cv2.scaleAdd(near, float(shift), np.add.outer(row[1] * v + row[2], row[0] * u))
+            for row, shift in zip(turned, moved, strict=True)
+        )
+        ahead = cv2.max(z, _NEAREST)
+        return np.asarray(cv2.merge([cv2.divide(x, ahead), cv2.divide(y, ahead)]))

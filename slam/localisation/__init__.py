@@ -1,0 +1,1 @@
+"""New images located in the map of an old run."""

@@ -1,0 +1,217 @@
+"""The system on frames as they come: the pipeline's own steps, and iSAM2 in place of the batch solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.inference import DepthPosePredictor
+from erfsfm.pose_noise import PoseNoise
+from slam.config import SlamConfig
+from slam.errors import SlamError
+from slam.frames import Frame, Image, Intrinsics, Predictor
+from slam.frontend.scale.road_plane import rescaled, resolve_mode
+from slam.loops.closure import LoopClosures
+from slam.pipeline.batch import Measurements, SlamPipeline
+from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.observer import Observer
+from slam.pose_graph import IncrementalPoseGraph
+from slam.prediction.networks import NetworkPredictor
+from slam.runtime.timing import Stopwatch
+from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
+from slam.trajectory import Trajectory
+
+
+class Slam:
+    """Monocular SLAM fed frame by frame; it keeps no images and makes no map.
+
+    What is measured is the pipeline's, causally: lengths and noise are judged anew as the drive goes on, so earlier
+    poses move a little with every update.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        intrinsics: Intrinsics,
+        config: SlamConfig | None = None,
+        camera_height_m: float | None = None,
+        update_frames: int = 10,
+        sweep_frames: int = 100,
+        noise: PoseNoise | None = None,
+        weights_sha256: str = "",
+    ) -> None:
+        """Prepare for the first frame.
+
+        Args:
+            predictor: depth and snippet poses.
+            intrinsics: of all images.
+            config: None for the defaults.
+            camera_height_m: above the road; None where unknown, then lengths are in camera heights.
+            update_frames: the graph is solved after so many frames, and when it is asked.
+            sweep_frames: loops are looked for after so many frames; 0 leaves it to ``close_loops``.
+            noise: of the snippet poses; None measures it against image geometry alone.
+            weights_sha256: of the networks, so that what others saw is not resumed.
+
+        Raises:
+            SlamError: a scale mode that wants more than images.
+        """
+        config = config or SlamConfig()
+        self._mode = resolve_mode(config.scale, camera_height_m)
+        if self._mode in ("reference", "lidar"):
+            raise SlamError(f"scale mode {self._mode} wants a whole sequence: choose camera-height or none")
+        if self._mode == "camera-height" and camera_height_m is None:
+            raise SlamError("scale mode camera-height wants camera_height_m: give it or choose scale.mode=none")
+        without_map = config.mapping.model_copy(update={"enabled": False})
+        config = config.model_copy(update={"mapping": without_map})
+        self._weights_sha256 = weights_sha256
+        self._drive = LiveSequence(intrinsics, camera_height_m)
+        self._pipeline = SlamPipeline(self._drive, predictor, config, noise=noise)
+        self._observer = Observer(predictor, intrinsics, config, Stopwatch())
+        self._graph = IncrementalPoseGraph(config.pose_graph)
+        self._shortest = predictor.sources + 1
+        self._update_frames, self._sweep_frames = update_frames, sweep_frames
+        self._loops = LoopClosures(not_sought="no sweep yet")
+        self._per_frame = np.ones(0)  # scale at which the loops were measured
+        self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
+
+    @classmethod
+    def from_weights(
+        cls,
+        name_or_dir: str | Path,
+        intrinsics: Intrinsics,
+        config: SlamConfig | None = None,
+        camera_height_m: float | None = None,
+        device: str = "cpu",
+    ) -> Slam:
+        """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
+        networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
+        return cls(
+            NetworkPredictor(networks, intrinsics),
+            intrinsics,
+            config,
+            camera_height_m,
+            noise=networks.noise,
+            weights_sha256=networks.sha256,
+        )
+
+    def __len__(self) -> int:
+        """Number of frames so far."""
+        return len(self._drive)
+
+    def add_frame(self, image: Image, stamp: float) -> None:
+        """Take the next frame.
+
+        Args:
+            image: ``(H, W, 3)`` uint8 RGB at the size of the intrinsics.
+            stamp: seconds, after that of the frame before.
+
+        Raises:
+            ValueError: another size, type or order.
+        """
+        size = (self._drive.intrinsics.height, self._drive.intrinsics.width, 3)
+        if image.shape != size or image.dtype != np.uint8:
+            raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
+        if len(self) and not stamp > self._drive.stamps[-1]:
+            raise ValueError(f"stamps must increase; got {stamp} after {self._drive.stamps[-1]}")
+        image = image.copy()  # it is looked at again when the next one comes
+        image.setflags(write=False)
+        index = len(self)
+        self._drive.stamps = np.append(self._drive.stamps, stamp)
+        self._observer.add(index, Frame(index, float(stamp), image))
+        if self._sweep_frames and len(self) % self._sweep_frames == 0:
+            self.close_loops()
+        elif len(self) % self._update_frames == 0:
+            self._update()
+
+    def save(self, path: Path) -> None:
+        """Keep all that was measured in a file, for `resume`; frames may go on coming.
+
+        Raises:
+            SlamError: the file cannot be written.
+        """
+        self._observer.flush()
+        write_atomically(path, SessionCheckpoint.of(self._drive, self._observer, self._weights_sha256).write)
+
+    def resume(self, path: Path) -> None:
+        """Go on after the last frame of what `save` kept, as if there had been no pause; loops are looked for anew.
+
+        Raises:
+            SlamError: frames came already, or the file is missing, damaged or of another camera or other weights.
+        """
+        if len(self):
+            raise SlamError(f"{path} is resumed before the first frame; {len(self)} came already")
+        drive = SessionCheckpoint.read(path)
+        mine = (self._drive.intrinsics, self._drive.camera_height_m, self._weights_sha256)
+        if (drive.intrinsics, drive.camera_height_m, drive.weights_sha256) != mine:
+            raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
+        drive.resume(self._observer)
+        self._drive.stamps = drive.stamps
+
+    def trajectory(self) -> Trajectory:
+        """All frames so far; where no snippet has been seen yet, the camera is taken to stand.
+
+        Raises:
+            SlamError: no frame yet, or the graph cannot be solved.
+        """
+        if not len(self):
+            raise SlamError("no trajectory before the first frame")
+        if len(self._T_world_camera) < len(self):
+            self._update()
+        return Trajectory(self._drive.stamps, self._T_world_camera.copy())
+
+    def close_loops(self) -> LoopClosures:
+        """Look for places seen before among all frames so far; the graph takes those that agree."""
+        measured = self._measure()
+        if measured is not None:
+            self._loops = self._pipeline.close_loops(self._observer.closed().views, measured)
+            self._per_frame = measured.scale.per_frame
+            self._solve(measured)
+        return self._loops
+
+    def _update(self) -> None:
+        measured = self._measure()
+        if measured is None:
+            self._T_world_camera = np.tile(np.eye(4), (len(self), 1, 1))
+        else:
+            self._solve(measured)
+
+    def _measure(self) -> Measurements | None:
+        self._observer.flush()
+        if not self._observer.seen.snippets:
+            return None
+        return self._pipeline.measure(self._mode, self._observer.closed())
+
+    def _solve(self, measured: Measurements) -> None:
+        now = measured.scale.per_frame
+        loops = [loop.measured for loop in self._loops.accepted]
+        current = [rescaled(edge, float(now[edge.from_index] / self._per_frame[edge.from_index])) for edge in loops]
+        self._T_world_camera = self._graph.update([*measured.factors, *current], measured.T_odometry)
+
+
+@dataclass
+class LiveSequence:
+    """A sequence that grows and is never read again."""
+
+    intrinsics: Intrinsics
+    camera_height_m: float | None
+    stamps: FloatArray = field(default_factory=lambda: np.zeros(0))
+    name: str = "live"
+    reference: FloatArray | None = None
+    T_camera_lidar: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frame(self, index: int) -> Frame:
+        """Never: frames are looked at as they come."""
+        raise SlamError(f"frame {index} of a live drive is not kept")
+
+    def scan_path(self, index: int) -> None:
+        """None: there are no scans."""
+
+    def provenance(self) -> tuple[str, ...]:
+        """Unknown."""
+        return ()

@@ -1,0 +1,100 @@
+"""A predictor that knows the truth and errs by a chosen amount: it drives the whole SLAM without networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+from slam.frames import DepthMap, Frame, SnippetPoses
+from slam.se3 import FloatArray, from_rotation_vector, invert
+
+_NOISE_CELL_PX = 32
+
+
+@dataclass(frozen=True)
+class OracleNoise:
+    """How an oracle errs.
+
+    ``rotation_sigma`` (radians) is for a pair one frame apart and grows with the square root of the
+    distance; ``translation_relative_sigma`` is a share of the pair's length. ``scale_drift_sigma`` is the step
+    of a random walk of the logarithm of the unscaled unit, shared by depth and translation.
+    ``depth_relative_sigma`` is the relative error of depth, smooth over patches as a network's is.
+    """
+
+    rotation_sigma: float = 0.0
+    translation_relative_sigma: float = 0.0
+    scale_drift_sigma: float = 0.0
+    depth_relative_sigma: float = 0.0
+    seed: int = 0
+
+
+class OraclePredictor:
+    """Implements ``Predictor`` from the truth; the answer for a frame does not depend on earlier calls."""
+
+    def __init__(
+        self,
+        T_world_camera: FloatArray,
+        depth_of: Callable[[int], NDArray[np.floating]],
+        noise: OracleNoise = OracleNoise(),
+        unscaled_factor: float = 1.0,
+        sources: int = 4,
+    ) -> None:
+        """Prepare the drift of the scale.
+
+        Args:
+            T_world_camera: true poses ``(N, 4, 4)``, metres.
+            depth_of: true z-depth ``(H, W)`` of a frame, metres, at the size of its image.
+            noise: how to err.
+            unscaled_factor: unscaled lengths per metre.
+            sources: source frames of a snippet, an even number.
+        """
+        self.sources = sources
+        self._T_world_camera = T_world_camera
+        self._depth_of = depth_of
+        self._noise = noise
+        walk = np.random.default_rng([noise.seed, _Stream.SCALE]).normal(size=len(T_world_camera))
+        self._unit = unscaled_factor * np.exp(noise.scale_drift_sigma * np.cumsum(walk))  # (N,)
+
+    def depth(self, frame: Frame) -> DepthMap:
+        """True depth in the unscaled unit of its frame, with a smooth relative error."""
+        depth = np.asarray(self._depth_of(frame.index), dtype=np.float64) * self._unit[frame.index]
+        if self._noise.depth_relative_sigma > 0:
+            rng = np.random.default_rng([self._noise.seed, _Stream.DEPTH, frame.index])
+            height, width = depth.shape
+            coarse = rng.normal(size=(height // _NOISE_CELL_PX + 2, width // _NOISE_CELL_PX + 2))
+            smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+            depth = depth * np.exp(self._noise.depth_relative_sigma * smooth)
+        return np.asarray(depth, dtype=np.float32)
+
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+        """True relative poses in the unscaled unit of the target, each with its own error."""
+        if len(frames) != self.sources + 1:
+            raise SlamError(f"a snippet has {self.sources + 1} frames; got {len(frames)}")
+        indices = [frame.index for frame in frames]
+        target = indices.pop(self.sources // 2)
+        T_source_target = np.stack([self._measure(source, target) for source in indices])
+        return SnippetPoses(target, tuple(indices), T_source_target)
+
+    def _measure(self, source: int, target: int) -> FloatArray:
+        T_source_target = invert(self._T_world_camera[source]) @ self._T_world_camera[target]
+        T_source_target[:3, 3] *= self._unit[target]
+        rng = np.random.default_rng([self._noise.seed, _Stream.POSE, target, source])
+        growth = np.sqrt(abs(source - target))
+        rotation = self._noise.rotation_sigma * growth * rng.normal(size=3)
+        length = float(np.linalg.norm(T_source_target[:3, 3]))
+        translation = self._noise.translation_relative_sigma * length * rng.normal(size=3)
+        return np.asarray(T_source_target @ from_rotation_vector(rotation, translation))
+
+
+class _Stream(IntEnum):
+    """What a random stream is for."""
+
+    SCALE = 0
+    DEPTH = 1
+    POSE = 2

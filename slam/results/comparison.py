@@ -1,0 +1,174 @@
+"""The numbers of several runs side by side, read from their ``metrics.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from slam.errors import RunError
+from slam.results.folder import TRAJECTORIES, RunFolder
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+MISSING = "–"
+NOT_RECORDED = "not recorded"
+
+
+@dataclass(frozen=True)
+class ErrorColumn:
+    """One number of a trajectory: where it stands inside T, what it is called, how it is written."""
+
+    path: tuple[str, ...]
+    name: str
+    short: str
+    decimals: int
+
+
+SNIPPET_ATE = ErrorColumn(("snippet5", "ate_mean"), "snippet ATE, m", "snip.\nATE", 4)
+SNIPPET_RE = ErrorColumn(("snippet5", "re_mean"), "snippet RE, rad", "snip.\nRE", 4)
+ALIGNED_ATE = tuple(
+    ErrorColumn(("align", how, "ate_rmse_m"), f"ATE RMSE, {label}", f"ATE\n{short}", 3)
+    for how, label, short in (
+        ("none", "as written", "none"),
+        ("first", "first pose", "first"),
+        ("scale", "first pose and scale", "scale"),
+        ("6dof", "6 dof", "6dof"),
+        ("7dof", "7 dof", "7dof"),
+    )
+)
+T_REL = ErrorColumn(("align", "7dof", "t_rel_percent"), "t_rel, % (7 dof)", "t_rel\n%", 2)
+R_REL = ErrorColumn(("align", "7dof", "r_rel_deg_per_100m"), "r_rel, deg / 100 m", "r_rel\n°/100m", 3)
+EVO_DIFFERENCE = ErrorColumn(("evo", "difference"), "largest difference to evo", "to\nevo", 1)
+STATISTICS = (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, EVO_DIFFERENCE)
+
+
+def lookup(tree: Mapping[str, Any] | None, *path: str) -> tuple[Any, str]:
+    """A value inside nested metrics and an empty reason, or None and why it is missing.
+
+    The reason is the sibling ``<name>_reason`` of the first key on the path that is null or absent.
+    """
+    node: Any = tree
+    for name in path:
+        if not isinstance(node, Mapping):
+            return None, NOT_RECORDED
+        value = node.get(name)
+        if value is None:
+            return None, str(node.get(f"{name}_reason") or NOT_RECORDED)
+        node = value
+    return (None, NOT_RECORDED) if node is None else (node, "")
+
+
+def written(value: Any, decimals: int) -> str:
+    """A number with its decimals, tiny ones in powers of ten; a dash for None."""
+    if value is None:
+        return MISSING
+    if isinstance(value, int) or not isinstance(value, float):
+        return str(value)
+    tiny = value != 0 and abs(value) < 0.5 * 10.0**-decimals
+    return f"{value:.1e}" if tiny else f"{value:.{decimals}f}"
+
+
+def failure(metrics: Mapping[str, Any]) -> str:
+    """Why a run failed, in one line; empty for a run that did not."""
+    if metrics.get("status") == "ok":
+        return ""
+    reason = metrics.get("reason") or metrics.get("status_reason") or metrics.get("error") or "no reason recorded"
+    return " ".join(str(reason).split())
+
+
+def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
+    """What a reader must know about the lengths of a run before comparing them."""
+    mode, _ = lookup(metrics, "scale", "mode")
+    notes = []
+    if mode == "none":
+        notes.append(
+            "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
+            "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres."
+        )
+    elif mode is not None and lookup(metrics, "scale", "value")[0] is None:
+        reason = lookup(metrics, "scale", "value")[1]
+        notes.append(f"No scale was found ({reason}): lengths are in the networks' own unit, not in metres.")
+    return notes
+
+
+def comparison_table(runs: Sequence[RunFolder]) -> Table:
+    """One row for each run and trajectory; failed runs say why.
+
+    Raises:
+        RunError: no run was given, or its ``metrics.json`` is damaged.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    contents = _contents(runs)
+    table = Table(title="Errors against the reference", title_justify="left", caption_justify="left")
+    table.add_column("run", overflow="fold", min_width=10)
+    table.add_column("trajectory", no_wrap=True)
+    for statistic in STATISTICS:
+        table.add_column(statistic.short, justify="right", min_width=statistic.decimals + 2, no_wrap=True)
+    notes: dict[str, None] = {}
+    for name, metrics in zip(run_names(runs), contents):
+        leak, _ = lookup(metrics, "provenance", "leak")
+        title = Text.assemble(name, ("\nLEAK", "bold red") if leak else "")
+        rows = [] if failure(metrics) else _rows(name, metrics, notes)
+        if failure(metrics):
+            notes[f"{name} failed: {failure(metrics)}."] = None
+            title.append("\nfailed", "bold red")
+        names, *columns = zip(*rows) if rows else [()] * (1 + len(STATISTICS))
+        table.add_row(title, *("\n".join(cells) for cells in (names, *columns)), end_section=True)
+        if leak:
+            notes["LEAK: the weights have seen the sequence in training; the numbers are no test."] = None
+        notes.update({f"{name}: {note}": None for note in unit_notes(metrics)})
+    table.caption = Text("\n".join(["ATE and snippet ATE in metres, snippet RE in radians.", *notes]))
+    return table
+
+
+def comparison_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
+    """The same numbers for a program: a list with one object a run, T of ``metrics.json`` by trajectory.
+
+    Raises:
+        RunError: no run was given, or its ``metrics.json`` is damaged.
+    """
+    objects = []
+    for run, metrics in zip(runs, _contents(runs)):
+        entry: dict[str, Any] = {"run": str(run.path), "status": metrics.get("status")}
+        if failure(metrics):
+            entry["reason"] = failure(metrics)
+        entry["leak"] = lookup(metrics, "provenance", "leak")[0]
+        for key in ("sequence", "scale", "trajectories"):
+            entry[key] = metrics.get(key)
+        objects.append(entry)
+    return objects
+
+
+def run_names(runs: Sequence[RunFolder]) -> list[str]:
+    """Short names of runs: the folder's own, or the whole path where two share it."""
+    names = [run.path.resolve().name for run in runs]
+    return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]
+
+
+def _contents(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
+    if not runs:
+        raise RunError("no run was given: name one or more run folders")
+    return [run.metrics() for run in runs]
+
+
+def _rows(name: str, metrics: Mapping[str, Any], notes: dict[str, None]) -> list[list[str]]:
+    """Cells of each trajectory, its own name first; why numbers are missing goes to the notes."""
+    rows = []
+    missing: dict[str, dict[str, None]] = {}
+    for trajectory in TRAJECTORIES:
+        numbers, reason = lookup(metrics, "trajectories", trajectory)
+        if numbers is None:
+            missing.setdefault(reason, {})[trajectory] = None
+            continue
+        values = [lookup(numbers, *statistic.path) for statistic in STATISTICS]
+        for _, why in values:
+            if why:
+                missing.setdefault(why, {})[trajectory] = None
+        cells = [written(value, statistic.decimals) for (value, _), statistic in zip(values, STATISTICS)]
+        rows.append([trajectory, *cells])
+    notes.update({f"{MISSING} {name}, {' and '.join(where)}: {why}.": None for why, where in missing.items()})
+    return rows

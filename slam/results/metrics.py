@@ -1,0 +1,104 @@
+"""What a run can say of itself: ``metrics.json`` (``docs/outputs.md``)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from erfsfm.evaluation.pose_metrics import (
+    SnippetErrors,
+    snippet_errors,
+    snippet_from_network,
+    snippets_from_trajectory,
+)
+from slam.evaluation.coverage import coverage, coverage_by_source
+from slam.evaluation.trajectory import trajectory_metrics
+from slam.frames import Sequence
+from slam.frontend.failure import MeasurementFailure
+from slam.pipeline.batch import SlamResult
+from slam.se3 import umeyama
+from slam.sequences.continued import Continued
+from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
+from slam.trajectory import Trajectory
+
+
+def lidar_trajectory(result: SlamResult) -> Trajectory | None:
+    """The LiDAR's path with the stamps of its frames."""
+    if result.lidar is None:
+        return None
+    return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
+
+
+def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
+    """Errors of the LiDAR's path against the truth at its own frames."""
+    lidar = lidar_trajectory(result)
+    if lidar is None or result.lidar is None:
+        return null("lidar", "the sequence has no LiDAR scans")
+    reference = None if result.reference is None else result.reference.select(result.lidar.frames).rebased()
+    return {"lidar": trajectory_metrics(lidar, reference)}
+
+
+def run_metrics(
+    result: SlamResult, sequence: Sequence, provenance: Provenance, map_summary: dict[str, Any]
+) -> dict[str, Any]:
+    """All of it, every number that cannot be known null with its reason."""
+    reference = result.reference
+    before = sequence.before if isinstance(sequence, Continued) else 0
+    trajectories = {
+        "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
+        "odometry": trajectory_metrics(result.odometry, reference),
+        "optimised": trajectory_metrics(result.optimised, reference),
+        **_lidar_metrics(result),
+    }
+    metrics: dict[str, Any] = finite(
+        {
+            "schema": SCHEMA,
+            "status": "ok",
+            "provenance": asdict(provenance),
+            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
+            | describe_gaps(result.observations.bridged)
+            | {"continued_at": before},
+            "timing": describe_timing(result.stopwatch, len(sequence) - before),
+            "scale": _scale(result),
+            "trajectories": trajectories,
+            "graph": _graph(result),
+            "loops": result.loops.summary(),
+            "map": map_summary,
+        }
+    )
+    return metrics
+
+
+def _network_snippets(result: SlamResult) -> SnippetErrors | None:
+    """The paper's protocol on the network's direct answers; None without truth or with other snippets."""
+    snippets = result.observations.snippets
+    if result.reference is None or len(snippets[0].sources) != 4:
+        return None
+    predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
+    return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
+
+
+def _scale(result: SlamResult) -> dict[str, Any]:
+    estimate = result.scale.estimate
+    if isinstance(estimate, MeasurementFailure):
+        return {"mode": result.scale.mode, **null("value", estimate.reason)}
+    return {
+        "mode": result.scale.mode,
+        "value": estimate.value,
+        "spread": estimate.spread,
+        "frames_used": estimate.frames_used,
+    }
+
+
+def _graph(result: SlamResult) -> dict[str, Any]:
+    """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
+    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
+    if result.reference is None:
+        return summary | null("coverage", "the sequence has no true poses")
+    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+    if not aligned.scale > 0:
+        return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
+    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
+    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}

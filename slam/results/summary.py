@@ -1,0 +1,96 @@
+"""``metrics.json``: what ran, how long, how good; every missing number has its reason beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from slam.frames import Sequence, runs
+from slam.runtime.timing import Stopwatch, peak_rss_mb
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Which program, which weights, which data they saw."""
+
+    version: str
+    commit: str
+    command: str
+    seed: int
+    device: str
+    weights: str
+    weights_sha256: str
+    weights_licence: str
+    trained_on: list[str]
+    leak: bool
+
+
+def null(name: str, reason: str) -> dict[str, Any]:
+    """A number that cannot be given, and why."""
+    return {name: None, f"{name}_reason": reason}
+
+
+def describe_sequence(sequence: Sequence, length_m: float | None) -> dict[str, Any]:
+    """Name, size and true length of a sequence."""
+    frames = len(sequence)
+    span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
+    summary: dict[str, Any] = {"name": sequence.name, "frames": frames}
+    summary |= {"length_m": length_m} if length_m is not None else null("length_m", "the sequence has no true poses")
+    summary |= {"fps": (frames - 1) / span} if span > 0 else null("fps", "the stamps span no time")
+    return summary
+
+
+def describe_gaps(frames: Mapping[int, str]) -> dict[str, Any]:
+    """How many frames measured nothing, and the runs of them with the first one's reason."""
+    return {
+        "bridged_frames": len(frames),
+        "bridged": [{"first": first, "last": last, "reason": frames[first]} for first, last in runs(frames)],
+    }
+
+
+def describe_timing(watch: Stopwatch, frames: int) -> dict[str, Any]:
+    """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
+    seconds = watch.seconds
+    return {
+        "seconds_total": seconds,
+        "frames_per_second": frames / seconds,
+        "cpu_seconds": watch.cpu_seconds,
+        "peak_rss_mb": peak_rss_mb(),
+        "stages": dict(watch.stages),
+    }
+
+
+def describe_failure(provenance: Provenance | None, reason: str) -> dict[str, Any]:
+    """What a run that failed leaves in place of its metrics."""
+    return {
+        "schema": SCHEMA,
+        "status": "failed",
+        "reason": reason,
+        "provenance": asdict(provenance) if provenance else None,
+    }
+
+
+def finite(tree: Any) -> Any:
+    """A copy in which every number that is not finite is null with a reason."""
+    if isinstance(tree, dict):
+        clean: dict[str, Any] = {}
+        for key, value in tree.items():
+            clean[key] = finite(value)
+            if isinstance(value, float) and not math.isfinite(value):
+                clean.setdefault(f"{key}_reason", f"the computation gave {value}")
+        return clean
+    if isinstance(tree, list | tuple):
+        return [finite(value) for value in tree]
+    if isinstance(tree, float) and not math.isfinite(tree):
+        return None
+    return tree
+
+
+def as_json(metrics: dict[str, Any]) -> str:
+    """The metrics as text; only finite numbers pass."""
+    return json.dumps(metrics, indent=2, allow_nan=False)

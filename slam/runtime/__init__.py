@@ -1,0 +1,1 @@
+"""Time, threads, progress bars and imports of heavy libraries."""

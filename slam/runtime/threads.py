@@ -1,0 +1,50 @@
+"""What goes on in other threads, and how many of them libraries may use."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import cv2
+from threadpoolctl import threadpool_limits
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+_CORES = 2
+
+
+def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
+    """What ``read`` gives for each of some numbers, in another thread while the one before is used."""
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
+        waiting: deque[Future[T]] = deque()
+        for number in numbers:
+            waiting.append(ahead.submit(read, number))
+            if len(waiting) > 1:
+                yield waiting.popleft().result()
+        for last in waiting:
+            yield last.result()
+
+
+def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
+    """What ``do`` gives for each item, in their order; each depends on its item alone."""
+    with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
+        return list(side.map(do, items))
+
+
+@contextmanager
+def limit_library_threads() -> Iterator[None]:
+    """BLAS and OpenCV without threads of their own.
+
+    A run computes in several threads already; matrices and images are small, and more would only wait for each other.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1, "blas"):
+            yield
+    finally:
+        cv2.setNumThreads(threads)

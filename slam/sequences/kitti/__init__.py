@@ -1,0 +1,1 @@
+"""KITTI's own layouts: odometry roots, raw drives, calibration and GPS/INS."""

@@ -1,0 +1,58 @@
+"""The embedded sequence: a street rendered in memory, with its truth at hand."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from slam.frames import Frame, Image, Intrinsics
+from slam.se3 import FloatArray
+from slam.sequences.recording import Source, labels, rebased, require_frame, uniform_stamps
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+
+FPS = 10.0
+_CACHED_FRAMES = 32
+
+
+class SimulatedSequence:
+    """A ``SimulatedStreet`` as a sequence; ``street`` has the depth, the scans and the true surface.
+
+    ``reference`` is re-based to the first camera; ``street.T_world_camera[0]`` takes it to the street.
+    """
+
+    def __init__(self, options: SimulationOptions, name: str = "sim") -> None:
+        self.street = SimulatedStreet(options)
+        self.name = name
+        K = np.asarray(self.street.K, dtype=np.float64)
+        self.intrinsics = Intrinsics(
+            options.width, options.height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        )
+        self.stamps = uniform_stamps(options.frames, FPS)
+        self.reference: FloatArray | None = rebased(np.asarray(self.street.T_world_camera, dtype=np.float64))
+        self.camera_height_m: float | None = float(self.street.camera_height_m)
+        self.T_camera_lidar: FloatArray | None = np.asarray(self.street.T_camera_lidar, dtype=np.float64)
+        self.sources: tuple[Source, ...] = (Source(f"simulated/{options.seed}", first=None),)
+        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._render)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.stamps)
+
+    def frame(self, index: int) -> Frame:
+        """Render one frame, or give it again from memory."""
+        require_frame(self.name, index, len(self))
+        return Frame(index, float(self.stamps[index]), self._cached(index).copy())
+
+    def scan_path(self, index: int) -> Path | None:
+        """None: scans are not on disk; ``street.scan(index)`` gives them."""
+        return None
+
+    def provenance(self) -> tuple[str, ...]:
+        """The simulated world by its seed; any two excerpts of it share their streets."""
+        return labels(self.sources, len(self))
+
+    def _render(self, index: int) -> Image:
+        image: Image = self.street.render(index).image
+        return image

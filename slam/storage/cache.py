@@ -1,0 +1,166 @@
+"""What was computed once is read the next time: arrays on disk, named by everything that they depend on.
+
+An entry is a file with a checksum before its arrays. It appears whole or not at all, and a damaged one is computed
+again. Arrays are kept at their own precision, so that a run that remembers and one that does not give the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+from slam.storage.files import write_atomically
+
+logger = logging.getLogger(__name__)
+
+Given = str | NDArray[Any]
+Answer = tuple[NDArray[Any], ...]
+GetOrCompute = Callable[[str, Sequence[Given], Callable[[], Answer]], Answer]
+
+_FORMAT = b"erfsfm-slam cache 2"
+_CHECK_BYTES = 16
+_LENGTH_BYTES = 4
+_REMEMBERED_DIGESTS = 8
+
+
+def without_cache(kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
+    """A ``GetOrCompute`` without memory."""
+    return compute()
+
+
+class DiskCache:
+    """A folder of entries, shared by any number of sequences, networks and runs."""
+
+    def __init__(self, folder: Path) -> None:
+        """Use a folder, made where it is missing.
+
+        Raises:
+            SlamError: the folder cannot be made.
+        """
+        self._folder = folder
+        self._is_writable = True
+        self._digests: deque[tuple[NDArray[Any], bytes]] = deque(maxlen=_REMEMBERED_DIGESTS)
+        self._hashing = Lock()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SlamError(f"no cache can be made in {folder}: {error.strerror or error}") from error
+
+    def read(self, key: str) -> Answer | None:
+        """An entry, or None where it is missing or not as it was written."""
+        path = self._path(key)
+        try:
+            raw = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            logger.warning("cache entry %s cannot be read (%s): computed again", path, error.strerror)
+            return None
+        check, content = raw[:_CHECK_BYTES], raw[_CHECK_BYTES:]
+        if _checksum(content) != check:
+            logger.warning("cache entry %s is damaged: computed again", path)
+            return None
+        return _unpacked(content)
+
+    def write(self, key: str, answer: Answer) -> None:
+        """Keep an entry; a full disk ends the keeping and not the run."""
+        if not self._is_writable:
+            return
+        content = _packed(answer)
+        try:
+            write_atomically(self._path(key), lambda file: file.write_bytes(_checksum(content) + content))
+        except SlamError as error:
+            logger.warning("the cache keeps nothing more: %s", error)
+            self._is_writable = False
+
+    def digest(self, given: Given) -> bytes:
+        """Of a text, or of shape and bytes of an array; an image is given several times and hashed once."""
+        if isinstance(given, str):
+            return hashlib.sha256(given.encode()).digest()
+        with self._hashing:
+            for known, digest in self._digests:
+                if known is given:
+                    return digest
+            digest = hashlib.sha256(repr(given.shape).encode() + given.tobytes()).digest()
+            if given.ndim == 3:
+                self._digests.append((given, digest))
+            return digest
+
+    def _path(self, key: str) -> Path:
+        return self._folder / key[:2] / key
+
+
+class CacheNamespace:
+    """A memory as one of its users sees it: no other user's entries are mistaken for its own."""
+
+    def __init__(self, memory: DiskCache, identity: str) -> None:
+        """See a memory.
+
+        Args:
+            memory: shared.
+            identity: everything that decides the answers beside what is given with the question.
+        """
+        self._memory = memory
+        self._identity = identity.encode()
+        self.found = 0
+        self.asked = 0
+
+    def get_or_compute(self, kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
+        """The arrays that ``compute`` gives, read where they are known.
+
+        Args:
+            kind: names the question.
+            given: all that the answer depends on, of fixed types for a kind.
+            compute: answers it.
+        """
+        named = hashlib.sha256(b"\0".join((_FORMAT, self._identity, kind.encode())))
+        for each in given:
+            named.update(self._memory.digest(each))
+        key = named.hexdigest()
+        known = self._memory.read(key)
+        if known is not None:
+            self.found += 1
+            return known
+        self.asked += 1
+        answer = compute()
+        self._memory.write(key, answer)
+        return answer
+
+
+def fingerprint(*sources: Path) -> str:
+    """Of some files: answers of other code are other answers."""
+    digest = hashlib.sha256()
+    for path in sources:
+        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _packed(answer: Answer) -> bytes:
+    """Types and shapes as JSON after its length, then the bytes: NumPy's own header takes longer to read than these."""
+    header = json.dumps([(array.dtype.str, array.shape) for array in answer]).encode()
+    return b"".join((len(header).to_bytes(_LENGTH_BYTES, "little"), header, *(array.tobytes() for array in answer)))
+
+
+def _unpacked(content: bytes) -> Answer:
+    start = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+    arrays: list[NDArray[Any]] = []
+    for kind, shape in json.loads(content[_LENGTH_BYTES:start]):
+        array = np.frombuffer(content, kind, math.prod(shape), start).reshape(shape).copy()
+        arrays.append(array)
+        start += array.nbytes
+    return tuple(arrays)
+
+
+def _checksum(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=_CHECK_BYTES).digest()

@@ -1,0 +1,61 @@
+"""Arrays that wait on disk until they are wanted again, so that a long drive does not fill the memory."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.errors import SlamError
+
+
+class SpillFile:
+    """A nameless file among the temporary ones: it is gone with the process, however that ends."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the spool
+        self._end = 0
+
+    def put(self, array: NDArray[Any]) -> SpilledArray:
+        """Keep an array.
+
+        Raises:
+            SlamError: the disk is full.
+        """
+        content = np.ascontiguousarray(array)
+        try:
+            self._file.seek(self._end)
+            self._file.write(content.data)
+            self._file.flush()
+        except OSError as error:
+            raise SlamError(
+                f"keyframes cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
+                "make room, set TMPDIR or switch fusion off (mapping.enabled=false)"
+            ) from error
+        spilled = SpilledArray(self, self._end, content.shape, content.dtype)
+        self._end += content.nbytes
+        return spilled
+
+    def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An array that was put at ``start``."""
+        array = np.empty(shape, dtype)
+        self._file.seek(start)
+        self._file.readinto(array.data)  # type: ignore[attr-defined]
+        return array
+
+
+@dataclass(frozen=True)
+class SpilledArray:
+    """Where an array waits."""
+
+    spill_file: SpillFile
+    start: int
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def read(self) -> NDArray[Any]:
+        """The array, as it was put."""
+        return self.spill_file.read(self.start, self.shape, self.dtype)

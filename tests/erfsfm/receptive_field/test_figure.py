@@ -1,0 +1,35 @@
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.receptive_field.figure import draw_fields
+from erfsfm.receptive_field.measure import measure_fields
+from erfsfm.receptive_field.street import street_snippet
+
+SNIPPET = street_snippet(5, 64, 128)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return measure_fields(["posenet", "erf-posenet-dilated"], "paper", SNIPPET)
+
+
+def test_the_picture_shows_what_is_read(tmp_path, rows):
+    draw_fields(rows, SNIPPET[2], tmp_path / "field.png")
+    picture = cv2.imread(str(tmp_path / "field.png"))
+    assert picture.shape[1] > picture.shape[0] > 300
+    draw_fields(rows[::-1], SNIPPET[2], tmp_path / "other.png")
+    assert (cv2.imread(str(tmp_path / "other.png")) != picture).any()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["field.png", "other.png"], "nothing half written"
+
+
+@pytest.mark.parametrize("kind, start", [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_formats(tmp_path, rows, kind, start):
+    draw_fields(rows, SNIPPET[2], tmp_path / f"field.{kind}")
+    assert (tmp_path / f"field.{kind}").read_bytes().startswith(start)
+
+
+def test_a_network_that_reads_nothing(tmp_path, rows):
+    rows[0].weighed.gradient.zero_()
+    draw_fields(rows[:1], np.zeros_like(SNIPPET[2]), tmp_path / "field.png")
+    assert (tmp_path / "field.png").stat().st_size > 0

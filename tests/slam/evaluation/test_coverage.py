@@ -1,0 +1,86 @@
+"""Shares of factors within their own bounds, for noise that is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slam import se3
+from slam.errors import SlamError
+from slam.evaluation.coverage import coverage, coverage_by_source, squared_bound
+from slam.frames import LOOP_SOURCE, RelativePose
+from slam.se3 import FloatArray
+
+SIGMAS = np.repeat([0.003, 0.03], 3)
+COUNT = 3000
+
+
+def truth() -> FloatArray:
+    turns = np.tile([0.0, 0.01, 0.0], (COUNT - 1, 1))
+    return se3.chain(se3.from_rotation_vector(turns, np.tile([0.0, 0.0, 1.0], (COUNT - 1, 1))))
+
+
+def factors(student_t_dof: float) -> list[RelativePose]:
+    """One step after the other, with errors by Student's t whose standard deviations are ``SIGMAS``."""
+    rng, T = np.random.default_rng(0), truth()
+    errors = SIGMAS * rng.normal(size=(COUNT - 1, 6))
+    if not math.isinf(student_t_dof):
+        errors *= np.sqrt((student_t_dof - 2) / rng.chisquare(student_t_dof, (COUNT - 1, 1)))
+    measured = se3.invert(T[:-1]) @ T[1:] @ se3.from_rotation_vector(errors[:, :3], errors[:, 3:])
+    return [
+        RelativePose(k, k + 1, T_k, SIGMAS, "network", student_t_dof=student_t_dof) for k, T_k in enumerate(measured)
+    ]
+
+
+@pytest.mark.parametrize("student_t_dof", [math.inf, 12.0, 4.0])
+def test_noise_that_is_as_it_says_is_covered(student_t_dof: float) -> None:
+    shares = coverage(factors(student_t_dof), truth(), 1.0)
+    assert shares == {
+        "50": pytest.approx(0.5, abs=0.03),
+        "90": pytest.approx(0.9, abs=0.02),
+        "95": pytest.approx(0.95, abs=0.02),
+    }
+
+
+def test_heavy_tails_that_are_not_told_are_seen() -> None:
+    shares = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0)
+    assert shares["50"] > 0.65 and shares["95"] < 0.94
+    shares = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0)
+    assert shares["50"] < 0.3
+
+
+def test_bounds_by_hand() -> None:
+    assert squared_bound(0.95, math.inf) == pytest.approx(12.592, abs=1e-3)
+    # the 50 % quantile of F(6, 6) is 1; four of six degrees of freedom are left of the variance
+    assert squared_bound(0.5, 6.0) == pytest.approx(6 * 4 / 6)
+    assert squared_bound(0.9, 1e6) == pytest.approx(squared_bound(0.9, math.inf), rel=1e-4)
+
+
+def test_the_scale_is_known() -> None:
+    edges, metric = factors(math.inf), truth()
+    shares = coverage(edges, metric, 1.0)
+    metric[:, :3, 3] *= 4.0
+    assert coverage(edges, metric, 0.25) == shares
+    assert coverage(edges, metric, 1.0)["95"] < 0.1
+    for bad in (([], 1.0), (edges, 0.0)):
+        with pytest.raises(SlamError):
+            coverage(bad[0], metric, bad[1])
+
+
+def test_the_kind_of_factor_that_is_not_honest_is_told() -> None:
+    honest = factors(math.inf)
+    boasting = [replace(f, sigmas=f.sigmas / 10, source=LOOP_SOURCE) for f in honest[:100]]
+    kinds = coverage_by_source(honest + boasting, truth(), 1.0)
+    assert kinds.keys() == {"network", LOOP_SOURCE}
+    assert kinds[LOOP_SOURCE]["factors"] == 100 and kinds[LOOP_SOURCE]["95"] < 0.2
+    assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0)}
+
+
+def test_each_factor_is_judged_by_its_own_law() -> None:
+    normal, heavy = factors(math.inf), [replace(f, source="essential") for f in factors(4.0)]
+    together, apart = coverage(normal + heavy, truth(), 1.0), coverage_by_source(normal + heavy, truth(), 1.0)
+    for level, share in together.items():
+        assert share == pytest.approx(np.mean([kind[level] for kind in apart.values()]))

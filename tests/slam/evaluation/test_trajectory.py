@@ -1,0 +1,330 @@
+"""The object T: exact values under known motions, golden values, degenerate input, limits, evo."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from erfsfm.evaluation.pose_metrics import SnippetErrors
+from slam import se3
+from slam.errors import ConfigError, TrajectoryError
+from slam.evaluation.trajectory import ALIGNMENTS, align, evo_commands, exceeded, trajectory_metrics
+from slam.se3 import FloatArray
+from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+
+A_KEYS = {"ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"}
+SHAPE = {
+    "snippet5": {"ate_mean", "ate_std", "re_mean", "re_std", "count"},
+    "evo": {"ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference"},
+}
+
+
+def trajectory(T_world_camera: FloatArray) -> Trajectory:
+    return Trajectory(0.1 * np.arange(len(T_world_camera), dtype=np.float64), T_world_camera)
+
+
+def drive(frames: int = 400, step_m: float = 1.0) -> FloatArray:
+    """A winding, hilly drive ``(N, 4, 4)`` from the identity."""
+    k = np.arange(frames - 1)
+    turns = np.stack([0.01 * np.sin(0.07 * k), 0.03 * np.cos(0.02 * k), 0.002 * np.sin(0.11 * k)], axis=1)
+    return se3.chain(se3.from_rotation_vector(turns, np.tile([0.0, 0.0, step_m], (frames - 1, 1))))
+
+
+def line(frames: int, step_m: float = 1.0) -> FloatArray:
+    T_world_camera = np.tile(np.eye(4), (frames, 1, 1))
+    T_world_camera[:, 2, 3] = step_m * np.arange(frames)
+    return T_world_camera
+
+
+def check_shape(metrics: dict[str, Any]) -> None:
+    """Every number is there, or None with a reason; the whole is JSON without NaN."""
+    json.dumps(metrics, allow_nan=False)
+    assert set(metrics) == {"snippet5", "align", "evo"}
+    assert tuple(metrics["align"]) == ALIGNMENTS
+    records = [(metrics[name], keys) for name, keys in SHAPE.items()]
+    for record, keys in records + [(record, A_KEYS) for record in metrics["align"].values()]:
+        assert {key for key in record if not key.endswith("_reason")} == keys
+        for key in keys:
+            assert (record[key] is None) == bool(record.get(f"{key}_reason"))
+
+
+def ate(metrics: dict[str, Any]) -> dict[str, float | None]:
+    return {name: record["ate_rmse_m"] for name, record in metrics["align"].items()}
+
+
+def test_a_perfect_estimate() -> None:
+    metrics = trajectory_metrics(trajectory(drive()), trajectory(drive()))
+    check_shape(metrics)
+    for record in metrics["align"].values():
+        assert record["scale"] == pytest.approx(1.0)
+        assert {key: record[key] for key in A_KEYS - {"scale"}} == pytest.approx(
+            dict.fromkeys(A_KEYS - {"scale"}, 0.0), abs=1e-6
+        )
+    assert metrics["snippet5"]["count"] == 396
+    assert metrics["evo"]["difference"] < 1e-6
+
+
+def test_a_known_similarity_under_each_alignment() -> None:
+    """The estimate is the truth, 2.5 times too small, from a world that is turned and moved."""
+    truth = drive()
+    turn, move = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([5.0, -6.0, 7.0])
+    estimate = se3.Similarity(1 / 2.5, turn, move).apply_to_poses(truth)
+    metrics = trajectory_metrics(trajectory(estimate), trajectory(truth))
+    check_shape(metrics)
+    positions = truth[:, :3, 3]
+    as_written = np.linalg.norm(estimate[:, :3, 3] - positions, axis=1)
+    spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+    expected = {
+        "none": math.sqrt((as_written**2).mean()),
+        "first": 0.6 * math.sqrt((positions**2).sum(axis=1).mean()),
+        "scale": 0.0,
+        "6dof": 0.6 * math.sqrt((spread**2).mean()),
+        "7dof": 0.0,
+    }
+    assert ate(metrics) == pytest.approx(expected, abs=1e-10)
+    for name, record in metrics["align"].items():
+        scaled = name in ("scale", "7dof")
+        assert record["scale"] == pytest.approx(2.5 if scaled else 1.0, rel=1e-12)
+        assert record["rpe_trans_m"] == pytest.approx(0.0 if scaled else 0.6, abs=1e-10)
+        assert record["rpe_rot_deg"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["snippet5"]["ate_mean"] == pytest.approx(0.0, abs=1e-12)
+    assert metrics["evo"]["difference"] < 1e-6
+
+
+def test_a_noisy_estimate_agrees_with_evo() -> None:
+    rng = np.random.default_rng(7)
+    noise = se3.from_rotation_vector(rng.normal(scale=0.02, size=(400, 3)), rng.normal(scale=0.5, size=(400, 3)))
+    metrics = trajectory_metrics(trajectory(drive() @ noise), trajectory(drive()))
+    assert 0.5 < metrics["evo"]["ape_rmse_m_7dof"] < 1.0
+    assert metrics["evo"]["ape_rmse_m_7dof"] == pytest.approx(metrics["align"]["7dof"]["ate_rmse_m"], abs=1e-9)
+    assert metrics["evo"]["difference"] < 1e-6
+
+
+def test_hand_values_of_segments_and_steps() -> None:
+    """A straight line whose estimate is 2 % long and turns 0.001 rad a metre about its own axis of motion."""
+    truth, estimate = line(251), line(251, 1.02)
+    estimate[:, :3, :3] = Rotation.from_rotvec(np.outer(0.001 * np.arange(251), [0.0, 0.0, 1.0])).as_matrix()
+    record = trajectory_metrics(trajectory(estimate), trajectory(truth))["align"]["first"]
+    # A segment of L m ends at the first frame beyond: L + 1 steps. Starts 0 to 140 hold 100 m, 0 to 40 200 m.
+    share = (15 * 101 / 100 + 5 * 201 / 200) / 20
+    assert record["t_rel_percent"] == pytest.approx(2.0 * share, rel=1e-9)
+    assert record["r_rel_deg_per_100m"] == pytest.approx(np.rad2deg(0.1) * share, rel=1e-9)
+    assert record["rpe_trans_m"] == pytest.approx(0.02, rel=1e-9)
+    assert record["rpe_rot_deg"] == pytest.approx(np.rad2deg(0.001), rel=1e-9)
+
+
+@pytest.mark.parametrize(("frames", "fits"), [(100, False), (101, False), (103, True)])
+def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
+    record = trajectory_metrics(trajectory(line(frames)), trajectory(line(frames)))["align"]["none"]
+    assert (record["t_rel_percent"] is not None) == fits
+    if not fits:
+        assert record["t_rel_percent_reason"] == f"no segment of 100 m fits into the path of {frames - 1}.0 m"
+        assert record["r_rel_deg_per_100m"] is None
+
+
+def test_nothing_is_known_without_a_reference() -> None:
+    metrics = trajectory_metrics(trajectory(drive(10)), None)
+    check_shape(metrics)
+    assert metrics["snippet5"]["count_reason"] == "there is no reference trajectory"
+    assert set(ate(metrics).values()) == {None}
+    given = trajectory_metrics(trajectory(drive(10)), None, SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
+    assert given["snippet5"] == {"ate_mean": 0.1, "ate_std": 0.2, "re_mean": 0.3, "re_std": 0.4, "count": 5}
+
+
+def test_direct_snippets_take_the_place_of_cut_ones() -> None:
+    metrics = trajectory_metrics(trajectory(drive(10)), trajectory(drive(10)), SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
+    assert metrics["snippet5"]["ate_mean"] == 0.1
+
+
+def test_an_estimate_that_stands_still_has_no_scale() -> None:
+    metrics = trajectory_metrics(trajectory(np.tile(drive(3)[2], (300, 1, 1))), trajectory(drive(300)))
+    check_shape(metrics)
+    for name in ("scale", "7dof"):
+        assert metrics["align"][name]["scale"] is None
+        assert metrics["align"][name]["rpe_trans_m"] == pytest.approx(1.0)
+        assert metrics["align"][name]["t_rel_percent"] > 50
+    assert metrics["snippet5"]["ate_mean"] == pytest.approx(math.sqrt(1 + 4 + 9 + 16) / 5, rel=0.01)
+    assert "evo refuses" in metrics["evo"]["difference_reason"]
+
+
+def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
+    metrics = trajectory_metrics(trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))))
+    check_shape(metrics)
+    errors = ate(metrics)
+    assert errors["scale"] is None
+    assert errors["7dof"] is None
+    assert (errors["first"] or 0.0) > 1.0
+    assert metrics["align"]["first"]["rpe_trans_m"] == pytest.approx(1.0)
+
+
+def test_a_straight_line_is_measured_though_evo_refuses_it() -> None:
+    metrics = trajectory_metrics(trajectory(line(120, 0.5)), trajectory(line(120)))
+    check_shape(metrics)
+    assert metrics["align"]["7dof"]["scale"] == pytest.approx(2.0)
+    assert metrics["align"]["7dof"]["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["align"]["7dof"]["t_rel_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["evo"]["ape_rmse_m_7dof"] is None
+
+
+@pytest.mark.parametrize(("frames", "known"), [(1, {"none"}), (2, {"none", "first", "scale", "6dof"})])
+def test_one_and_two_frames(frames: int, known: set[str]) -> None:
+    metrics = trajectory_metrics(trajectory(line(frames)), trajectory(line(frames, 2.0)))
+    check_shape(metrics)
+    assert {name for name, value in ate(metrics).items() if value is not None} == known
+    assert metrics["snippet5"]["count"] == 0
+    assert metrics["snippet5"]["ate_mean_reason"] == "a snippet needs 5 frames"
+
+
+def test_a_lost_estimate_is_no_number() -> None:
+    lost = drive(20)
+    lost[11, 0, 3] = np.nan
+    metrics = trajectory_metrics(trajectory(lost), trajectory(drive(20)))
+    check_shape(metrics)
+    assert "not finite" in metrics["align"]["none"]["ate_rmse_m_reason"]
+
+
+def test_overflow_becomes_a_reason() -> None:
+    huge = drive(20)
+    huge[:, :3, 3] *= 1e200
+    with np.errstate(over="ignore", invalid="ignore"):
+        check_shape(trajectory_metrics(trajectory(huge), trajectory(drive(20))))
+
+
+def test_lengths_must_agree() -> None:
+    with pytest.raises(TrajectoryError, match="19 poses and the reference 20"):
+        trajectory_metrics(trajectory(drive(19)), trajectory(drive(20)))
+
+
+def test_align_gives_trajectories_to_draw() -> None:
+    truth = drive(50)
+    estimate = se3.Similarity(0.1, np.eye(3), np.ones(3)).apply_to_poses(truth)
+    aligned = align(estimate, truth, "7dof")
+    np.testing.assert_allclose(aligned.T_world_estimate, truth, atol=1e-10)
+    assert aligned.scale == pytest.approx(10.0)
+
+
+def test_our_numbers_stand_without_evo(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "evo", None)
+    metrics = trajectory_metrics(trajectory(drive(20)), trajectory(drive(20)))
+    check_shape(metrics)
+    assert "evo cannot be imported" in metrics["evo"]["difference_reason"]
+    assert metrics["align"]["7dof"]["ate_rmse_m"] is not None
+
+
+def test_limits() -> None:
+    rough = drive(60)
+    rough[::2, 1, 3] += 0.2
+    metrics = trajectory_metrics(trajectory(rough), trajectory(drive(60)))
+    assert (
+        exceeded(metrics, ["ate_rmse_m=1", "align.none.ate_rmse_m = 0.5", "snippet5.ate_mean=1", "evo.difference=1e-6"])
+        == []
+    )
+    lines = exceeded(metrics, ["ate_rmse_m=0.01", "align.first.rpe_rot_deg=1", "t_rel_percent=5"])
+    assert len(lines) == 2
+    assert lines[0].startswith("align.7dof.ate_rmse_m is 0.09")
+    assert lines[0].endswith("over the limit 0.01")
+    assert lines[1].startswith("align.7dof.t_rel_percent is not known (no segment of 100 m")
+
+
+@pytest.mark.parametrize("limit", ["ate_rmse_m", "ate_rmse_m=", "=3", "ate_rmse_m=few", "ate_rmse_m=nan"])
+def test_malformed_limits(limit: str) -> None:
+    with pytest.raises(ConfigError, match="METRIC=VALUE"):
+        exceeded({}, [limit])
+
+
+@pytest.mark.parametrize("limit", ["ate=1", "align.8dof.ate_rmse_m=1", "align.7dof=1", "snippet5.ate_rmse_m=1"])
+def test_unknown_limits(limit: str) -> None:
+    with pytest.raises(ConfigError, match=f"no metric '{limit[:-2]}'.*ate_rmse_m"):
+        exceeded({}, [limit])
+
+
+def test_evo_commands(tmp_path: Path) -> None:
+    kitti, tum = tmp_path / "my kitti.txt", tmp_path / "tum.txt"
+    write_kitti(kitti, trajectory(drive(20)))
+    write_tum(tum, trajectory(drive(20)))
+    ape, rpe, rotation = evo_commands(kitti, kitti)
+    assert ape == f"evo_ape kitti '{kitti}' '{kitti}' --align --correct_scale"
+    assert rpe.endswith("--delta 1 --delta_unit f --pose_relation trans_part")
+    assert rotation.endswith("--pose_relation angle_deg")
+    assert evo_commands(tum, tum, "tum")[0] == f"evo_ape tum {tum} {tum} --align --correct_scale --t_max_diff 0.05"
+    assert evo_commands(kitti, tum) == []
+
+
+def test_evo_leaves_nothing_at_home(tmp_path: Path) -> None:
+    program = (
+        "import sys, numpy as np\n"
+        "from slam.evaluation.trajectory import trajectory_metrics\n"
+        "from slam.trajectory import Trajectory\n"
+        "assert 'evo' not in sys.modules and 'torch' not in sys.modules\n"
+        "T = np.tile(np.eye(4), (9, 1, 1)); T[:, :3, 3] = np.random.rand(9, 3)\n"
+        "t = Trajectory(np.arange(9.0), T)\n"
+        "assert trajectory_metrics(t, t)['evo']['difference'] < 1e-6\n"
+        "assert 'evo' in sys.modules\n"
+    )
+    environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("sequence", "alignment", "t_rel", "r_rel", "ate_m", "rpe_m", "rpe_deg"),
+    [
+        ("09", "6dof", 2.607, 0.288, 10.880, 0.056, 0.037),
+        ("09", "7dof", 2.528, 0.288, 10.729, 0.054, 0.037),
+        ("10", "6dof", 2.293, 0.369, 3.721, 0.047, 0.043),
+        ("10", "7dof", 2.221, 0.369, 3.356, 0.047, 0.043),
+    ],
+)
+def test_golden_numbers(
+    golden: dict[str, Any],
+    sequence: str,
+    alignment: str,
+    t_rel: float,
+    r_rel: float,
+    ate_m: float,
+    rpe_m: float,
+    rpe_deg: float,
+) -> None:
+    """DF-VO's stereo-trained trajectories, as kitti-odom-eval scores them, to every printed digit."""
+    record = golden[sequence]["align"][alignment]
+    rounded = {key: round(record[key], 3) for key in A_KEYS - {"scale"}}
+    assert rounded == {
+        "t_rel_percent": t_rel,
+        "r_rel_deg_per_100m": r_rel,
+        "ate_rmse_m": ate_m,
+        "rpe_trans_m": rpe_m,
+        "rpe_rot_deg": rpe_deg,
+    }
+    assert golden[sequence]["evo"]["difference"] < 1e-6
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("sequence", "expected"), [("09", (0.0142, 0.0077, 0.0007, 1587)), ("10", (0.0120, 0.0086, 0.0008, 1197))]
+)
+def test_golden_snippets(golden: dict[str, Any], sequence: str, expected: tuple[float, ...]) -> None:
+    snippets = golden[sequence]["snippet5"]
+    found = [round(snippets[key], 4) for key in ("ate_mean", "ate_std", "re_mean", "count")]
+    assert tuple(found) == expected
+
+
+@pytest.fixture(scope="module")
+def golden(data_root: Path) -> dict[str, Any]:
+    """T of the public trajectories of sequences 09 and 10."""
+    folder = data_root / "golden"
+    return {
+        name: trajectory_metrics(
+            read_trajectory(folder / f"dfvo_stereo_{name}.txt"), read_trajectory(folder / f"reference_{name}.txt")
+        )
+        for name in ("09", "10")
+    }

@@ -1,0 +1,72 @@
+"""A COLMAP model read back puts every point on the pixel where our camera sees it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import RunError
+from slam.formats.colmap import write_colmap
+from slam.frames import Intrinsics
+from slam.se3 import FloatArray, apply, chain, from_rotation_vector, invert
+
+CAMERA = Intrinsics(416, 128, 230.5, 231.25, 207.0, 63.5)
+POINTS = np.array([[1.0, 0.5, 12.0], [-3.0, 1.5, 20.0], [0.25, -2.0, 9.0]])
+COLOURS = np.array([[1, 2, 3], [255, 0, 128], [7, 7, 7]], np.uint8)
+
+
+def drive() -> FloatArray:
+    turn = np.tile([0.01, 0.05, -0.02], (4, 1))
+    return chain(from_rotation_vector(turn, np.tile([0.1, 0.0, 1.0], (4, 1))))
+
+
+def rows(path: Path) -> list[list[str]]:
+    """Lines without comments; an empty one stays, as images.txt needs it."""
+    return [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def rotation(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
+    """The matrix of a unit quaternion, written out as COLMAP's documentation has it."""
+    return np.array(
+        [
+            [1 - 2 * (qy**2 + qz**2), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)],
+            [2 * (qx * qy + qw * qz), 1 - 2 * (qx**2 + qz**2), 2 * (qy * qz - qw * qx)],
+            [2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx**2 + qy**2)],
+        ]
+    )
+
+
+def test_a_model_reads_back(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS)
+    folder = tmp_path / "new" / "model"
+    assert {path.name for path in folder.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
+    ((camera_id, model, width, height, *pinhole),) = rows(folder / "cameras.txt")
+    assert (camera_id, model, width, height) == ("1", "PINHOLE", "416", "128")
+    fx, fy, cx, cy = map(float, pinhole)
+    points = np.array(rows(folder / "points3D.txt"), dtype=float)
+    np.testing.assert_array_equal(points[:, 0], [1, 2, 3])
+    np.testing.assert_allclose(points[:, 1:4], POINTS, rtol=1e-5)
+    np.testing.assert_array_equal(points[:, 4:7], COLOURS)
+    images = rows(folder / "images.txt")
+    assert len(images) == 10 and all(line == [] for line in images[1::2])
+    for k, (image_id, *pose, camera, name) in enumerate(images[::2]):
+        assert (image_id, camera, name) == (str(k + 1), "1", f"{k:06d}.png")
+        numbers = np.array(pose, dtype=float)
+        seen = points[:, 1:4] @ rotation(*numbers[:4]).T + numbers[4:]
+        u, v = fx * seen[:, 0] / seen[:, 2] + cx, fy * seen[:, 1] / seen[:, 2] + cy
+        ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
+        # their pixel (0.5, 0.5) is our (0, 0)
+        np.testing.assert_allclose(np.stack([u, v], axis=1) - 0.5, ours[:, :2] / ours[:, 2:], atol=1e-2)
+
+
+def test_without_points_the_model_is_whole(tmp_path: Path) -> None:
+    write_colmap(tmp_path, CAMERA, drive(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    assert rows(tmp_path / "points3D.txt") == [] and len(rows(tmp_path / "images.txt")) == 10
+
+
+def test_a_place_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="cannot be written"):
+        write_colmap(tmp_path / "file" / "model", CAMERA, drive(), POINTS, COLOURS)

@@ -1,0 +1,118 @@
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from slam import se3
+from slam.config import RoadConfig
+from slam.frames import Frame, Intrinsics
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.road_homography import RoadHomography, RoadStep
+
+CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
+CONFIG = RoadConfig()
+HEIGHT_M = 1.65
+V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
+RAYS = np.stack([(U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy, np.ones(U.shape)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    layers = [gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (2, 6)]
+    noise = sum(layer / layer.std() for layer in layers)
+    return np.clip(120 + 10 * noise, 0, 255).astype(np.float32)
+
+
+def render(T_road_camera: np.ndarray, texture: np.ndarray, index: int, car_ahead: bool = False) -> Frame:
+    """A road ``HEIGHT_M`` below the road frame's origin under an even sky."""
+    rays = RAYS @ T_road_camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = (HEIGHT_M - T_road_camera[1, 3]) / rays[..., 1]
+    ground = (reach > 0) & (reach < 80)
+    points = T_road_camera[:3, 3] + rays * np.where(ground, reach, 0.0)[..., None]
+    a, b = (np.float32(40.0) * points[..., axis].astype(np.float32) for axis in (0, 2))
+    grey = np.where(ground, cv2.remap(texture, a % 1023, b % 1023, cv2.INTER_LINEAR), 200.0)
+    if car_ahead:
+        grey[100:140, 270:340] = 90.0  # it drives as fast as the camera
+    return Frame(index, 0.1 * index, np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2))
+
+
+def behind_a_car(texture: np.ndarray, rows: int) -> list[Frame]:
+    """A step of 1 m; all that the camera shows in so many rows below the horizon drives as fast as it does."""
+    car = np.random.default_rng(0).integers(0, 255, (rows, 300, 3), np.uint8)
+    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])), texture, k) for k in range(2)]
+    for frame in frames:
+        frame.image[92 : 92 + rows, 150:450] = cv2.GaussianBlur(car, (0, 0), 2.0)
+    return frames
+
+
+def pitched(pitch_deg: float) -> np.ndarray:
+    return se3.from_rotation_vector(np.deg2rad([pitch_deg, 0.0, 0.0]), np.zeros(3))
+
+
+def measure(
+    texture, step: np.ndarray, pitch_deg: float = 0.0, config=CONFIG, car_ahead=False
+) -> RoadStep | MeasurementFailure:
+    """One step of a camera that looks down by ``pitch_deg``; the aligner is told the direction only."""
+    T_body_camera = pitched(-pitch_deg)
+    previous = render(T_body_camera, texture, 0, car_ahead)
+    current = render(step @ T_body_camera, texture, 1, car_ahead)
+    T_previous_current = se3.invert(T_body_camera) @ step @ T_body_camera
+    T_previous_current[:3, 3] *= 7.0
+    return RoadHomography(config, CAMERA).measure(previous, current, T_previous_current)
+
+
+@pytest.mark.parametrize("length_m", [0.15, 0.6, 1.3, 2.4])
+@pytest.mark.parametrize(("turn_deg", "pitch_deg"), [(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)])
+def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch_deg):
+    step = se3.from_rotation_vector(np.deg2rad([0.0, turn_deg, 0.0]), np.array([0.0, 0.0, length_m]))
+    road = measure(texture, step, pitch_deg)
+    assert isinstance(road, RoadStep)
+    assert road.length_heights * HEIGHT_M == pytest.approx(length_m, rel=0.02)
+    assert np.rad2deg(np.arctan2(road.normal[2], road.normal[1])) == pytest.approx(pitch_deg, abs=0.3)
+    assert CONFIG.relative_sigma <= road.relative_sigma < 2 * CONFIG.relative_sigma
+
+
+def test_a_car_ahead_does_not_shorten_the_step(texture):
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    road = measure(texture, step, car_ahead=True)
+    assert isinstance(road, RoadStep)
+    assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_car_that_covers_the_road_is_refused(texture):
+    """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    refusal = RoadHomography(CONFIG, CAMERA).measure(*behind_a_car(texture, rows=90), step)
+    assert isinstance(refusal, MeasurementFailure) and "stands still" in refusal.reason
+
+
+def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    frames = behind_a_car(texture, rows=76)
+    road = RoadHomography(CONFIG, CAMERA).measure(*frames, step)
+    assert isinstance(road, RoadStep)
+    assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
+    assert road.relative_sigma >= CONFIG.near_relative_sigma
+    long_only = RoadConfig(near_heights=0.1)
+    assert isinstance(RoadHomography(long_only, CAMERA).measure(*frames, step), MeasurementFailure)
+
+
+def test_what_is_no_road_is_refused_with_a_reason(texture):
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    rng = np.random.default_rng(0)
+    noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
+    refusal = RoadHomography(CONFIG, CAMERA).measure(*noise, step)
+    assert isinstance(refusal, MeasurementFailure) and "looks different" in refusal.reason
+    sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
+    refusal = RoadHomography(CONFIG, sky).measure(*noise, step)
+    assert isinstance(refusal, MeasurementFailure) and "too little of the road" in refusal.reason
+    refusal = measure(texture, step, pitch_deg=3.0, config=RoadConfig(max_tilt_deg=0.01, tilt_sigma_deg=5.0))
+    assert isinstance(refusal, MeasurementFailure) and "tilted" in refusal.reason
+
+
+def test_the_answer_is_the_same_every_time(texture):
+    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    one, other = measure(texture, step), measure(texture, step)
+    assert one.length_heights == other.length_heights

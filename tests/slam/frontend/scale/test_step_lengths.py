@@ -1,0 +1,184 @@
+import numpy as np
+import pytest
+from scipy.sparse import csc_array
+
+from slam.config import LengthConfig
+from slam.frontend.scale.step_lengths import StepEvidence, length_ratio, marginals, solve_lengths
+from slam.frontend.visual.epipolar import TriangulatedPoints
+
+CONFIG = LengthConfig()
+STEPS = 200
+TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
+
+
+def evidence(**measured: np.ndarray) -> StepEvidence:
+    empty = {name: np.full(STEPS, np.nan) for name in ("ratio", "ratio_sigma", "absolute", "absolute_sigma", "learned")}
+    return StepEvidence(**(empty | measured))
+
+
+def ratios(noise: float = 0.0) -> dict[str, np.ndarray]:
+    values = np.full(STEPS, np.nan)
+    values[1:] = np.diff(np.log(TRUE)) + noise * np.random.default_rng(0).normal(size=STEPS - 1)
+    return {"ratio": values, "ratio_sigma": np.where(np.isfinite(values), 0.001, np.nan)}
+
+
+def noisy(sigma: float, seed: int = 1) -> np.ndarray:
+    return np.log(TRUE) + sigma * np.random.default_rng(seed).normal(size=STEPS)
+
+
+def test_triangulation_carries_a_rare_road_through_the_drive():
+    """Where the road is seen in one step of forty and learned depth is twice too long, lengths are still right."""
+    road = np.where(np.arange(STEPS) % 40 == 20, np.log(TRUE), np.nan)
+    measured = evidence(
+        absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.05) + np.log(2.0), **ratios(0.003)
+    )
+    solved = solve_lengths(measured, CONFIG)
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
+    np.testing.assert_allclose(solved.unit_correction, 0.5, rtol=0.1)
+
+
+def test_a_noisy_road_is_better_with_triangulation_than_without():
+    absolute = {"absolute": noisy(0.05), "absolute_sigma": np.full(STEPS, 0.06)}
+    alone = solve_lengths(evidence(**absolute), CONFIG).length
+    together = solve_lengths(evidence(**absolute, **ratios(0.003)), CONFIG).length
+    errors = [np.sqrt(np.mean(np.log(lengths / TRUE) ** 2)) for lengths in (alone, together)]
+    assert errors[0] > 0.03
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_a_quarter_of_wrong_roads_does_not_matter():
+    road = noisy(0.03)
+    road[::4] += np.log(1.6)
+    measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), **ratios(0.003))
+    np.testing.assert_allclose(solve_lengths(measured, CONFIG).length, TRUE, rtol=0.05)
+
+
+def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
+    road = noisy(0.03)
+    road[: STEPS // 2] += np.log(0.1)
+    measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.1, seed=2), **ratios(0.003))
+    solved = solve_lengths(measured.without_contradicted(CONFIG.max_contradiction), CONFIG)
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.08)
+    assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
+
+
+def test_learned_depth_bridges_a_gap_in_the_unit_that_it_was_seen_to_have():
+    """Steps 80 to 119 have neither road nor ratio, and learned lengths are 30 % short all along."""
+    gap = (np.arange(STEPS) >= 80) & (np.arange(STEPS) < 120)
+    tied = ratios()
+    tied["ratio"] = np.where(gap | np.roll(gap, 1), np.nan, tied["ratio"])
+    road = np.where(gap, np.nan, np.log(TRUE))
+    learned = np.log(0.7 * TRUE)
+    solved = solve_lengths(
+        evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied), CONFIG
+    )
+    np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
+    believed = solve_lengths(evidence(learned=learned), CONFIG)
+    np.testing.assert_allclose(believed.length, 0.7 * TRUE, rtol=1e-6)
+    np.testing.assert_allclose(believed.unit_correction, 1.0, atol=1e-6)
+
+
+def test_steps_that_nothing_measured_have_no_length():
+    learned = np.where(np.arange(STEPS) < 50, np.nan, np.log(TRUE))
+    solved = solve_lengths(evidence(learned=learned), CONFIG)
+    assert np.isnan(solved.length[:50]).all() and np.isfinite(solved.length[50:]).all()
+    nothing = solve_lengths(StepEvidence.empty(5), CONFIG)
+    assert np.isnan(nothing.length).all()
+    np.testing.assert_array_equal(nothing.unit_correction, 1.0)
+
+
+def triangulated(track_ids: np.ndarray, previous: np.ndarray, current: np.ndarray) -> TriangulatedPoints:
+    return TriangulatedPoints(track_ids, previous, current, np.full(len(track_ids), 0.02))
+
+
+def test_ratio_of_lengths_from_common_points():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(4.0, 20.0, 60)  # metres, in the camera between
+    track_ids = np.arange(60)
+    earlier = triangulated(track_ids, depth + 2.0, depth / 2.0)  # a step of 2 m
+    wrong = np.where(track_ids < 10, 3.0, 1.0)
+    later = triangulated(track_ids[::-1] + 5, depth[::-1] / 1.5, depth[::-1])
+    assert length_ratio(earlier, triangulated(track_ids + 100, depth, depth)) is None
+    shifted = triangulated(track_ids, wrong * depth / 1.5, depth)  # a step of 1.5 m, ten points on a car
+    ratio = length_ratio(earlier, shifted)
+    assert ratio is not None
+    assert ratio[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
+    again = length_ratio(triangulated(track_ids + 5, depth + 2.0, depth / 2.0), later)
+    assert again is not None and again[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
+
+
+def test_sigmas_are_those_of_the_whole_system() -> None:
+    """The chains of small complements say what inverting everything says."""
+    rng = np.random.default_rng(0)
+    steps = 7
+    pairs = [(k, steps + k) for k in range(steps)]
+    pairs += [(first + k, first + k + 1) for first in (0, steps) for k in range(steps - 1)]
+    ties = np.zeros((len(pairs), 2 * steps))
+    for row, pair in zip(ties, pairs):
+        row[list(pair)] = rng.normal(size=2)
+    A = np.concatenate([np.eye(2 * steps), ties])
+    information = A.T @ A
+    left = np.linalg.inv(information)[:steps, :steps]
+    expected = np.sqrt(np.diag(left))
+    alike = np.clip(np.diag(left, 1) / (expected[1:] * expected[:-1]), 0.0, 1.0)
+    banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))
+    assert (information[(banded != 0) & (banded != 1) & (banded != steps)] == 0).all()
+    sigmas, with_neighbours = marginals(csc_array(information), steps)
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
+    both_sides = 0.5 * (np.append(alike[0], alike) + np.append(alike, alike[-1]))
+    np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
+
+
+def test_lengths_tied_to_their_neighbours_add_up_as_they_say() -> None:
+    """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up to what the lengths' errors do."""
+    middle = slice(80, 120)
+    alone, together = [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        chained = np.full(STEPS, np.nan)
+        chained[1:] = np.diff(np.log(TRUE)) + 0.02 * rng.normal(size=STEPS - 1)
+        measured = evidence(
+            absolute=noisy(0.06, seed=300 + seed),
+            absolute_sigma=np.full(STEPS, 0.06),
+            ratio=chained,
+            ratio_sigma=np.full(STEPS, 0.02 / CONFIG.ratio_widening),
+        )
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9, correlated_widening=1.0))
+        summed = np.log(solved.length / TRUE)[middle].sum()
+        alone.append(summed / np.linalg.norm(solved.relative_sigma[middle]))
+        together.append(summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
+    assert 0.75 < np.sqrt(np.square(together).mean()) < 1.3
+    assert np.sqrt(np.square(alone).mean()) > 1.5
+
+
+def test_sigmas_say_how_far_lengths_err() -> None:
+    """Also in the middle of a gap of the road, where only triangulation and learned depth go on."""
+    errors, sigmas = [], []
+    for seed in range(20):
+        road = noisy(0.06, seed=100 + seed)
+        road[60:100] = np.nan
+        rng = np.random.default_rng(seed)
+        chained = np.full(STEPS, np.nan)
+        chained[1:] = np.diff(np.log(TRUE)) + 0.01 * rng.normal(size=STEPS - 1)
+        measured = evidence(
+            absolute=road,
+            absolute_sigma=np.full(STEPS, 0.06),
+            ratio=chained,
+            ratio_sigma=np.full(STEPS, 0.01 / CONFIG.ratio_widening),
+            learned=noisy(0.1, seed=200 + seed),
+        )
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
+        errors.append(np.log(solved.length / TRUE))
+        sigmas.append(solved.relative_sigma)
+    ratio = np.abs(errors) / np.array(sigmas)
+    assert 0.75 < np.sqrt((ratio**2).mean()) < 1.25
+    assert 0.75 < np.sqrt((ratio[:, 70:90] ** 2).mean()) < 1.25
+    assert np.mean(sigmas, axis=0)[80] > 1.5 * np.mean(sigmas, axis=0)[30]
+
+
+def test_a_step_that_nothing_measured_has_no_sigma() -> None:
+    road = noisy(0.06)
+    road[50:60] = np.nan
+    solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06)), CONFIG)
+    np.testing.assert_array_equal(np.isnan(solved.relative_sigma), np.isnan(solved.length))
+    assert np.isnan(solved.length[50:60]).all() and np.isfinite(solved.length[:50]).all()

@@ -1,0 +1,261 @@
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from slam import se3
+from slam.config import GeometryConfig
+from slam.frames import Frame, Intrinsics, RelativePose
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.step_lengths import length_ratio
+from slam.frontend.visual.odometry import Motion, VisualOdometry
+from slam.frontend.visual.step_noise import StepNoise
+
+CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
+CONFIG = GeometryConfig()
+CALM = StepNoise(np.zeros(3), np.zeros(3))
+UNIT = 0.3  # unscaled lengths per metre
+V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
+RAYS = np.stack([(U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy, np.ones(U.shape)], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def texture() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    layers = [gaussian_filter(rng.normal(size=(1024, 1024)), sigma, mode="wrap") for sigma in (3, 8)]
+    noise = sum(layer / layer.std() for layer in layers)
+    return np.clip(128 + 45 * noise, 0, 255).astype(np.float32)
+
+
+def render(T_world_camera: np.ndarray, texture: np.ndarray, index: int = 0) -> tuple[Frame, np.ndarray]:
+    """A road, two walls and an end wall, all textured; image and true z-depth."""
+    rays = RAYS @ T_world_camera[:3, :3].T
+    centre = T_world_camera[:3, 3]
+    planes = [(1, 1.65), (0, -6.0), (0, 7.0), (2, 45.0), (1, -9.0)]  # axis, where
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.stack([(where - centre[axis]) / rays[..., axis] for axis, where in planes])
+    reach = np.where(reach > 0, reach, np.inf)
+    nearest, depth = reach.argmin(axis=0), reach.min(axis=0)
+    points = centre + rays * depth[..., None]
+    grey = np.zeros(depth.shape, np.float32)
+    for k, (axis, _) in enumerate(planes):
+        a, b = (np.float32(25.0) * points[..., other].astype(np.float32) for other in range(3) if other != axis)
+        sampled = cv2.remap(texture, (a + 100 * k) % 1023, b % 1023, cv2.INTER_LINEAR)
+        grey = np.where(nearest == k, sampled, grey)
+    image = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    return Frame(index, 0.1 * index, image), depth.astype(np.float32)
+
+
+def measure(T_previous_current, texture, depth_error=lambda depth: depth, config=CONFIG):
+    start = se3.from_rotation_vector(np.array([0.01, -0.02, 0.0]), np.array([0.3, 0.1, 2.0]))
+    previous, depth = render(start, texture, 4)
+    current, _ = render(start @ T_previous_current, texture, 5)
+    odometry = VisualOdometry(config, CAMERA)
+    return odometry.measure(previous, current, depth_error(UNIT * depth), 1.65 * UNIT)
+
+
+def pose_of(motion: Motion | MeasurementFailure) -> RelativePose:
+    assert isinstance(motion, Motion)
+    return motion.relative_pose
+
+
+def errors(measured: RelativePose, truth: np.ndarray) -> tuple[float, float, float]:
+    """Rotation and direction in degrees, length as a share."""
+    rotation = float(se3.rotation_angle(measured.T_from_to[:3, :3].T @ truth[:3, :3]))
+    a, b = measured.T_from_to[:3, 3] / UNIT, truth[:3, 3]
+    length = np.linalg.norm(a) / np.linalg.norm(b) - 1
+    cosine = a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+    return np.rad2deg(rotation), np.rad2deg(np.arccos(np.clip(cosine, -1, 1))), float(length)
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "step"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+        ((0.2, 2.0, -0.3), (0.05, 0.01, 1.2)),
+        ((0.0, -3.0, 0.0), (0.02, 0.0, 0.5)),
+        ((0.1, 0.5, 0.2), (0.0, 0.0, -0.8)),
+        ((0.0, 0.0, 0.0), (0.6, 0.0, 0.1)),
+    ],
+)
+def test_motion_is_recovered(texture, turn_deg, step):
+    truth = se3.from_rotation_vector(np.deg2rad(turn_deg), np.array(step))
+    measured = pose_of(measure(truth, texture))
+    assert (measured.from_index, measured.to_index, measured.source) == (4, 5, "essential")
+    rotation_deg, direction_deg, length = errors(measured, truth)
+    assert rotation_deg < 0.05
+    assert direction_deg < 1.0
+    assert abs(length) < 0.02
+
+
+def test_sigmas_are_tight_in_rotation_and_direction_and_loose_in_length(texture):
+    measured = pose_of(measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture))
+    rotation_deg, (x, y, z) = np.rad2deg(measured.sigmas[:3]), measured.sigmas[3:] / UNIT
+    assert (rotation_deg >= CONFIG.rotation_floor_deg).all()
+    assert (rotation_deg < 0.1).all()
+    assert max(x, y) < 0.02
+    assert 0.05 <= z < 0.15
+
+
+def test_length_withstands_wrong_depth_and_a_driving_car(texture):
+    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+
+    def spoil(depth):
+        rng = np.random.default_rng(0)
+        depth = depth * (1 + 0.1 * rng.normal(size=depth.shape)).astype(np.float32)
+        depth[60:130, 250:330] *= 4.0
+        return depth
+
+    measured = pose_of(measure(truth, texture, spoil))
+    rotation_deg, _, length = errors(measured, truth)
+    assert rotation_deg < 0.05
+    assert abs(length) < 0.03
+
+
+def test_pure_rotation_is_left_to_points(texture):
+    truth = se3.from_rotation_vector(np.deg2rad([0.1, 2.0, 0.1]), np.array([0.0, 0.0, 0.01]))
+    measured = pose_of(measure(truth, texture))
+    assert measured.source == "pnp"
+    assert errors(measured, truth)[0] < 0.05
+    assert np.linalg.norm(measured.T_from_to[:3, 3] - UNIT * truth[:3, 3]) < 0.02 * UNIT
+    assert (measured.sigmas > 0).all()
+
+
+def test_standing_still_is_the_identity(texture):
+    measured = pose_of(measure(np.eye(4), texture))
+    assert measured.source == "still"
+    np.testing.assert_array_equal(measured.T_from_to, np.eye(4))
+    assert (measured.sigmas[3:] < 0.05 * UNIT).all()
+    assert (measured.sigmas > 0).all()
+
+
+def test_refusals_carry_a_reason(texture):
+    black = Frame(0, 0.0, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    refusal = VisualOdometry(CONFIG, CAMERA).measure(black, black, np.ones(U.shape, np.float32))
+    assert isinstance(refusal, MeasurementFailure)
+    assert "0 corners could be followed" in refusal.reason
+    rotation = se3.from_rotation_vector(np.deg2rad([0.0, 2.0, 0.0]), np.zeros(3))
+    refusal = measure(rotation, texture, lambda depth: np.full_like(depth, np.nan))
+    assert isinstance(refusal, MeasurementFailure)
+    assert "trusted depth" in refusal.reason
+    refusal = measure(rotation, texture, config=GeometryConfig(min_inliers=5000, max_corners=10000))
+    assert isinstance(refusal, MeasurementFailure)
+
+
+def test_far_depth_is_not_trusted(texture):
+    forward = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    refusal = measure(forward, texture, config=GeometryConfig(max_depth_heights=0.5))
+    assert isinstance(refusal, MeasurementFailure)
+
+
+def test_the_answer_is_the_same_every_time(texture):
+    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    one, other = pose_of(measure(truth, texture)), pose_of(measure(truth, texture))
+    np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
+    np.testing.assert_array_equal(one.sigmas, other.sigmas)
+
+
+def drive(texture, turn_deg=(0.0, 0.0, 0.0), steps=(1.0, 1.0, 1.0, 1.0)):
+    """Frames with their true depth, and the poses."""
+    increments = [se3.from_rotation_vector(np.deg2rad(turn_deg), np.array([0.0, 0.0, step])) for step in steps]
+    poses = se3.chain(np.array(increments))
+    return [render(T, texture, k) for k, T in enumerate(poses)], poses
+
+
+def test_frames_two_apart_are_measured_beside_neighbours(texture):
+    frames, _ = drive(texture)
+    answers = []
+    for _ in range(2):
+        odometry = VisualOdometry(CONFIG, CAMERA)
+        for k in range(5):
+            for step in (1, 2):
+                if k >= step:
+                    measured = pose_of(odometry.measure(frames[k - step][0], frames[k][0], frames[k - step][1]))
+                    assert measured.T_from_to[2, 3] == pytest.approx(step, rel=0.02)
+                    answers.append(measured.T_from_to)
+    np.testing.assert_array_equal(answers[: len(answers) // 2], answers[len(answers) // 2 :])
+
+
+def test_a_turn_across_two_steps_is_measured_in_its_two_images(texture):
+    frames, poses = drive(texture, (0.1, 1.5, 0.0))
+    odometry = VisualOdometry(CONFIG, CAMERA)
+    steps = [pose_of(odometry.measure(a[0], b[0], a[1])).T_from_to for a, b in itertools.pairwise(frames[:3])]
+    first, last = frames[0], frames[2]
+    span = odometry.relative_rotation_task(first[0], last[0], first[1], steps[0] @ steps[1])()
+    assert span is not None
+    assert (span.from_index, span.to_index, list(span.steps)) == (0, 2, [0, 1])
+    R_last_first = poses[2][:3, :3].T @ poses[0][:3, :3]
+    assert np.rad2deg(se3.rotation_angle(span.R_to_from.T @ R_last_first)) < 0.02
+    assert (np.rad2deg(span.sigmas) < 0.05).all()
+    assert odometry.relative_rotation_task(first[0], last[0], first[1], np.eye(4))() is None  # a camera that stood
+
+
+def test_corners_keep_their_names_and_tie_the_lengths_of_neighbouring_steps(texture):
+    """Learned depth that changes its unit between frames does not enter the ratio of lengths."""
+    steps = (1.0, 1.4, 0.7, 0.7)
+    frames, _ = drive(texture, (0.0, 1.0, 0.0), steps)
+    odometry = VisualOdometry(CONFIG, CAMERA)
+    motions = [
+        odometry.measure(first[0], second[0], first[1] * np.float32(1 + 0.3 * (k % 2)))
+        for k, (first, second) in enumerate(itertools.pairwise(frames))
+    ]
+    for k, (earlier, later) in enumerate(itertools.pairwise(motions)):
+        ratio = length_ratio(earlier.triangulated, later.triangulated)
+        assert ratio is not None
+        assert ratio[0] == pytest.approx(np.log(steps[k + 1] / steps[k]), abs=0.01)
+        assert 0 < ratio[1] < 0.01
+
+
+def test_a_length_from_elsewhere_keeps_rotation_and_direction(texture):
+    truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 1.0]))
+    motion = measure(truth, texture, lambda depth: 2.0 * depth)
+    assert isinstance(motion, Motion)
+    length = float(np.linalg.norm(truth[:3, 3]))
+    metric = motion.with_length(length, 0.03, 0.09, CALM)
+    np.testing.assert_array_equal(metric.T_from_to[:3, :3], motion.relative_pose.T_from_to[:3, :3])
+    np.testing.assert_allclose(metric.T_from_to[:3, 3], truth[:3, 3], atol=0.02)
+    np.testing.assert_array_equal(metric.sigmas[:3], motion.relative_pose.sigmas[:3])
+    assert 0.03 <= metric.sigmas[5] < 0.035
+    still = measure(np.eye(4), texture)
+    with pytest.raises(ValueError, match="by still has no direction"):
+        still.with_length(1.0, 0.03, 0.09, CALM)
+
+
+def test_the_noise_of_the_drive_widens_what_corners_promise(texture):
+    motion = measure(se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0])), texture)
+    assert isinstance(motion, Motion)
+    calm = motion.with_length(2.0, 0.03, 0.09, CALM).sigmas
+    rough = motion.with_length(
+        2.0, 0.03, 0.09, StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))
+    ).sigmas
+    np.testing.assert_allclose(rough[:3], np.hypot(calm[:3], [0.01, 0.02, 0.0]))
+    np.testing.assert_allclose(rough[3:5], np.hypot(calm[3:5], 2.0 * 0.05), rtol=0.01)
+    assert rough[5] == pytest.approx(calm[5], rel=0.02)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["00", "05"])
+def test_rotation_on_real_frames(data_root, name):
+    folder = data_root / "kitti_odometry" / "sequences" / name
+    P0 = np.array((folder / "calib.txt").read_text().splitlines()[0].split()[1:], float).reshape(3, 4)
+    rows = np.loadtxt(data_root / "kitti_odometry" / "poses" / f"{name}.txt").reshape(-1, 3, 4)
+    T_world_camera = se3.make(rows[:, :, :3], rows[:, :, 3])
+    first = 90
+    frames = []
+    for k in range(first, first + 31):
+        grey = cv2.imread(str(folder / "image_0" / f"{k:06d}.jpg"), cv2.IMREAD_GRAYSCALE)
+        frames.append(Frame(k, 0.1 * k, np.repeat(grey[..., None], 3, axis=2)))
+    height, width = frames[0].image.shape[:2]
+    intrinsics = Intrinsics(width, height, P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2])
+    odometry = VisualOdometry(CONFIG, intrinsics)
+    constant = np.full((height, width), 10.0, np.float32)
+    rotations_deg = []
+    for previous, current in itertools.pairwise(frames):
+        measured = pose_of(odometry.measure(previous, current, constant))
+        T_previous_current = se3.invert(T_world_camera[previous.index]) @ T_world_camera[current.index]
+        error = T_previous_current[:3, :3].T @ measured.T_from_to[:3, :3]
+        rotations_deg.append(np.rad2deg(se3.rotation_angle(error)))
+    assert np.median(rotations_deg) < 0.1
+    assert np.max(rotations_deg) < 0.5

@@ -1,0 +1,102 @@
+import cv2
+import numpy as np
+import pytest
+
+from slam.config import GeometryConfig
+from slam.frames import Frame, Intrinsics
+from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.visual.predicted_flow import PredictedFlow
+from slam.frontend.visual.tracking import CornerTracker, Tracks
+
+CAMERA = Intrinsics(320, 120, 240.0, 240.0, 160.0, 40.0)
+HEIGHT, LENGTH = 1.65, 1.1
+FORWARDS = UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]))
+ROWS, COLUMNS = np.mgrid[:120, :320]
+
+
+def road_depth() -> np.ndarray:
+    """Depth of a level road below the horizon, NaN above."""
+    below = (ROWS - CAMERA.cy) / CAMERA.fy
+    return np.where(below > 0.02, HEIGHT / np.maximum(below, 0.02), np.nan).astype(np.float32)
+
+
+def where_it_goes(pixels: np.ndarray) -> np.ndarray:
+    """Of pixels ``(M, 2)`` on the road, after the camera went forwards by ``LENGTH``."""
+    depth = HEIGHT * CAMERA.fy / (pixels[:, 1] - CAMERA.cy)
+    centre = np.array([CAMERA.cx, CAMERA.cy])
+    return centre + (pixels - centre) * (depth / (depth - LENGTH))[:, None]
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    """A road with texture as fine near as far, seen from two places; it is the plane that both images show."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.integers(0, 255, (1024, 1024)).astype(np.float32), (0, 0), 1.2)
+    depth = np.nan_to_num(road_depth(), nan=1e6)
+    images = []
+    for gone in (0.0, LENGTH):
+        across = (COLUMNS - CAMERA.cx) / CAMERA.fx * depth
+        grey = cv2.remap(
+            texture,
+            ((across * 14.0) % 1024).astype(np.float32),
+            (((depth + gone) * 14.0) % 1024).astype(np.float32),
+            cv2.INTER_LINEAR,
+        )
+        sharp = (grey - grey.mean()) * 3.0 + 128.0
+        shown = np.where(np.isfinite(road_depth()), np.clip(sharp, 0, 255), 128.0).astype(np.uint8)
+        images.append(np.repeat(shown[..., None], 3, axis=2))
+    return [Frame(k, 0.1 * k, image) for k, image in enumerate(images)]
+
+
+def predicted_flow(length: float = LENGTH) -> PredictedFlow:
+    return PredictedFlow(FORWARDS, length, road_depth(), CAMERA)
+
+
+def test_what_is_foreseen_right_stands_where_it_stood(frames):
+    first, second = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in frames)
+    near = np.s_[60:95, 80:240]
+    undone = predicted_flow().undone(second)
+
+    def unlike(image: np.ndarray) -> float:
+        return float(np.abs(image[near].astype(float) - first[near]).mean())
+
+    assert unlike(undone) < 0.5 * unlike(second)
+
+
+def test_pixels_go_where_the_road_goes():
+    pixels = np.array([[100.0, 70.0], [200.5, 81.25], [160.0, 64.0]], np.float32)
+    np.testing.assert_allclose(predicted_flow().in_current(pixels), where_it_goes(pixels), atol=0.02)
+    assert predicted_flow().in_current(np.zeros((0, 2), np.float32)).shape == (0, 2)
+
+
+def test_without_depth_only_the_turn_is_foreseen():
+    turn, _ = cv2.Rodrigues(np.array([0.0, -0.02, 0.0]))
+    unknown = np.full((120, 320), np.nan, np.float32)
+    moved = PredictedFlow(UnitRelativePose(turn, FORWARDS.direction), 5.0, unknown, CAMERA).in_current(
+        np.array([[160.0, 40.0]], np.float32)
+    )
+    np.testing.assert_allclose(moved, [[160.0 - 240.0 * np.tan(0.02), 40.0]], atol=1e-3)
+
+
+def errors(tracks: Tracks) -> np.ndarray:
+    on_the_road = (tracks.previous[:, 1] > 60) & (tracks.previous[:, 1] < 95)
+    return tracks.current[on_the_road] - where_it_goes(tracks.previous[on_the_road])
+
+
+def test_corners_on_the_road_are_found_where_they_are(frames):
+    """Also with a length that is wrong by a tenth, as learned depth is."""
+    config = GeometryConfig()
+    plain = errors(CornerTracker(config).track(*frames))
+    foreseen = errors(CornerTracker(config).track(*frames, predicted_flow(0.9 * LENGTH)))
+    right_plain, right_foreseen = ((np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, foreseen))
+    assert right_foreseen > max(2 * right_plain, 25)
+    assert abs(np.median(foreseen[:, 1])) < 0.15
+
+
+def test_a_wrong_prediction_is_not_followed(frames):
+    """What was foreseen of a standing camera loses against the windows as they are."""
+    config = GeometryConfig()
+    still = [frames[0], Frame(1, 0.1, frames[0].image)]
+    tracks = CornerTracker(config).track(*still, predicted_flow())
+    assert len(tracks.track_ids) > 100
+    assert np.quantile(np.abs(tracks.current - tracks.previous).max(axis=1), 0.95) < 0.05

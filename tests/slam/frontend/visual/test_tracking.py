@@ -1,0 +1,84 @@
+import cv2
+import numpy as np
+import pytest
+
+from slam.config import GeometryConfig
+from slam.frames import Frame, Intrinsics
+from slam.frontend.visual.epipolar import UnitRelativePose
+from slam.frontend.visual.predicted_flow import PredictedFlow
+from slam.frontend.visual.tracking import CornerTracker
+
+CONFIG = GeometryConfig(max_corners=300)
+SHIFT_PX = 4
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    """A wide picture that slides to the left by whole pixels."""
+    noise = np.random.default_rng(0).integers(0, 255, (120, 300), np.uint8)
+    wide = np.repeat(cv2.GaussianBlur(noise, (0, 0), 1.5)[..., None], 3, axis=2)
+    return [Frame(k, 0.1 * k, np.ascontiguousarray(wide[:, SHIFT_PX * k :][:, :200])) for k in range(6)]
+
+
+def test_tracks_move_with_the_picture_and_keep_their_names(frames):
+    tracker = CornerTracker(CONFIG)
+    first, second = tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])
+    for tracks in (first, second):
+        assert len(tracks.track_ids) == len(set(tracks.track_ids.tolist())) > 50
+        error = np.abs(tracks.previous - tracks.current - [SHIFT_PX, 0]).max(axis=1)
+        assert np.median(error) < 0.01 and error.max() < 0.5
+    common, one, other = np.intersect1d(first.track_ids, second.track_ids, return_indices=True)
+    assert len(common) > 0.8 * len(first.track_ids)
+    np.testing.assert_array_equal(first.current[one], second.previous[other])
+
+
+def test_new_corners_fill_what_slides_into_view(frames):
+    tracker = CornerTracker(CONFIG)
+    for k in range(5):
+        tracks = tracker.track(frames[k], frames[k + 1])
+    fresh = tracks.previous[tracks.track_ids > np.median(tracks.track_ids)]
+    assert len(tracks.track_ids) > 50
+    assert fresh[:, 0].max() > 200 - 3 * SHIFT_PX
+    assert len(tracks.track_ids) <= CONFIG.max_corners
+
+
+def test_an_empty_image_gives_no_tracks(frames):
+    black = Frame(9, 0.9, np.zeros_like(frames[0].image))
+    assert len(CornerTracker(CONFIG).track(black, frames[0]).track_ids) == 0
+    assert len(CornerTracker(CONFIG).track(frames[0], black).track_ids) == 0
+
+
+def test_two_trackers_agree(frames):
+    one, other = (CornerTracker(CONFIG).track(frames[0], frames[2]) for _ in range(2))
+    np.testing.assert_array_equal(one.current, other.current)
+    np.testing.assert_array_equal(one.track_ids, other.track_ids)
+
+
+def test_few_corners_are_sought_again_under_another_exposure(frames):
+    dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
+    once = CornerTracker(CONFIG.model_copy(update={"few_corners": 0})).track(frames[0], dark)
+    again = CornerTracker(CONFIG.model_copy(update={"few_corners": 1000})).track(frames[0], dark)
+    assert len(again.track_ids) > max(2 * len(once.track_ids), 40)
+    error = np.abs(again.previous - again.current - [SHIFT_PX, 0]).max(axis=1)
+    assert np.median(error) < 0.1
+
+
+def test_corners_are_found_again_two_frames_later_where_they_were_foreseen(frames):
+    tracker = CornerTracker(CONFIG)
+    tracks = [tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])]
+    camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
+    depth, sliding = np.full((120, 200), 10.0, np.float32), UnitRelativePose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    foreseen = PredictedFlow(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
+    across = tracker.ask_across(frames[0], frames[2], foreseen)()
+    assert len(across.track_ids) > 0.8 * len(tracks[0].track_ids)
+    assert np.isin(across.track_ids, tracks[0].track_ids).all()
+    error = np.abs(across.previous - across.current - [2 * SHIFT_PX, 0]).max(axis=1)
+    assert np.median(error) < 0.02 and error.max() < 0.5
+
+
+def test_corners_that_nobody_followed_are_not_found_across(frames):
+    camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
+    nothing = PredictedFlow(
+        UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
+    )
+    assert len(CornerTracker(CONFIG).ask_across(frames[0], frames[2], nothing)().track_ids) == 0

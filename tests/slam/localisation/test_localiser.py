@@ -1,0 +1,185 @@
+"""New pictures of a street that was driven before are found in its map; others are not, and it is said why."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.config import LoopsConfig, dump_yaml, load_config
+from slam.errors import RunError, SequenceError
+from slam.frames import Frame, Image
+from slam.localisation.localiser import Localiser, localise
+from slam.localisation.tables import localisation_json, localisation_table, write_localisations
+from slam.loops.descriptors import FeatureExtractor
+from slam.loops.places import PLACES, Places
+from slam.results.folder import RunFolder
+from slam.se3 import FloatArray, invert, rotation_angle
+from slam.sequences.simulation.sequence import SimulatedSequence
+from slam.sequences.simulation.street import SimulationOptions
+from slam.trajectory import read_trajectory
+
+CONFIG = LoopsConfig()
+UNIT = 0.5  # lengths of the map per metre
+
+
+@functools.cache
+def street(seed: int, hazards: tuple[str, ...] = ()) -> SimulatedSequence:
+    return SimulatedSequence(SimulationOptions("straight", 60, seed, 312, 96, hazards))
+
+
+def reference() -> FloatArray:
+    T_world_camera = street(630).reference
+    assert T_world_camera is not None
+    return T_world_camera
+
+
+@functools.cache
+def places() -> Places:
+    """What a run on every third frame would keep, its depth exact."""
+    sequence = street(630)
+    extractor = FeatureExtractor(CONFIG, sequence.intrinsics)
+    frames = range(0, 60, 3)
+    views = []
+    for k in frames:
+        rendered = sequence.street.render(k)
+        depth = np.where(rendered.depth > 0, rendered.depth, np.nan).astype(np.float32)
+        views.append(extractor.view(Frame(k, 0.1 * k, rendered.image), depth, sequence.camera_height_m).scaled(UNIT))
+    T_world_camera = reference()[list(frames)].copy()
+    T_world_camera[:, :3, 3] *= UNIT
+    return Places(sequence.intrinsics, tuple(views), T_world_camera)
+
+
+@pytest.fixture
+def run(make_run: Callable[..., RunFolder]) -> RunFolder:
+    folder = make_run()
+    folder.write(PLACES, places().write)
+    folder.write_text("config.yaml", dump_yaml(load_config()))
+    return folder
+
+
+@pytest.fixture
+def album(tmp_path: Path) -> Path:
+    """Three pictures of the street in other light, one of another street, one damaged."""
+    folder = tmp_path / "album"
+    folder.mkdir()
+    for k in (10, 25, 40):
+        save(folder / f"{k}.png", street(630, ("exposure",)).frame(k).image)
+    save(folder / "50.png", street(631).frame(20).image)
+    (folder / "60.png").write_bytes(b"damaged")
+    return folder
+
+
+def save(path: Path, image: Image) -> None:
+    cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
+
+
+def test_places_read_back(tmp_path: Path) -> None:
+    places().write(tmp_path / PLACES)
+    again = Places.read(tmp_path / PLACES)
+    assert again.intrinsics == places().intrinsics and len(again.views) == 20
+    np.testing.assert_array_equal(again.T_world_camera, places().T_world_camera)
+    for view, other in zip(again.views, places().views, strict=True):
+        assert view.index == other.index
+        for name in ("pixels", "descriptors", "points"):
+            np.testing.assert_array_equal(getattr(view, name), getattr(other, name))
+            assert getattr(view, name).dtype == getattr(other, name).dtype
+
+
+@pytest.mark.parametrize("damage", ["half", "text", "pickle", "other"])
+def test_damaged_places_are_one_error(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / PLACES
+    places().write(path)
+    if damage == "half":
+        path.write_bytes(path.read_bytes()[:3000])
+    elif damage == "text":
+        path.write_text("places")
+    elif damage == "pickle":
+        np.savez(path, format=np.array([{}], dtype=object))
+    else:
+        np.savez(path, format=np.array(99))
+    with pytest.raises(RunError, match=r"places\.npz (is damaged|has format 99)"):
+        Places.read(path)
+
+
+@pytest.mark.parametrize("hazards", [(), ("exposure",), ("rain",)])
+def test_pictures_of_the_street_are_found_where_they_were_taken(hazards: tuple[str, ...]) -> None:
+    localiser = Localiser(places(), CONFIG)
+    found = 0
+    for k in range(4, 58, 6):
+        result = localiser.locate(f"{k}", street(630, hazards).frame(k).image)
+        if result.T_world_camera is None:
+            continue
+        found += 1
+        T_error = invert(reference()[k]) @ result.T_world_camera
+        away = np.linalg.norm(result.T_world_camera[:3, 3] / UNIT - reference()[k, :3, 3])
+        assert away < 0.5 and rotation_angle(T_error[:3, :3]) < np.deg2rad(1.0)
+        assert result.nearest_frame is not None and abs(result.nearest_frame - k) <= 2 and result.inliers >= 20
+    assert found >= 7
+
+
+def test_another_size_of_the_same_camera_is_found_too() -> None:
+    image = street(630).frame(31).image
+    twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)
+    assert Localiser(places(), CONFIG).locate("twice", twice).nearest_frame in (30, 33)
+    own = Localiser(places(), CONFIG, places().intrinsics.resized(624, 192)).locate("own", twice)
+    assert own.T_world_camera is not None
+    assert np.linalg.norm(own.T_world_camera[:3, 3] / UNIT - reference()[31, :3, 3]) < 0.5
+    with pytest.raises(SequenceError, match="the image is 300x192, its camera 312x96: give its --camera"):
+        Localiser(places(), CONFIG).locate("cut", twice[:, :300])
+
+
+@pytest.mark.parametrize("what", ["another street", "noise", "black"])
+def test_what_was_never_seen_is_not_found(what: str) -> None:
+    images = {
+        "another street": [street(seed).frame(k).image for seed in (631, 632) for k in range(5, 55, 10)],
+        "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
+        "black": [np.zeros((96, 312, 3), np.uint8)],
+    }[what]
+    localiser = Localiser(places(), CONFIG)
+    for image in images:
+        result = localiser.locate(what, image)
+        assert result.T_world_camera is None and result.nearest_frame is None and result.reason
+
+
+def test_an_album_is_found_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    found = list(localise(album, run))
+    assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
+    assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]
+    assert "60.png" in found[4].reason
+    entries = json.loads(json.dumps(localisation_json(found), allow_nan=False))
+    assert entries[1]["found"] and abs(entries[1]["nearest_frame"] - 25) <= 2
+    assert entries[3] | {"reason": ""} == {
+        "image": "50.png",
+        "found": False,
+        **dict.fromkeys(("position", "T_world_camera", "nearest_frame", "inliers")),
+        "reason": "",
+    }
+    assert localisation_table(found).row_count == 5
+    write_localisations(tmp_path / "found.tum", found)
+    written = read_trajectory(tmp_path / "found.tum")
+    np.testing.assert_array_equal(written.stamps, [0.0, 1.0, 2.0])
+    np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
+
+
+def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    found = list(localise(album / "50.png", run))
+    with pytest.raises(RunError, match="none of 1 images was found"):
+        write_localisations(tmp_path / "found.tum", found)
+    assert not (tmp_path / "found.tum").exists()
+
+
+def test_missing_parts_are_named(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="nowhere: no such file or folder"):
+        list(localise(tmp_path / "nowhere", run))
+    run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
+    with pytest.raises(RunError, match=r"keeps no places: it ran with loops\.enabled=false"):
+        list(localise(album, run))
+    (run.path / PLACES).unlink()
+    with pytest.raises(RunError, match=r"has no places\.npz"):
+        list(localise(album, run))

@@ -1,0 +1,291 @@
+"""The system on a drive whose truth is known, driven by an oracle: no networks, and mostly no pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.pose_noise import PoseNoise
+from slam import se3
+from slam.config import load_config
+from slam.errors import SlamError
+from slam.evaluation.trajectory import trajectory_metrics
+from slam.frames import Frame, Image, Intrinsics
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.prediction.oracle import OracleNoise, OraclePredictor
+from slam.se3 import FloatArray
+from slam.sequences.excerpt import Excerpt
+from slam.sequences.simulation.sequence import SimulatedSequence
+from slam.sequences.simulation.street import SimulationOptions
+from slam.trajectory import Trajectory, write_kitti, write_tum
+
+CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
+HEIGHT_M = 1.5
+FACTOR = 0.2  # unscaled lengths per metre
+NO_NOISE = OracleNoise()
+NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false")
+
+
+class SessionCheckpoint:
+    """A camera on a level road: poses and depth are exact, the images show nothing."""
+
+    def __init__(self, T_world_camera: FloatArray, image: Image | None = None) -> None:
+        self.name = "drive"
+        self.intrinsics = CAMERA
+        self.stamps = 0.1 * np.arange(len(T_world_camera))
+        self.reference: FloatArray | None = T_world_camera
+        self.camera_height_m: float | None = HEIGHT_M
+        self.T_camera_lidar: FloatArray | None = None
+        self.read = 0
+        self._image = np.full((32, 104, 3), 90, np.uint8) if image is None else image
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frame(self, index: int) -> Frame:
+        self.read += 1
+        return Frame(index, float(self.stamps[index]), self._image)
+
+    def scan_path(self, index: int) -> Path | None:
+        return None
+
+    def provenance(self) -> tuple[str, ...]:
+        return ()
+
+
+def turning(frames: int) -> FloatArray:
+    """Poses ``(N, 4, 4)`` of a level drive that bends left and right, at a changing speed."""
+    k = np.arange(frames - 1)
+    yaw = 0.05 * np.sin(k / 9.0)
+    rotation_vector = np.stack([0 * yaw, yaw, 0 * yaw], axis=1)
+    step = np.stack([0 * yaw, 0 * yaw, 1.0 + 0.2 * np.cos(k / 5.0)], axis=1)
+    return se3.chain(se3.from_rotation_vector(rotation_vector, step))
+
+
+def road(index: int) -> FloatArray:
+    """z-depth of the level road up to a wall at 30 m."""
+    below = np.arange(32) - CAMERA.cy
+    depth = np.minimum(HEIGHT_M * CAMERA.fy / np.maximum(below, 1e-3), 30.0)
+    return np.repeat(depth[:, None], 104, axis=1)
+
+
+def run(drive: SessionCheckpoint, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
+    assert drive.reference is not None
+    oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
+    return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
+
+
+def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
+    return float(trajectory_metrics(estimate, reference)["align"]["7dof"]["ate_rmse_m"])
+
+
+def test_exact_answers_give_the_truth() -> None:
+    drive = SessionCheckpoint(turning(60))
+    result = run(drive)
+    for each in (result.network, result.odometry, result.optimised, result.reference):
+        assert each is not None and len(each) == 60
+        np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
+        np.testing.assert_array_equal(each.stamps, drive.stamps)
+    assert result.scale.mode == "camera-height"
+    np.testing.assert_allclose(result.scale.per_frame, 1 / FACTOR, rtol=1e-5)
+    np.testing.assert_allclose(result.network.positions, FACTOR * turning(60)[:, :3, 3], atol=1e-9)
+    for each in (result.odometry, result.optimised):
+        np.testing.assert_allclose(each.T_world_camera, turning(60), atol=1e-3)
+    assert result.map is None and result.observations.geometric == []
+    assert len(result.observations.snippets) == 56 and len(result.factors) == 4 * 56
+
+
+def test_noise_is_cut_by_the_graph() -> None:
+    before, after = [], []
+    for seed in range(5):
+        noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=seed)
+        result = run(SessionCheckpoint(turning(100)), noise=noise)
+        before.append(ate(result.network, result.reference))
+        after.append(ate(result.optimised, result.reference))
+    assert np.mean(after) < 0.7 * np.mean(before)
+
+
+def test_a_unit_that_wanders_is_brought_back_by_the_road() -> None:
+    noise = OracleNoise(scale_drift_sigma=0.03)
+    result = run(SessionCheckpoint(turning(200)), "scale.smoothing_frames=11", noise=noise)
+    wandered = result.network.length_m / FACTOR / turning_length(200)
+    assert abs(np.log(wandered)) > 0.1
+    assert result.optimised.length_m == pytest.approx(turning_length(200), rel=0.03)
+    assert ate(result.optimised, result.reference) < 0.3 * ate(result.network, result.reference)
+
+
+def turning_length(frames: int) -> float:
+    return float(np.linalg.norm(np.diff(turning(frames)[:, :3, 3], axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize(
+    ("mode", "unit_m"), [("none", HEIGHT_M), ("camera-height", 1.0), ("reference", 1.0), ("auto", 1.0)]
+)
+def test_scale_modes(mode: str, unit_m: float) -> None:
+    """``none`` measures in camera heights, the others in metres."""
+    result = run(SessionCheckpoint(turning(30)), f"scale.mode={mode}")
+    assert result.scale.mode == ("camera-height" if mode == "auto" else mode)
+    assert result.optimised.length_m * unit_m == pytest.approx(turning_length(30), rel=1e-4)
+    assert not isinstance(result.scale.estimate, MeasurementFailure)
+    assert result.scale.estimate.value * FACTOR * unit_m == pytest.approx(1.0, rel=1e-4)
+
+
+def test_auto_without_a_height_is_none() -> None:
+    drive = SessionCheckpoint(turning(30))
+    drive.camera_height_m = None
+    assert run(drive).scale.mode == "none"
+
+
+@pytest.mark.parametrize(
+    ("frames", "mode", "words"),
+    [
+        (4, "auto", "drive has 4 frames, .* snippet .* has 5"),
+        (30, "lidar", "wants LiDAR scans of neighbouring frames"),
+        (30, "reference", "drive has none"),
+        (30, "camera-height", "add camera_height_m to camera.yaml"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_any_work(frames: int, mode: str, words: str) -> None:
+    drive = SessionCheckpoint(turning(frames))
+    oracle = OraclePredictor(turning(frames), road)
+    drive.reference = drive.camera_height_m = None
+    pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, f"scale.mode={mode}"]))
+    with pytest.raises(SlamError, match=words) as refused:
+        pipeline.run()
+    assert "\n" not in str(refused.value)
+    assert drive.read == 0
+
+
+def test_one_snippet_is_enough() -> None:
+    result = run(SessionCheckpoint(turning(5)))
+    np.testing.assert_allclose(result.optimised.T_world_camera, turning(5), atol=1e-3)
+
+
+def test_without_a_road_lengths_stay_unscaled_and_say_why() -> None:
+    result = run(SessionCheckpoint(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
+    assert isinstance(result.scale.estimate, MeasurementFailure) and "0 frames" in result.scale.estimate.reason
+    np.testing.assert_array_equal(result.scale.per_frame, 1.0)
+    assert result.optimised.length_m == pytest.approx(FACTOR * turning_length(20), rel=1e-3)
+
+
+def speckled() -> Image:
+    noise = np.random.default_rng(0).integers(0, 255, (32, 104), np.uint8)
+    return np.repeat(cv2.GaussianBlur(noise, (0, 0), 1.0)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("mode", ["camera-height", "reference"])
+def test_standing_still(mode: str) -> None:
+    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+    result = run(still, f"scale.mode={mode}")
+    np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
+    metrics = trajectory_metrics(result.optimised, result.reference)
+    assert metrics["align"]["6dof"]["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    if mode == "reference":
+        assert isinstance(result.scale.estimate, MeasurementFailure) and "does not move" in result.scale.estimate.reason
+
+
+def test_images_that_do_not_change_hold_a_restless_network() -> None:
+    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+    noise = OracleNoise(np.deg2rad(0.3))
+    options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
+    result = run(still, *options, noise=noise)
+    assert {factor.source for factor in result.observations.geometric} == {STILL_SOURCE}
+    turned = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
+    assert turned[1] < 0.3 * turned[0]
+    np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
+
+
+def test_images_without_corners_refuse_the_geometry_and_the_network_goes_on() -> None:
+    result = run(SessionCheckpoint(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
+    assert result.observations.geometric == []
+    pairs = [(first, second) for first, second, _ in result.observations.failures]
+    assert sorted(pairs) == sorted([(k, k + 1) for k in range(19)] + [(k, k + 3) for k in range(17)])
+    np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def street() -> Excerpt:
+    return Excerpt(SimulatedSequence(SimulationOptions("straight", 40, 1002, 208, 64)), 4, 29)
+
+
+def drive_street(
+    street: Excerpt,
+    progress: Callable[[str, int, int], None] | None = None,
+    noise: PoseNoise | None = None,
+    use: str = "calibrated",
+) -> SlamResult:
+    oracle = OraclePredictor(
+        street.reference,
+        lambda k: np.where((depth := street.base.street.render(street.start + k).depth) > 0, depth, 200.0),
+        OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
+        FACTOR,
+    )
+    settings = load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", f"frontend.use={use}"])
+    return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
+
+
+def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
+    """Corners, RANSAC, the graph's threads and Open3D's: none of them may leave a trace."""
+    for name in ("first", "second"):
+        result = drive_street(street)
+        folder = tmp_path / name
+        folder.mkdir()
+        for stem in ("network", "odometry", "optimised"):
+            write_kitti(folder / f"{stem}.kitti.txt", getattr(result, stem))
+            write_tum(folder / f"{stem}.tum.txt", getattr(result, stem))
+        result.graph.write_g2o(folder / "graph.g2o")
+        assert result.map is not None
+        result.map.write_mesh(folder / "mesh.ply")
+        result.map.write_cloud(folder / "cloud.ply")
+    for path in sorted((tmp_path / "first").iterdir()):
+        assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
+
+
+def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
+    told: list[tuple[str, int, int]] = []
+    result = drive_street(street, lambda *words: told.append(words))
+    assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
+    seen = result.observations
+    assert len(seen.geometric) > 15 and len(seen.geometric) + len(seen.failures) == 24
+    measured = {g.from_index for g in seen.geometric}
+    by_network = [f for f in result.factors if f.source == "network"]
+    assert all(set(range(*sorted((f.from_index, f.to_index)))) - measured for f in by_network)
+    assert len(seen.road_steps) > 10 and np.isfinite(result.scale.lengths).sum() == len(seen.motions)
+    assert [index for index, _, _ in seen.examples] == [4, 8, 12, 16, 20]
+    assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
+    assert result.map is not None and result.map.statistics().triangles > 5000
+    assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
+
+
+def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt) -> None:
+    six = (0.002, 0.002, 0.002, 0.02, 0.02, 0.02)
+    none = (0.0,) * 6
+    noise = PoseNoise(
+        frame=six,
+        turn=none,
+        length=none,
+        disagreement=none,
+        correlation=none,
+        pose_sha256="",
+        measured_on=["simulated/600"],
+        pairs=99,
+    )
+    every, gaps = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "bridge"))
+    pairs = {(f.from_index, f.to_index) for f in every.factors if f.source == "network"}
+    assert pairs == {(k, k + 1) for k in range(1, 23)} | {(k, k + 2) for k in range(23)}
+    assert len(gaps.factors) < len(every.factors)
+    assert ate(every.optimised, every.reference) < 1.3 * ate(gaps.optimised, gaps.reference)
+
+
+def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:
+    oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
+    settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "geometry.enabled=false"])
+    seen = SlamPipeline(street, oracle, settings).run().observations
+    assert [keyframe.index for keyframe in seen.keyframes] == [0, 5, 10, 15, 20]
+    assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)

@@ -1,0 +1,224 @@
+"""A drive that is left and taken up again is the drive that was never interrupted."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam import Slam, run_slam
+from slam.config import load_config
+from slam.errors import SlamError
+from slam.frames import Frame
+from slam.pipeline.checkpoint import DRIVE, KEYFRAMES
+from slam.prediction.oracle import OracleNoise, OraclePredictor
+from slam.results.folder import RunFolder
+from slam.sequences.catalogue import open_sequence
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+
+SAME = (
+    *(f"trajectory_{name}.tum.txt" for name in ("network", "odometry", "optimised")),
+    *("reference.tum.txt", "graph.g2o", "loops.json", "places.npz", "map_mesh.ply", "map_cloud.ply"),
+)
+WEIGHTS = "sim"
+SETTINGS = ["output.report=false", "output.keep=keyframes", "mapping.min_weight=1"]
+
+
+def run(root: Path, output: Path, frames: str | None, **options: Any) -> RunFolder:
+    options = {"overrides": SETTINGS, "weights": WEIGHTS} | options
+    return run_slam(root, "sim", output=output, frames=frames, **options)
+
+
+def rounded(tree: Any) -> Any:
+    """Numbers to nine decimals: the truth of both parts is joined, which rounds."""
+    if isinstance(tree, dict):
+        return {key: rounded(value) for key, value in tree.items()}
+    return f"{tree + 0.0:.9f}" if isinstance(tree, float) else tree
+
+
+@pytest.fixture(scope="module")
+def whole(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """All 14 frames in one go. Not to be changed."""
+    return run(kitti_root, tmp_path_factory.mktemp("runs") / "whole", None)
+
+
+@pytest.fixture(scope="module")
+def begun(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """The first 8 frames. Not to be changed."""
+    return run(kitti_root, tmp_path_factory.mktemp("runs") / "begun", "0:8")
+
+
+@pytest.fixture
+def go_on(kitti_root: Path, begun: RunFolder, tmp_path: Path) -> Callable[..., RunFolder]:
+    def go(frames: str | None = "8:", root: Path = kitti_root, **options: Any) -> RunFolder:
+        output = options.pop("output", tmp_path / "continued")
+        return run(root, output, frames, **{"overrides": (), "continues": begun.path} | options)
+
+    return go
+
+
+def test_every_file_has_the_bytes_of_a_run_in_one_go(whole: RunFolder, go_on: Callable[..., RunFolder]) -> None:
+    continued = go_on()
+    assert [name for name in SAME if (continued.path / name).read_bytes() != (whole.path / name).read_bytes()] == []
+    metrics, wanted = continued.metrics(), whole.metrics()
+    assert (metrics["sequence"].pop("continued_at"), wanted["sequence"].pop("continued_at")) == (8, 0)
+    for part in ("sequence", "scale", "trajectories", "graph", "loops"):
+        assert rounded(metrics[part]) == rounded(wanted[part])
+    assert metrics["map"]["points"] == wanted["map"]["points"] > 0
+
+
+def test_frame_by_frame(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
+    """Three runs in a row, one of them of a single frame."""
+    settings = ["output.report=false", "mapping.enabled=false"]
+    before = run(kitti_root, tmp_path / "0", "0:6", overrides=settings).path
+    for frames in ("6:7", "7:"):
+        before = run(kitti_root, tmp_path / frames[0], frames, continues=before, overrides=()).path
+    assert (before / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
+
+
+def test_the_images_of_before_are_not_asked_for(
+    whole: RunFolder, go_on: Callable[..., RunFolder], copy_of_kitti_root: Callable[[], Path]
+) -> None:
+    root = copy_of_kitti_root()
+    for path in sorted((root / "sequences/sim/image_2").iterdir())[1:8]:  # the first tells the size
+        path.write_bytes(b"gone")
+    continued = go_on(root=root)
+    assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
+
+
+def test_a_folder_that_begins_anew_comes_after(
+    whole: RunFolder, begun: RunFolder, kitti_root: Path, tmp_path: Path
+) -> None:
+    """Images alone, with stamps from zero: the same poses, and no truth is made up."""
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in sorted((kitti_root / "sequences/sim/image_2").iterdir())[8:]:
+        shutil.copy(path, images)
+    shutil.copy(kitti_root / "camera.yaml", images)
+    continued = run_slam(images, weights=WEIGHTS, continues=begun.path, output=tmp_path / "out")
+    found, wanted = continued.trajectory("optimised"), whole.trajectory("optimised")
+    assert found is not None and wanted is not None
+    np.testing.assert_array_equal(found.T_world_camera, wanted.T_world_camera)
+    np.testing.assert_allclose(np.diff(found.stamps), 0.1, atol=1e-6)
+    assert continued.trajectory("reference") is None
+
+
+def test_without_keyframes_the_map_begins_where_they_do(
+    begun: RunFolder,
+    go_on: Callable[..., RunFolder],
+    whole: RunFolder,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bare = Path(shutil.copytree(begun.path, tmp_path / "bare"))
+    (bare / KEYFRAMES).unlink()
+    continued = go_on(continues=bare)
+    assert "the map begins at frame 8" in caplog.text
+    assert continued.metrics()["map"]["blocks"] < whole.metrics()["map"]["blocks"]
+    assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
+
+
+def test_what_follows_the_pass_over_the_frames_may_be_set_anew(go_on: Callable[..., RunFolder]) -> None:
+    continued = go_on(overrides=["pose_graph.kernel=none", "mapping.enabled=false", "output.keep=nothing"])
+    config = load_config(continued.path / "config.yaml")
+    assert (config.pose_graph.kernel, config.output.keep) == ("none", "nothing")
+    assert not (continued.path / DRIVE).exists() and not (continued.path / "map_mesh.ply").exists()
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"config": "default"}, "leave out --config"),
+        ({"overrides": ["geometry.inlier_px=3"]}, "geometry is settled by the frames of .*: leave out --set geometry"),
+    ],
+    ids=["configuration", "geometry"],
+)
+def test_what_does_not_go_together(go_on: Callable[..., RunFolder], options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SlamError, match=message):
+        go_on(**options)
+
+
+def test_other_weights(go_on: Callable[..., RunFolder]) -> None:
+    with pytest.raises(SlamError, match="was run with other weights"):
+        go_on(weights="default")
+
+
+def test_another_camera(go_on: Callable[..., RunFolder], tmp_path: Path) -> None:
+    root = tmp_path / "wide"
+    write_kitti_root(
+        SimulatedStreet(SimulationOptions(route="straight", frames=6, seed=1002, width=240, height=64)), root
+    )
+    with pytest.raises(SlamError, match=r"taken with another camera, 240 x 64 .* 208 x 64"):
+        go_on(root=root, frames=None)
+
+
+def test_the_run_to_continue_is_not_overwritten(begun: RunFolder, go_on: Callable[..., RunFolder]) -> None:
+    with pytest.raises(SlamError, match="is the run to continue, and would be lost"):
+        go_on(output=begun.path)
+    assert (begun.path / DRIVE).is_file()
+
+
+def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(SlamError, match="not a run folder"):
+        go_on(continues=tmp_path)
+    bare = Path(shutil.copytree(begun.path, tmp_path / "bare"))
+    (bare / DRIVE).write_bytes((bare / DRIVE).read_bytes()[:-1000])
+    with pytest.raises(SlamError, match=r"drive.zip is missing or damaged"):
+        go_on(continues=bare)
+    (bare / DRIVE).unlink()
+    with pytest.raises(SlamError, match=r"cannot be continued: it has no drive.zip"):
+        go_on(continues=bare)
+    damaged = Path(shutil.copytree(begun.path, tmp_path / "damaged"))
+    (damaged / KEYFRAMES).write_bytes(b"PK")
+    with pytest.raises(SlamError, match=r"keyframes.npz is damaged"):
+        go_on(continues=damaged)
+
+
+def live(root: Path, **options: Any) -> Slam:
+    sequence = open_sequence(root, "sim")
+    street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64))
+
+    def depth_of(index: int) -> np.ndarray:
+        depth = street.render(index).depth.astype(np.float64)
+        return np.where(depth > 0, depth, 200.0)
+
+    assert sequence.reference is not None
+    oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3), 0.2)
+    return Slam(oracle, sequence.intrinsics, load_config(), sequence.camera_height_m, **options)
+
+
+def feed(slam: Slam, root: Path, frames: range) -> None:
+    sequence = open_sequence(root, "sim")
+    for index in frames:
+        frame: Frame = sequence.frame(index)
+        slam.add_frame(frame.image, frame.stamp)
+
+
+def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path) -> None:
+    first = live(kitti_root)
+    feed(first, kitti_root, range(8))
+    first.save(tmp_path / "drive.zip")
+    second = live(kitti_root)
+    second.resume(tmp_path / "drive.zip")
+    assert len(second) == 8
+    np.testing.assert_allclose(second.trajectory().positions, first.trajectory().positions, atol=1e-9)
+    for slam in (first, second):
+        feed(slam, kitti_root, range(8, 14))
+    np.testing.assert_allclose(second.trajectory().positions, first.trajectory().positions, atol=1e-6)
+    assert second.trajectory().length_m > 5
+
+
+def test_live_slam_resumes_its_own_drive_alone(kitti_root: Path, tmp_path: Path) -> None:
+    first = live(kitti_root)
+    feed(first, kitti_root, range(6))
+    first.save(tmp_path / "drive.zip")
+    with pytest.raises(SlamError, match="before the first frame; 6 came already"):
+        first.resume(tmp_path / "drive.zip")
+    with pytest.raises(SlamError, match="another camera, camera height or weights"):
+        live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")
+    with pytest.raises(SlamError, match="missing or damaged"):
+        live(kitti_root).resume(tmp_path / "none.zip")

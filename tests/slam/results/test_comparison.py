@@ -1,0 +1,83 @@
+"""Tables of several runs say what is missing and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
+from slam.errors import RunError
+from slam.results.folder import RunFolder
+
+MakeRun = Callable[..., RunFolder]
+MakeMetrics = Callable[..., dict[str, Any]]
+
+
+def printed(runs: list[RunFolder], width: int = 140) -> str:
+    console = Console(width=width, record=True, file=None, quiet=False, force_terminal=False)
+    with console.capture() as capture:
+        console.print(comparison_table(runs))
+    return capture.get()
+
+
+def test_runs_stand_side_by_side_with_their_numbers(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    text = printed([make_run("first"), make_run("second", make_metrics(mode="none"))])
+    assert "first" in text
+    assert "second" in text
+    assert text.count("0.870") == 2  # ATE of the optimised trajectories, 7 dof
+    assert "Scale mode none" in text
+    assert "LEAK" not in text
+
+
+def test_a_leak_and_missing_numbers_are_said(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    text = printed([make_run("seen", make_metrics(leak=True))])
+    assert "LEAK" in text
+    assert "lidar: the sequence has no LiDAR scans" in text
+    assert "odometry: no segment of 100 m was left" in text
+
+
+def test_a_failed_run_keeps_its_place(make_run: MakeRun) -> None:
+    failed = {"schema": 1, "status": "failed", "reason": "no motion [bold]between[/bold] frames", "provenance": None}
+    text = printed([make_run("good"), make_run("bad", failed)])
+    assert "bad failed: no motion [bold]between[/bold] frames" in text
+    assert "0.870" in text
+
+
+def test_json_holds_the_objects_of_metrics_json(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    metrics = make_metrics()
+    run = make_run("one", metrics)
+    (entry,) = json.loads(json.dumps(comparison_json([run])))
+    assert entry["run"] == str(run.path)
+    assert entry["status"] == "ok"
+    assert entry["trajectories"] == metrics["trajectories"]
+
+
+def test_no_run_is_an_error() -> None:
+    with pytest.raises(RunError, match="no run was given"):
+        comparison_table([])
+
+
+def test_runs_of_one_name_are_told_apart(make_run: MakeRun) -> None:
+    runs = [make_run("a/run"), make_run("b/run"), make_run("c")]
+    assert run_names(runs) == [str(runs[0].path), str(runs[1].path), "c"]
+
+
+def test_lookup_finds_the_reason_where_the_path_breaks() -> None:
+    tree = {"a": {"b": None, "b_reason": "because"}, "c": 1.0}
+    assert lookup(tree, "c") == (1.0, "")
+    assert lookup(tree, "a", "b") == (None, "because")
+    assert lookup(tree, "a", "b", "deeper") == (None, "because")
+    assert lookup(tree, "c", "d") == (None, "not recorded")
+    assert lookup(None, "c") == (None, "not recorded")
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "text"),
+    [(None, 2, "–"), (3, 2, "3"), (0.0, 2, "0.00"), (1.236, 2, "1.24"), (3.1e-12, 1, "3.1e-12"), ("x", 1, "x")],
+)
+def test_numbers_are_written_with_their_decimals(value: Any, decimals: int, text: str) -> None:
+    assert written(value, decimals) == text

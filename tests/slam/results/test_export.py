@@ -1,0 +1,140 @@
+"""Exports are whole files in the axes asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import RunError
+from slam.results.export import R_UP_WORLD, export
+from slam.frames import Intrinsics
+from slam.loops.places import PLACES, Places
+from slam.results.folder import RunFolder
+from slam.se3 import FloatArray
+from slam.trajectory import read_trajectory
+
+MakeRun = Callable[..., RunFolder]
+
+
+def rotate_ply(source: Path, target: Path, R_up_world: FloatArray) -> None:
+    """Turns the vertex lines of the fixture's ASCII PLY."""
+    lines = source.read_text().splitlines()
+    start = lines.index("end_header") + 1
+    vertices = np.array([[float(word) for word in line.split()] for line in lines[start : start + 3]])
+    turned = [" ".join(f"{value:g}" for value in row) for row in vertices @ R_up_world.T]
+    target.write_text("\n".join([*lines[:start], *turned, *lines[start + 3 :]]) + "\n")
+
+
+def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> None:
+    np.testing.assert_allclose(R_UP_WORLD @ R_UP_WORLD.T, np.eye(3))
+    assert np.linalg.det(R_UP_WORLD) == pytest.approx(1.0)
+    up_of_camera, ahead_of_camera, right = [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    np.testing.assert_allclose(R_UP_WORLD @ up_of_camera, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(R_UP_WORLD @ ahead_of_camera, [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(R_UP_WORLD @ right, right)
+
+
+@pytest.mark.parametrize("what", ["mesh", "cloud"])
+def test_ply_is_copied_or_turned_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
+    folder = make_run()
+    source = folder.path / f"map_{what}.ply"
+    copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down", rotate_ply)
+    assert copied.read_bytes() == source.read_bytes()
+    turned = export(folder, what, tmp_path / "new" / "b.ply", "z", rotate_ply)
+    assert "0 1 2" in turned.read_text().splitlines()  # the vertex 2 m above the road, (0, -2, 1)
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
+
+
+@pytest.mark.parametrize(("name", "format"), [("t.txt", "kitti"), ("t.tum", "tum"), ("t.tum.txt", "tum")])
+def test_trajectory_format_follows_the_name(make_run: MakeRun, tmp_path: Path, name: str, format: str) -> None:
+    folder = make_run()
+    written = export(folder, "trajectory", tmp_path / name, "y-down", rotate_ply)
+    source = folder.path / f"trajectory_optimised.{format}.txt"
+    read, original = read_trajectory(written), read_trajectory(source)
+    np.testing.assert_allclose(read.T_world_camera, original.T_world_camera, atol=1e-6)
+    assert read.timed == (format == "tum")
+
+
+def test_trajectory_with_z_up_turns_the_world_only(make_run: MakeRun, tmp_path: Path) -> None:
+    folder = make_run()
+    down = read_trajectory(export(folder, "trajectory", tmp_path / "a.tum", "y-down", rotate_ply))
+    up = read_trajectory(export(folder, "trajectory", tmp_path / "b.tum", "z", rotate_ply))
+    np.testing.assert_allclose(up.positions[:, 1], down.positions[:, 2], atol=1e-6)
+    np.testing.assert_allclose(up.T_world_camera[0, :3, :3], R_UP_WORLD, atol=1e-6)
+
+
+def test_graph_is_copied(make_run: MakeRun, tmp_path: Path) -> None:
+    folder = make_run()
+    written = export(folder, "graph", tmp_path / "g.g2o", "y-down", rotate_ply)
+    assert written.read_bytes() == (folder.path / "graph.g2o").read_bytes()
+
+
+def keep_places(folder: RunFolder) -> None:
+    camera = Intrinsics(416, 128, 230.0, 230.0, 207.0, 63.0)
+    folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
+
+
+@pytest.mark.parametrize("up", ["y-down", "z"])
+def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str) -> None:
+    folder = make_run()
+    keep_places(folder)
+    written = export(folder, "colmap", tmp_path / "new" / "model", up, rotate_ply)
+    assert (written / "cameras.txt").read_text().splitlines()[1] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
+    assert len((written / "images.txt").read_text().splitlines()) == 1 + 2 * 300
+    third = (written / "points3D.txt").read_text().splitlines()[3]
+    assert third == ("3 0 -2 1 128 128 128 0" if up == "y-down" else "3 0 1 2 128 128 128 0")
+    first = [float(word) for word in (written / "images.txt").read_text().splitlines()[1].split()[1:8]]
+    half = np.sqrt(0.5)  # z up: the camera's axes turned by 90 degrees about x
+    expected = [1.0, 0, 0, 0, 0, 0, 0] if up == "y-down" else [half, half, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(first, expected, atol=1e-9)
+
+
+def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -> None:
+    folder = make_run()
+    keep_places(folder)
+    (folder.path / "map_cloud.ply").unlink()
+    written = export(folder, "colmap", tmp_path / "model", "y-down", rotate_ply)
+    assert len((written / "points3D.txt").read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "up", "why"),
+    [
+        ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
+        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap"),
+        ("mesh", "out.obj", "y-down", r"ends in \.ply"),
+        ("mesh", "out.ply", "x", "y-down or z"),
+        ("graph", "out.g2o", "z", "leave --up out"),
+        ("mesh", "", "y-down", "is a folder"),
+        ("graph", "file/out.g2o", "y-down", "cannot be written"),
+    ],
+)
+def test_errors_are_clear_and_leave_nothing(
+    make_run: MakeRun, tmp_path: Path, what: str, name: str, up: str, why: str
+) -> None:
+    folder = make_run()
+    target = tmp_path / "target"
+    target.mkdir()
+    (target / "file").write_text("in the way")
+    with pytest.raises(RunError, match=why):
+        export(folder, what, target / name, up, rotate_ply)
+    assert [path.name for path in target.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("what", "missing"),
+    [
+        ("mesh", "map_mesh.ply"),
+        ("trajectory", "trajectory_optimised.tum.txt"),
+        ("colmap", "places.npz"),
+    ],
+)
+def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:
+    folder = make_run()
+    keep_places(folder)
+    (folder.path / missing).unlink()
+    with pytest.raises(RunError, match=f"has no {missing}"):
+        export(folder, what, tmp_path / "out.ply", "y-down", rotate_ply)

@@ -1,0 +1,174 @@
+"""The report is one valid page that says everything and needs nothing."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from slam.results.report import DepthExample, write_report
+from slam.results.folder import RunFolder
+from slam.trajectory import Trajectory
+
+MakeRun = Callable[..., RunFolder]
+MakeMetrics = Callable[..., dict[str, Any]]
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class Balance(HTMLParser):
+    """Collects text, tags and every opening tag without its end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def parsed(folder: RunFolder) -> tuple[str, Balance]:
+    html = (folder.path / "report.html").read_text(encoding="utf-8")
+    balance = Balance()
+    balance.feed(html)
+    balance.close()
+    assert balance.open == []
+    assert html.startswith("<!DOCTYPE html>")
+    return html, balance
+
+
+def examples() -> list[DepthExample]:
+    image = np.full((32, 104, 3), 90, dtype=np.uint8)
+    depth = np.linspace(1.0, 40.0, 32 * 104, dtype=np.float32).reshape(32, 104)
+    return [DepthExample(index, image, depth) for index in (10, 20)]
+
+
+@pytest.fixture
+def full(make_run: MakeRun) -> RunFolder:
+    folder = make_run()
+    rng = np.random.default_rng(0)
+    write_report(folder, examples(), rng.normal(size=(500, 3)) * 20.0, rng.random((500, 3)))
+    return folder
+
+
+def test_a_full_report_is_balanced_and_needs_no_network_and_no_script(full: RunFolder) -> None:
+    html, balance = parsed(full)
+    without_pictures = re.sub(r"base64,[\w+/=]+", "", html)
+    assert not re.search(r"https?:|//|@import|url\(|<script|<link", without_pictures)
+    addresses = [attrs["href"] for tag, attrs in balance.tags if tag == "a"]
+    assert addresses
+    assert all((full.path / str(address)).is_file() for address in addresses)
+    assert not list(full.path.glob(".*"))
+
+
+def test_its_pictures_are_whole_and_not_blank(full: RunFolder) -> None:
+    _, balance = parsed(full)
+    pictures = [attrs for tag, attrs in balance.tags if tag == "img"]
+    assert [each["alt"] for each in pictures] == [
+        "Trajectories from above",
+        "Position error over distance travelled",
+        "Drift over segment length",
+        "Depth maps",
+        "Map from above",
+    ]
+    for each in pictures:
+        data = str(each["src"]).removeprefix("data:image/png;base64,")
+        assert imread(io.BytesIO(base64.b64decode(data)))[..., :3].std() > 0.02
+
+
+def test_it_says_what_ran_and_escapes_it(full: RunFolder) -> None:
+    html, balance = parsed(full)
+    words = " ".join(balance.words)
+    for said in ("sim/loop <42>", "MIT: trained on our own", "erfsfm-slam run --sequence '<b>09</b>' & more"):
+        assert said in words
+    assert "mode camera-height, value 1.6503" in words
+    assert "<b>09" not in html
+    assert "<b>too small" not in html
+    assert "LEAK" not in html
+
+
+def test_its_table_marks_the_best_and_explains_what_is_missing(full: RunFolder) -> None:
+    html, balance = parsed(full)
+    assert '<td class="best">0.870</td>' in html
+    assert "0.0123 ± 0.0060" in html
+    missing = [attrs for tag, attrs in balance.tags if tag == "td" and attrs.get("class") == "missing"]
+    assert missing
+    assert all(attrs.get("title") for attrs in missing)
+    assert "t_rel, % (7 dof) of odometry: no segment of 100 m was left" in html
+    assert "lidar trajectory: the sequence has no LiDAR scans" in html
+
+
+def test_loops_are_listed_with_their_verdict(full: RunFolder) -> None:
+    _, balance = parsed(full)
+    words = " ".join(balance.words)
+    assert "12 candidates, 3 verified, 1 accepted" in words
+    assert words.index("295") < words.index("parallax <b>too small</b>")
+
+
+def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    folder = make_run(metrics=make_metrics(leak=True))
+    write_report(folder, [], None, None)
+    html, _ = parsed(folder)
+    assert '<div class="stamp" role="alert"><b>LEAK</b>' in html
+
+
+def test_without_reference_and_map_the_report_says_so(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    metrics = make_metrics(reference=False, mode="none")
+    metrics |= {"map": None, "map_reason": "fusion is switched off"}
+    metrics["loops"] = {"candidates": None, "candidates_reason": "this part is not built yet", "rejected": []}
+    folder = make_run(metrics=metrics, reference=False)
+    write_report(folder, [], None, None)
+    html, balance = parsed(folder)
+    words = " ".join(balance.words)
+    assert "No errors: the sequence has no true poses" in words
+    assert "No map: fusion is switched off" in words
+    assert "this part is not built yet" in words
+    assert "camera heights" in words
+    assert html.count("<img") == 1
+
+
+def test_a_failed_run_says_why(make_run: MakeRun) -> None:
+    metrics = {"schema": 1, "status": "failed", "reason": "frame 7 <is> broken", "provenance": None}
+    folder = make_run(metrics=metrics, reference=False)
+    for path in folder.path.glob("trajectory_*"):
+        path.unlink()
+    write_report(folder, [], None, None)
+    html, balance = parsed(folder)
+    assert "frame 7 <is> broken" in balance.words
+    assert "No trajectory was written" in html
+    assert "FAILED" in html
+
+
+def test_a_damaged_loops_file_costs_nothing_else(make_run: MakeRun) -> None:
+    folder = make_run()
+    folder.write_text("loops.json", "{")
+    write_report(folder, [], None, None)
+    assert "12 candidates" in parsed(folder)[0]
+
+
+def test_trajectories_without_a_common_time_cost_nothing_else(make_run: MakeRun) -> None:
+    folder = make_run()
+    late = folder.trajectory("odometry")
+    assert late is not None
+    folder.write_trajectory("trajectory_lidar", Trajectory(late.stamps + 1e6, late.T_world_camera))
+    write_report(folder, examples(), None, None)
+    html, _ = parsed(folder)
+    assert "not drawn, no time stamps match" in html
+    assert html.count("<img") == 1

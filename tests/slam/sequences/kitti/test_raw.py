@@ -1,0 +1,142 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam import se3
+from slam.errors import SequenceError
+from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.kitti.raw import drive_sources
+
+FRAMES = 5
+DATE = "2011_09_26"
+NAME = f"{DATE}_drive_0013"
+CAM_TO_CAM = """calib_time: 09-Jan-2012 13:57:47
+S_rect_02: 8.0e+01 4.8e+01
+R_rect_00: 1 0 0 0 1 0 0 0 1
+P_rect_00: 60 0 39.5 0 0 60 23.5 0 0 0 1 0
+P_rect_02: 60 0 39.5 6 0 60 23.5 0 0 0 1 0
+"""
+VELO_TO_CAM = "calib_time: now\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.1 -0.3\n"
+IMU_TO_VELO = "calib_time: now\nR: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n"
+
+
+def times(offset_s: float) -> str:
+    return "".join(f"2011-09-26 13:10:{51 + 0.1 * k + offset_s:012.9f}\n" for k in range(FRAMES))
+
+
+def write_drive(root: Path, late_s: float = 0.0, name: str = NAME) -> Path:
+    """A level drive north-east at 10 m/s; packets are taken ``late_s`` after their images."""
+    import cv2
+
+    drive = root / DATE / f"{name}_sync"
+    (drive / "image_02/data").mkdir(parents=True)
+    (drive / "oxts/data").mkdir(parents=True)
+    (drive / "velodyne_points/data").mkdir(parents=True)
+    (root / DATE / "calib_cam_to_cam.txt").write_text(CAM_TO_CAM)
+    (root / DATE / "calib_velo_to_cam.txt").write_text(VELO_TO_CAM)
+    (root / DATE / "calib_imu_to_velo.txt").write_text(IMU_TO_VELO)
+    metres = 6378137.0 * np.pi / 180
+    lat0, speed = 49.0, 10 / np.sqrt(2)
+    for k in range(FRAMES):
+        cv2.imwrite(str(drive / f"image_02/data/{k:010d}.png"), np.full((24, 40, 3), k, np.uint8))
+        way = speed * (0.1 * k + late_s)
+        row = np.zeros(30)
+        row[:3] = lat0 + way / metres, 8.0 + way / metres / np.cos(np.deg2rad(lat0)), 100
+        row[5:8] = np.pi / 4, speed, speed
+        (drive / f"oxts/data/{k:010d}.txt").write_text(" ".join(f"{x:.14g}" for x in row))
+    (drive / "velodyne_points/data/0000000002.bin").write_bytes(b"")
+    (drive / "image_02/timestamps.txt").write_text(times(0.0))
+    (drive / "oxts/timestamps.txt").write_text(times(late_s))
+    return drive
+
+
+@pytest.mark.parametrize("given", ["drive", "date", "root"])
+@pytest.mark.parametrize("name", [None, NAME, f"{NAME}_sync", f"{DATE}/{NAME}_sync"])
+def test_layouts(tmp_path: Path, given: str, name: str | None) -> None:
+    drive = write_drive(tmp_path)
+    dataset = {"drive": drive, "date": drive.parent, "root": tmp_path}[given]
+    sequence = open_sequence(dataset, name, None, None)
+    assert (sequence.name, len(sequence)) == (NAME, FRAMES)
+    assert sequence.stamps == pytest.approx(np.arange(FRAMES) / 10)
+    assert sequence.provenance() == (f"kitti_raw/{NAME}[0:5]",)
+    assert sequence.scan_path(2) == drive.absolute() / "velodyne_points/data/0000000002.bin"
+    assert sequence.scan_path(1) is None
+
+
+def test_calibration_follows_the_image_size(tmp_path: Path) -> None:
+    sequence = open_sequence(write_drive(tmp_path), None, None, None)
+    K = sequence.intrinsics
+    assert (K.width, K.height, K.fx, K.fy, K.cx, K.cy) == (40, 24, 30, 30, 19.5, 11.5)
+    # camera 2 is 0.1 m left of camera 0, the LiDAR 0.1 m above and 0.3 m behind camera 0
+    assert sequence.T_camera_lidar is not None
+    assert sequence.T_camera_lidar[:3, 3] == pytest.approx([0.1, -0.1, -0.3])
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.008])
+def test_reference_drives_along_z(tmp_path: Path, late_s: float) -> None:
+    """The camera moves 1 m a frame straight ahead, whenever the packets were taken."""
+    reference = open_sequence(write_drive(tmp_path, late_s), None, None, None).reference
+    assert reference is not None and se3.is_se3(reference)
+    assert np.array_equal(reference[0], np.eye(4))
+    wanted = np.column_stack([np.zeros(FRAMES), np.zeros(FRAMES), np.arange(FRAMES)])
+    assert reference[:, :3, 3] == pytest.approx(wanted, abs=1e-3)
+
+
+def test_root_with_several_drives(tmp_path: Path) -> None:
+    write_drive(tmp_path)
+    write_drive(tmp_path, name=f"{DATE}_drive_0014")
+    assert sequence_names(tmp_path) == [NAME, f"{DATE}_drive_0014"]
+    with pytest.raises(SequenceError, match="has 2 sequences"):
+        open_sequence(tmp_path, None, None, None)
+    assert open_sequence(tmp_path, f"{DATE}_drive_0014", None, None).name == f"{DATE}_drive_0014"
+
+
+def test_alias_in_the_odometry_benchmark() -> None:
+    labels = [source.label(100) for source in drive_sources("2011_09_30_drive_0033")]
+    assert labels == ["kitti_raw/2011_09_30_drive_0033[0:100]", "kitti_odometry/09[0:100]"]
+    _, alias = drive_sources("2011_09_30_drive_0028")
+    assert alias.shifted(1100).label(4071) == "kitti_odometry/08[0:4071]"
+
+
+def test_optional_parts(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path)
+    (drive.parent / "calib_imu_to_velo.txt").unlink()
+    sequence = open_sequence(drive, None, None, None)
+    assert sequence.reference is None and sequence.T_camera_lidar is not None
+    (drive.parent / "calib_velo_to_cam.txt").unlink()
+    (drive / "image_02/timestamps.txt").unlink()
+    sequence = open_sequence(drive, None, None, None)
+    assert sequence.T_camera_lidar is None and sequence.camera_height_m == 1.65
+    assert sequence.stamps == pytest.approx(np.arange(FRAMES) / 10)
+
+
+def test_errors(tmp_path: Path) -> None:
+    drive = write_drive(tmp_path)
+    (drive / "image_02/timestamps.txt").write_text("yesterday\n")
+    with pytest.raises(SequenceError, match=r"timestamps\.txt must hold a date and a time a row"):
+        open_sequence(drive, None, None, None)
+    (drive / "image_02/timestamps.txt").write_text(times(0.0)[:29])
+    with pytest.raises(SequenceError, match=r"timestamps\.txt has 1 rows for 5 images"):
+        open_sequence(drive, None, None, None)
+    (drive / "image_02/timestamps.txt").write_text(times(0.0))
+    (drive / "oxts/data/0000000001.txt").write_text("1 2 3")
+    with pytest.raises(SequenceError, match=r"0000000001\.txt has 3 numbers, not 30"):
+        open_sequence(drive, None, None, None)
+    (drive / "oxts/data/0000000001.txt").unlink()
+    with pytest.raises(SequenceError, match="has 4 packets for 5 images"):
+        open_sequence(drive, None, None, None)
+    (drive.parent / "calib_cam_to_cam.txt").unlink()
+    with pytest.raises(SequenceError, match=r"no calib_cam_to_cam\.txt in .*2011_09_26: .*beside the drives"):
+        open_sequence(drive, None, None, None)
+    for path in (drive / "image_02/data").iterdir():
+        path.unlink()
+    with pytest.raises(SequenceError, match="looked for png or jpg in image_02/data"):
+        open_sequence(drive, None, None, None)
+
+
+def test_unrectified_drive(tmp_path: Path) -> None:
+    folder = tmp_path / f"{NAME}_extract"
+    folder.mkdir()
+    with pytest.raises(SequenceError, match="not rectified"):
+        open_sequence(folder, None, None, None)

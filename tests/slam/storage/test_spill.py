@@ -1,0 +1,30 @@
+"""What waits on disk comes back as it was, and a full disk says what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import SlamError
+from slam.storage.spill import SpillFile
+
+
+def test_arrays_come_back_in_any_order() -> None:
+    rng = np.random.default_rng(0)
+    arrays = [rng.integers(0, 255, (4, 5, 3), np.uint8), rng.normal(size=(4, 5)).astype(np.float32)[:, ::2], np.eye(4)]
+    spill_file = SpillFile()
+    kept = [spill_file.put(array) for array in arrays]
+    kept[0].read()
+    kept.append(spill_file.put(arrays[0]))
+    for array, each in reversed(list(zip([*arrays, arrays[0]], kept, strict=True))):
+        np.testing.assert_array_equal(each.read(), array)
+        assert each.read().dtype == array.dtype
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda: Path("/dev/full").open("wb"))  # noqa: SIM115
+    with pytest.raises(SlamError, match=r"keyframes cannot be kept in .*No space left.*set TMPDIR"):
+        SpillFile().put(np.zeros(100_000))

@@ -1,0 +1,66 @@
+"""What a run is worth against the truth, beside the errors that it measures itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.results.comparison import lookup
+from slam.results.folder import RunFolder
+from slam.results.summary import null
+from slam.se3 import FloatArray, invert, rotation_angle
+
+FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop that is farther off the truth is false
+
+
+def judged(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Errors as shares, and the accepted loops sorted by the truth.
+
+    ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's.
+    """
+    length = lookup(metrics, "sequence", "length_m")
+    network, optimised = (_ate(metrics, name) for name in ("network", "optimised"))
+    return {
+        **_share("network_percent", network, length, 100.0),
+        **_share("optimised_percent", optimised, length, 100.0),
+        **_share("of_network", optimised, network, 1.0),
+        **_loops(folder, metrics),
+    }
+
+
+def _ate(metrics: Mapping[str, Any], trajectory: str) -> tuple[float | None, str]:
+    return lookup(metrics, "trajectories", trajectory, "align", "7dof", "ate_rmse_m")
+
+
+def _share(name: str, part: tuple[float | None, str], whole: tuple[float | None, str], unit: float) -> dict[str, Any]:
+    if part[0] is None or not whole[0]:
+        return null(name, part[1] or whole[1] or "nothing to compare with")
+    return {name: unit * part[0] / whole[0]}
+
+
+def _loops(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
+    reference = RunFolder.open(folder).trajectory("reference")
+    reason = lookup(metrics, "loops", "accepted")[1]
+    if reference is None:
+        reason = "the sequence has no true poses"
+    elif lookup(metrics, "scale", "mode")[0] == "none":
+        reason = "loops in camera heights cannot be compared with metres"
+    if reference is None or reason:
+        return null("true_loops", reason) | null("false_loops", reason)
+    accepted = json.loads((folder / "loops.json").read_text(encoding="utf-8"))["accepted"]
+    false = sum(
+        is_false(np.array(loop["T_from_to"]), *reference.T_world_camera[[loop["from"], loop["to"]]])
+        for loop in accepted
+    )
+    return {"true_loops": len(accepted) - false, "false_loops": false}
+
+
+def is_false(T_from_to: FloatArray, T_world_from: FloatArray, T_world_to: FloatArray) -> bool:
+    """Whether a measured relative pose, metres, is too far off the true one."""
+    off = invert(invert(T_world_from) @ T_world_to) @ T_from_to
+    far = np.linalg.norm(off[:3, 3]) > FALSE_M
+    return bool(far or rotation_angle(off[:3, :3]) > np.deg2rad(FALSE_DEG))

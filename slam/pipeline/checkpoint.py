@@ -28,6 +28,7 @@ from slam.loops.descriptors import View
 from slam.pipeline.observer import Keyframe, Observations, Observer
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
+from slam.storage.archive import reading_archive
 from slam.storage.serialisation import Memento, Serialiser
 from slam.storage.spill import SpillFile
 
@@ -141,9 +142,6 @@ def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
 
 def _read_keyframes(path: Path) -> Iterator[Keyframe]:
     spill_file = SpillFile()
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            for index in sorted(int(name.removeprefix("image_")) for name in file.files if name.startswith("image_")):
-                yield Keyframe(index, spill_file.put(file[f"image_{index}"]), spill_file.put(file[f"depth_{index}"]))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path} is damaged ({type(error).__name__}): run the sequence again") from error
+    with reading_archive(path), np.load(path, allow_pickle=False) as file:
+        for index in sorted(int(name.removeprefix("image_")) for name in file.files if name.startswith("image_")):
+            yield Keyframe(index, spill_file.put(file[f"image_{index}"]), spill_file.put(file[f"depth_{index}"]))

@@ -79,7 +79,8 @@ class DiskCache:
             return
         content = _packed(answer)
         try:
-            write_atomically(self._path(key), lambda file: file.write_bytes(_checksum(content) + content))
+            entry = _checksum(content) + content  # the checksum finds what the disk lost: no need to wait for it
+            write_atomically(self._path(key), lambda file: file.write_bytes(entry), sync=False)
         except SlamError as error:
             logger.warning("the cache keeps nothing more: %s", error)
             self._is_writable = False

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import RunError
+from slam.storage.archive import reading_archive
 
 _FORMAT = 1
 Tree = Any  # of JSON
@@ -62,16 +63,13 @@ class Serialiser:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        try:
-            with zipfile.ZipFile(path) as file:
-                head = json.loads(file.read("tree.json"))
-                if head["format"] != _FORMAT:
-                    raise RunError(f"{path} has format {head['format']}, this version reads {_FORMAT}: run again")
-                with file.open("arrays.bin") as content:
-                    arrays = [_array(content.read, *described) for described in head["arrays"]]
+        with reading_archive(path), zipfile.ZipFile(path) as file:
+            head = json.loads(file.read("tree.json"))
+            if head["format"] != _FORMAT:
+                raise RunError(f"{path} has format {head['format']}, this version reads {_FORMAT}: run again")
+            with file.open("arrays.bin") as content:
+                arrays = [_array(content.read, *described) for described in head["arrays"]]
             return {name: self._unpacked(tree, arrays) for name, tree in head["values"].items()}
-        except (OSError, KeyError, IndexError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise RunError(f"{path} is missing or damaged ({type(error).__name__}): run the sequence again") from error
 
     def _unpacked(self, tree: Tree, arrays: list[NDArray[Any]]) -> Any:
         if isinstance(tree, list):

@@ -15,6 +15,7 @@ import typer
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
 from slam.runtime.progress import progress_bar
+from slam.runtime.signals import Terminated
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -69,15 +70,15 @@ def run(
         folder = run_slam(
             dataset,
             sequence,
-            camera,
-            weights,
-            config,
-            overrides or [],
-            frames,
-            output,
-            seed,
-            device,
-            progress,
+            camera=camera,
+            weights=weights,
+            config=config,
+            overrides=overrides or [],
+            frames=frames,
+            output=output,
+            seed=seed,
+            device=device,
+            progress=progress,
             command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
             cache=cache,
             rerun=rerun,
@@ -324,4 +325,6 @@ def main() -> None:
     except SystemExit as end:
         if end.code == _INTERRUPTED:
             typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
+        elif isinstance(end, Terminated):
+            typer.echo(f"erfsfm-slam: {end}; what was written stays", err=True)
         raise

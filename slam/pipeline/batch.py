@@ -123,7 +123,7 @@ class SlamPipeline:
 
     def estimate(self) -> SlamResult:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
-        mode = self._require_possible()
+        mode = self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
         observer = self._observe()
@@ -183,7 +183,7 @@ class SlamPipeline:
                 self._progress("map", done + 1, len(keyframes))
         return tsdf_map
 
-    def _require_possible(self) -> ScaleMode:
+    def require_possible(self) -> ScaleMode:
         """The scale mode of this run; refuses before any work what could only fail after all of it."""
         sequence, shortest = self._sequence, self._predictor.sources + 1
         if len(sequence) < shortest:

@@ -185,7 +185,7 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
     try:
         return trajectories_of(folder)
     except SlamError as error:
-        logger.warning("the report shows no trajectories: %s", error)
+        logger.info("the report shows no trajectories: %s", error)
         return {}
 
 

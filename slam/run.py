@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,7 +48,7 @@ class RunOptions(TypedDict, total=False):
     camera: Path | None
     weights: str | Path
     config: str | Path | None
-    overrides: list[str] | tuple[str, ...]
+    overrides: Sequence[str]
     frames: str | None
     output: Path | None
     seed: int
@@ -88,7 +89,7 @@ class RunRequest:
     camera: Path | None = None
     weights: str | Path = "default"
     config: str | Path | None = None
-    overrides: list[str] | tuple[str, ...] = ()
+    overrides: Sequence[str] = ()
     frames: str | None = None
     output: Path | None = None
     seed: int = 0

@@ -1,4 +1,4 @@
-"""What a run keeps so that new images can be found in its map: features, their points and where they were seen."""
+"""Features of a run's frames, with 3-D points and poses, kept so that new images can be localised in its map."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Places:
     T_world_camera: FloatArray
 
     def write(self, path: Path) -> None:
-        """Write as ``.npz``; what each array is stands in ``docs/outputs.md``."""
+        """Write as ``.npz``; ``docs/outputs.md`` describes each array."""
         camera = self.intrinsics
         np.savez_compressed(
             path,
@@ -55,7 +55,7 @@ class Places:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
             width, height, *pinhole = content["camera"].tolist()
             frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-            # beyond the last view there is nothing
+            # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
             return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])

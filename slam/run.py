@@ -121,7 +121,7 @@ def run_slam(
         SlamError, ErfsfmError: one line. Whatever ends a run, its folder holds what there is and says why.
     """
     request = RunRequest(dataset, sequence, **options)
-    with run_log() as log, raising_on_termination():
+    with run_log() as log, raising_on_termination() as ignore_signals:
         job = _prepare(request)
         folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
         folder.write_metrics(describe_start(job.provenance))
@@ -130,6 +130,7 @@ def run_slam(
             with limit_library_threads():
                 _run(job, folder)
         except BaseException as error:
+            ignore_signals()
             _leave_failure(folder, log, job.settings.output.report, error)
             if folder.replaces is not None and isinstance(error, SlamError):
                 kept = f"{folder.replaces} keeps its earlier run, this one is in {folder.path}"

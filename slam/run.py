@@ -26,7 +26,7 @@ from slam.prediction.networks import NetworkPredictor
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
-from slam.results.output import check_output
+from slam.results.output import UNFINISHED, check_output
 from slam.results.report import DepthExample, write_report
 from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog, run_log
@@ -180,9 +180,10 @@ def _settings(request: RunRequest) -> SlamConfig:
         return load_config(request.config, request.overrides)
     if request.config is not None:
         raise ConfigError(f"the configuration of {continues} holds for what continues it: leave out --config")
-    if request.output is not None and request.output.resolve() == continues.resolve():
+    output = request.output
+    if output is not None and continues.resolve() in (output.resolve(), (output / UNFINISHED).resolve()):
         raise RunError(
-            f"{request.output} is the run to continue, and would be lost with this one: choose another --output"
+            f"{continues} is the run to continue, and would be lost with --output {output}: choose another --output"
         )
     own = load_config(RunFolder.open(continues).require("config.yaml"))
     settings = load_config(continues / "config.yaml", request.overrides)

@@ -47,6 +47,14 @@ def test_a_failed_run_keeps_its_place(make_run: MakeRun) -> None:
     assert "0.870" in text
 
 
+@pytest.mark.parametrize(("status", "word"), [("failed", "failed"), ("estimated", "did not end")])
+def test_numbers_of_a_run_that_did_not_end_are_shown_with_its_reason(
+    make_run: MakeRun, make_metrics: MakeMetrics, status: str, word: str
+) -> None:
+    text = printed([make_run("early", make_metrics() | {"status": status, "reason": "no space left"})])
+    assert "0.870" in text and word in text and f"early {word}: no space left" in text
+
+
 def test_json_holds_the_objects_of_metrics_json(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
     metrics = make_metrics()
     run = make_run("one", metrics)

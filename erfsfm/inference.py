@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
@@ -48,6 +48,13 @@ def choose_device(choice: str) -> torch.device:
     return torch.device("cuda" if choice != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+@dataclass(frozen=True)
+class PreparedImage:
+    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``."""
+
+    tensor: Tensor
+
+
 class DepthPosePredictor:
     """Depth of single images and poses of snippets, in one unknown scale.
 
@@ -67,8 +74,6 @@ class DepthPosePredictor:
         if self.device.type == "cpu":  # images have the channels of a pixel together, and small kernels gain by it
             for network in (self._depth_net, self._pose_net):
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        # an image of a sequence is asked for its depth and again in every snippet: image, its bytes then, tensor
-        self._inputs: deque[tuple[NDArray[np.uint8], NDArray[np.uint8], Tensor]] = deque(maxlen=self.sources + 1)
 
     @classmethod
     def from_weights(cls, name_or_dir: str | Path, device: str = "cpu") -> DepthPosePredictor:
@@ -113,14 +118,18 @@ class DepthPosePredictor:
         height, width = image.shape[:2]
         return depth_at(self.disparity(image), height, width)
 
+    def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
+        """An image ``(H, W, 3)`` uint8 RGB as the networks take it; one that is asked about again is prepared once."""
+        return PreparedImage(self._input(image))
+
     @torch.inference_mode()
-    def disparity(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
         """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size."""
-        disparity: NDArray[np.float32] = self._depth_net(self._input(image))[0, 0].float().cpu().numpy()
+        disparity: NDArray[np.float32] = self._depth_net(self._tensor(image))[0, 0].float().cpu().numpy()
         return disparity
 
     @torch.inference_mode()
-    def poses(self, images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
+    def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
         Args:
@@ -136,7 +145,7 @@ class DepthPosePredictor:
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
         middle = self.sources // 2
-        inputs = [self._input(image) for image in images]
+        inputs = [self._tensor(image) for image in images]
         target = inputs.pop(middle)
         T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
         return T_source_target
@@ -145,15 +154,12 @@ class DepthPosePredictor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
-        for known, content, tensor in self._inputs:
-            if known is image and (content is image or np.array_equal(content, image)):
-                return tensor
         resized = resize_image(image, self.record.network.height, self.record.network.width)
         tensor = torch.from_numpy(resized.astype(np.float32)).to(self.device)
-        tensor = tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
-        is_settled = image.base is None and not image.flags.writeable
-        self._inputs.append((image, image if is_settled else image.copy(), tensor))
-        return tensor
+        return tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
+
+    def _tensor(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
+        return image.tensor if isinstance(image, PreparedImage) else self._input(image)
 
 
 class _PoseMatrices(nn.Module):

@@ -29,8 +29,9 @@ class Section(BaseModel):
 class FrontendConfig(Section):
     """Noise of the pose network's direct snippet poses, see ``frontend/network_factors.py``."""
 
-    use: Literal["calibrated", "bridge", "always"] = Field(
-        default="calibrated", description="always with a noise beside the weights, else bridge: where geometry has none"
+    use: Literal["calibrated", "gaps", "always"] = Field(
+        default="calibrated",
+        description="calibrated: always with a noise beside the weights, else gaps: where geometry has none",
     )
     rotation_sigma_deg: float = Field(default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step")
     translation_relative_sigma: float = Field(default=0.1, gt=0, le=10, description="share of the step's length")
@@ -134,6 +135,9 @@ class GapsConfig(Section):
     blank_contrast: float = Field(default=3.0, ge=0, description="a standard deviation of grey levels below is blank")
     noise_contrast: float = Field(default=0.3, ge=0, lt=1, description="share of contrast that survives blurring")
     min_correlation: float = Field(default=0.2, ge=-1, le=1, description="correlation with the frames before")
+    repeat_difference: float = Field(
+        default=0.1, ge=0, description="difference over gradient of an image encoded again"
+    )
     max_unread_frames: int = Field(default=30, ge=1, description="more unreadable images in a row end the run")
     rotation_sigma_deg: float = Field(default=2.0, gt=0, le=90, description="rotation sigma of a bridged step")
     translation_relative_sigma: float = Field(default=0.5, gt=0, le=10, description="share of a bridged step's length")

@@ -13,6 +13,10 @@ class SequenceError(SlamError):
     """A sequence is missing, incomplete or malformed."""
 
 
+class MissingFrameError(SequenceError):
+    """A frame of a sequence has no image: a gap in time, which is interpolated."""
+
+
 class TrajectoryError(SlamError):
     """A trajectory file cannot be read, or two trajectories do not match."""
 

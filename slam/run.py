@@ -23,7 +23,6 @@ from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
-from slam.prediction.cached import CachedNetworks
 from slam.prediction.networks import NetworkPredictor
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
@@ -38,7 +37,7 @@ from slam.results.summary import (
 from slam.runtime.imports import import_rerun
 from slam.runtime.threads import limit_library_threads
 from slam.sequences.catalogue import open_sequence
-from slam.storage.cache import CacheNamespace, DiskCache, fingerprint, without_cache
+from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, fingerprint, without_cache
 
 logger = logging.getLogger(__name__)
 
@@ -100,8 +99,8 @@ def run_slam(
         recording = drive.continued(recording)
     memory = None if cache is None else DiskCache(cache)
     get_or_compute = without_cache if memory is None else CacheNamespace(memory, _code()).get_or_compute
-    asked = networks if memory is None else _cached(networks, memory)
-    predictor = NetworkPredictor(asked, recording.intrinsics, get_or_compute)
+    answers = without_cache if memory is None else _answers(networks, memory)
+    predictor = NetworkPredictor(networks, recording.intrinsics, get_or_compute, answers)
     provenance = Provenance(
         version=__version__,
         commit=commit(),
@@ -118,8 +117,9 @@ def run_slam(
     folder.write_text("config.yaml", dump_yaml(settings))
     with _logging_to(folder.path / "run.log"):
         try:
-            _seed(seed)
-            pipeline = SlamPipeline(recording, predictor, settings, progress, networks.noise, get_or_compute, drive)
+            pipeline = SlamPipeline(
+                recording, predictor, settings, progress, networks.noise, get_or_compute, drive, seed
+            )
             with limit_library_threads():
                 result = _run(folder, pipeline, recording, provenance, settings.output)
             if rerun is not None:
@@ -167,10 +167,10 @@ def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, erro
             write_report(folder, [], None, None)
 
 
-def _cached(networks: DepthPosePredictor, memory: DiskCache) -> CachedNetworks:
-    """The networks with a memory of their answers; GPU and CPU answer a little differently and share none."""
+def _answers(networks: DepthPosePredictor, cache: DiskCache) -> GetOrCompute:
+    """The cache of the networks' answers; GPU and CPU answer a little differently and share none."""
     network = networks.record.network.model_dump_json()
-    return CachedNetworks(networks, f"{networks.sha256} {network} {networks.device.type}", memory)
+    return CacheNamespace(cache, f"{networks.sha256} {network} {networks.device.type}").get_or_compute
 
 
 def _code() -> str:
@@ -181,20 +181,15 @@ def _code() -> str:
     return " ".join((fingerprint(*sources, Path(se3.__file__), Path(photometric_residual.__file__)), *versions))
 
 
-def _seed(seed: int) -> None:
-    np.random.seed(seed)
-    cv2.setRNGSeed(seed)
-
-
 def _run(
     folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, output: OutputConfig
 ) -> SlamResult:
     estimate = pipeline.estimate()
     _write_estimate(folder, estimate, sequence.intrinsics)
     if output.keep != "nothing":
-        folder.write(DRIVE, SessionCheckpoint.of(sequence, estimate.observer, provenance.weights_sha256).write)
+        folder.write(DRIVE, SessionCheckpoint.of(sequence, estimate.state, provenance.weights_sha256).write)
     if output.keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, estimate.observer.seen.keyframes))
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, estimate.state.seen.keyframes))
     result = replace(estimate, map=pipeline.fuse(estimate))
     surface = write_map(folder, result, sequence)
     folder.write_metrics(run_metrics(result, sequence, provenance, surface.summary))

@@ -135,7 +135,7 @@ class Localiser:
         if isinstance(found, str):
             return found
         T_world_camera = T_world_place @ invert(found.T_image_points)
-        return _Sighting(place.index, T_world_camera, len(found.inliers), found.depth)
+        return _Sighting(place.index, T_world_camera, found.inliers, found.depth)
 
     def _agree(self, one: _Sighting, other: _Sighting) -> bool:
         T = invert(one.T_world_camera) @ other.T_world_camera

@@ -94,6 +94,7 @@ def close_loops(
     intrinsics: Intrinsics,
     config: LoopsConfig,
     get_or_compute: GetOrCompute = without_cache,
+    seed: int = 0,
 ) -> LoopClosures:
     """Find where the drive came back.
 
@@ -113,7 +114,7 @@ def close_loops(
     candidates = find_candidates(
         views, path[np.array([view.index for view in views], dtype=int)], config, get_or_compute
     )
-    verifier = LoopVerifier(config, intrinsics, get_or_compute)
+    verifier = LoopVerifier(config, intrinsics, get_or_compute, seed)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]

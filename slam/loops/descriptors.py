@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import LoopsConfig
-from slam.frames import DepthMap, Frame, Image, Intrinsics
+from slam.frames import DepthMap, Frame, Grey, Intrinsics
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 Descriptors = NDArray[np.uint8]
@@ -67,14 +67,13 @@ class FeatureExtractor:
         """
         settings = (self._config.max_features, self._config.corner_contrast)
         pixels, descriptors = self._get_or_compute(
-            "features", (frame.image, repr(settings)), lambda: self._features(frame.image)
+            "features", (frame, repr(settings)), lambda: self._features(frame.grey)
         )
         points = self._points(pixels, depth_unscaled, height_unscaled)
         return View(frame.index, pixels, descriptors, points)
 
-    def _features(self, image: Image) -> Answer:
+    def _features(self, grey: Grey) -> Answer:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found = self._orb.detect(grey, None)
         chosen = [found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)]
         chosen, descriptors = self._orb.compute(grey, chosen)

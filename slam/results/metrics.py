@@ -58,7 +58,7 @@ def run_metrics(
             "status": "ok",
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
-            | describe_gaps(result.observations.bridged)
+            | describe_gaps(result.observations.interpolated)
             | {"continued_at": before},
             "timing": describe_timing(result.stopwatch, len(sequence) - before),
             "scale": _scale(result),

@@ -11,7 +11,7 @@ from slam.errors import SlamError
 from slam.storage.files import write_atomically
 from slam.runtime.imports import import_rerun
 from slam.frames import Intrinsics
-from slam.pipeline.observer import Keyframe
+from slam.pipeline.observations import Keyframe
 from slam.pipeline.batch import SlamResult
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory

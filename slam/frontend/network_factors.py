@@ -3,8 +3,9 @@
 Noise that lies beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
 overlapping snippets measured of it, with the correlation of their errors. Roads may be unlike those that the noise was
 measured on: on the drive it is scaled to how far the network is from image geometry, apart for straights and turns, and
-what geometry does not know of itself the network does not know either (``docs/design/0019``). What is left has heavier
-tails than normal errors and lasts from snippet to snippet; the graph takes it for so much more (``docs/design/0020``).
+what geometry does not know of itself the network does not know either. What is left has heavier tails than normal
+errors and lasts from snippet to snippet; the graph takes it for so much more
+(``docs/design/noise-and-the-pose-graph.md``).
 
 Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
 sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length

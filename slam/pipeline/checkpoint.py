@@ -1,7 +1,7 @@
 """What a run folder keeps so that the drive can go on (``run --continue``): all that was measured, and no images of it.
 
 The frames that follow are looked at as if there had been no pause, and lengths, noise, loops and graph are then found
-anew for the whole drive (``docs/design/0016``).
+anew for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 
 from __future__ import annotations

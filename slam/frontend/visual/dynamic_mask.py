@@ -1,7 +1,8 @@
 """Where in the image things lately moved by themselves.
 
 A car ahead stays where it is in the image for minutes. Some of its corners fit the camera's motion by chance, and these
-bend it; but most do not, and those beside them are then not to be believed either (``docs/design/0014``).
+bend it; but most do not, and those beside them are then not to be believed either
+(``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations

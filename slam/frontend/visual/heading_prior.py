@@ -1,7 +1,8 @@
 """A vehicle goes where it is steered: its direction of motion follows from its turn, up to a fraction of a degree.
 
 What corners say of a direction and of a turn is bound together: with few of them, a camera that slides to the right can
-hardly be told from one that turns to the left, and the errors of both are correlated by 0.8 (``docs/design/0013``). How
+hardly be told from one that turns to the left, and the errors of both are correlated by 0.8
+(``docs/design/visual-front-end.md``). How
 direction and turn of this drive belong together is seen from the steps before; whatever is known of the direction then
 mends the turn. On a camera that goes anywhere the relation is loose, and says nothing.
 """

@@ -2,7 +2,7 @@
 
 Seen from a moving car a window on the road stretches by a fifth from frame to frame, one on a near wall by a tenth. A
 tracker that only shifts windows follows whatever part of one has most texture: single corners err by half a pixel, and
-those on the road all together upwards, which looks like a camera that pitches (``docs/design/0013``).
+those on the road all together upwards, which looks like a camera that pitches (``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations

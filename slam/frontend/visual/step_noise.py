@@ -4,7 +4,7 @@ Corners promise sigmas that hold where the camera is all that errs. On the road 
 stamps, the mount, whatever is not a pinhole - and it goes wrong in proportion to how the camera shakes, how it turns,
 and where a step does not fit the steps beside it. So the sigmas of each step are widened by shares of what of these the
 corners' own noise does not explain. The shares in ``GeometryConfig`` were fitted once
-(``docs/design/0009-noise-from-the-drive-itself.md``).
+(``docs/design/noise-and-the-pose-graph.md``).
 """
 
 from __future__ import annotations

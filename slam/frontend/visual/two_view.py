@@ -1,7 +1,8 @@
 """The motion between two views that corners, learned depth and the drive so far agree on.
 
 Corners alone can be misled: when most of what stands out in an image is a car that turns with the camera, its corners
-and the distant ones lie on the epipolar lines of a motion that neither of them made (``docs/design/0010``). Two judges
+and the distant ones lie on the epipolar lines of a motion that neither of them made
+(``docs/design/visual-front-end.md``). Two judges
 tell it from the true one. A motion says how far each corner shifts along its epipolar line, and so does learned depth;
 and a vehicle moves the way it has moved.
 """

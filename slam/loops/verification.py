@@ -1,6 +1,6 @@
-"""A loop is measured or refused: matched corners against learned depth, in both directions.
+"""Verification of a loop candidate: perspective-n-point on learned depth, in both directions.
 
-Every gate is free of scale: pixels, shares, degrees, and lengths as a share of the depth of what was seen.
+All thresholds are independent of scale: pixels, ratios, degrees, and lengths over the depth of the points.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LEAST_PIXEL_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class Loop:
-    """A measured loop; ``inliers`` is the smaller of both directions."""
+    """A verified loop; ``inliers`` is the smaller of both directions."""
 
     measured: RelativePose
     inliers: int
@@ -36,13 +36,13 @@ class Loop:
         return self.measured.from_index, self.measured.to_index
 
     def refused(self, reason: str) -> RejectedLoop:
-        """The same loop, refused after all."""
+        """The same loop, rejected for a reason."""
         return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)
 
 
 @dataclass(frozen=True)
 class RejectedLoop:
-    """A loop that was looked at and refused, with as much as was measured of it."""
+    """A rejected candidate or loop, with what was measured of it."""
 
     from_index: int
     to_index: int
@@ -63,7 +63,7 @@ class LoopVerifier:
         self._get_or_compute = get_or_compute
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
-        """Measure the pose of the later view in the earlier one, or say why not."""
+        """Measure the pose of the later view in the earlier one, or reject it with a reason."""
         given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
         rows_earlier, rows_later = self._get_or_compute(
             "corners alike", given, lambda: matches(earlier, later, self._config)
@@ -95,7 +95,7 @@ class LoopVerifier:
         return Loop(measured, inliers, score)
 
     def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Resection | str:
-        """The camera that sees ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or why there is none.
+        """The camera pose from ``points`` ``(M, 3)`` seen at ``pixels`` ``(M, 2)`` by RANSAC, or why there is none.
 
         Points with NaN are left out.
         """
@@ -131,9 +131,9 @@ class LoopVerifier:
     def _sigmas(
         self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Resection, backward: Resection
     ) -> FloatArray:
-        """Sigmas ``(6,)`` in camera b: of corners in both directions, of learned depth, of what they disagree about.
+        """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
-        Both directions see the same corners, and neighbouring corners err together: the second gains nothing.
+        Both directions use the same corners, whose errors are correlated: averaging them does not narrow the sigmas.
         """
         config = self._config
         corners = config.corner_sigma_widening * np.hypot(forward.sigmas, backward.sigmas)
@@ -150,7 +150,7 @@ class LoopVerifier:
 class Resection:
     """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z.
 
-    ``sigmas`` ``(6,)``: of rotation and translation in the image's camera, were its corners to err independently.
+    ``sigmas`` ``(6,)``: of rotation and translation in the image's camera, for independent corner errors.
     """
 
     T_image_points: FloatArray
@@ -162,7 +162,7 @@ class Resection:
 def _resection_sigmas(
     points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray, K: FloatArray
 ) -> FloatArray:
-    """Sigmas ``(6,)`` of a resection from the Jacobian and the size of its reprojection residuals."""
+    """Sigmas ``(6,)`` of perspective-n-point from its Jacobian and the spread of its reprojection residuals."""
     projected, jacobian = cv2.projectPoints(points, rotation, translation, K, None)
     residual = (projected.reshape(-1, 2) - pixels).ravel()
     sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
@@ -171,7 +171,7 @@ def _resection_sigmas(
 
 
 def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of both views that are each other's nearest by Hamming distance, clearly before the second nearest."""
+    """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     distance = hamming(first.descriptors, second.descriptors)
@@ -184,7 +184,7 @@ def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.
 
 
 def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:
-    """The mean of two measurements of one transform that lie close together."""
+    """The mean of two close measurements of one transform."""
     R_a_b = T_a_b[:3, :3]
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(R_a_b.T @ T_a_b_again[:3, :3]).as_rotvec())
     return make(R_a_b @ half.as_matrix(), 0.5 * (T_a_b[:3, 3] + T_a_b_again[:3, 3]))

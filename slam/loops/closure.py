@@ -40,7 +40,7 @@ class LoopClosures:
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
         """The same after the pose graph dropped some accepted loops."""
         ends = {(edge.from_index, edge.to_index) for edge in dropped}
-        gone = tuple(loop.refused("the trajectory cannot meet it") for loop in self.accepted if loop.ends in ends)
+        gone = tuple(loop.refused("contradicts the pose graph") for loop in self.accepted if loop.ends in ends)
         kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
         return replace(self, accepted=kept, rejected=gone + self.rejected)
 

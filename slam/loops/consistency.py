@@ -33,7 +33,7 @@ def agreeing(
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         way = path[later] - path[earlier]
         if drift > config.max_drift_ratio * way:
-            refused.append(loop.refused(f"moves the trajectory by {drift:.1f} on a way of {way:.0f}"))
+            refused.append(loop.refused(f"corrects the odometry by {drift:.1f} over a path of {way:.0f}"))
         else:
             possible.append(loop)
     for loop, (supporting, conflicting) in zip(possible, _votes(possible, T_world_camera, config), strict=True):

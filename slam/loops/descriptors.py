@@ -1,4 +1,4 @@
-"""Features of a frame for loop closure: ORB corners and descriptors, and their 3-D points from learned depth."""
+"""Features of a frame for loop closure: ORB (Rublee et al. 2011) and 3-D points from learned depth."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The system runs as ever; then the near part of every learned depth map becomes a cloud of points, and kiss-icp (Vizzo et
 al. 2023) registers cloud after cloud. Its trajectory stands in one table with those of the run. What was found is told
-in docs/design/0012-kiss-icp-on-learned-depth.md.
+in docs/design/tried-without-success.md.
 
 Example: python tools/kiss_icp_on_learned_depth.py --dataset KITTI --sequence 05 --weights sim
 """

@@ -3,7 +3,7 @@
 Pose variants are trained beside the plain depth network, depth variants beside the plain pose network. Finished
 trainings are not repeated, broken ones go on where they stopped, so the same command may be given again.
 
-Example: python tools/study_receptive_field.py --worlds worlds --unseen unseen --report docs/receptive_field.md
+Example: python tools/study_receptive_field.py --worlds worlds --unseen unseen --report docs/receptive-field-study.md
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes to the configuration")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("runs/study"), help="keeps every training")
-    parser.add_argument("--report", type=Path, default=Path("docs/receptive_field.md"))
+    parser.add_argument("--report", type=Path, default=Path("docs/receptive-field-study.md"))
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
 

@@ -1,4 +1,4 @@
-"""The pinhole camera: its matrix follows every resize, crop and flip here and nowhere else.
+"""The pinhole camera, and its matrix under resize, crop and flip.
 
 Pixel (0, 0) is the centre of the top-left pixel, so a resize by s moves the principal point as
 ``c' = (c + 0.5) s - 0.5``.

@@ -1,7 +1,7 @@
-"""A network as one graph of tensor operations, for many answers at one size of image.
+"""A network traced and frozen to one TorchScript graph, for inference at one image size.
 
-The graph is run without Python: a quarter faster on a CPU, where a narrow network spends as long between its layers as
-in many of them, and other threads of Python go on meanwhile.
+The graph runs without Python: a quarter faster on a CPU, where a narrow network spends as long between its layers as in
+them, and other Python threads run meanwhile.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from erfsfm.networks.deformable import meets_kernel
 
 
 class Frozen(nn.Module):
-    """A network that becomes a graph when it is asked for the first time, which takes about as long as ten answers.
+    """A network that is traced and frozen at its first call, which takes about as long as ten calls.
 
-    Answers are the network's up to rounding. One that computes by the compiled kernel of deformable layers
-    (``erfsfm.networks.deformable``) is faster as it is, and stays so.
+    Outputs equal the network's up to rounding. A network that uses the compiled kernel of deformable layers
+    (``erfsfm.networks.deformable``) is faster without a graph and is not traced.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -29,18 +29,18 @@ class Frozen(nn.Module):
         self._is_frozen = False
 
     def forward(self, *inputs: Tensor | list[Tensor]) -> Tensor:
-        """The network's answer."""
+        """The network's output."""
         if not self._is_frozen:
             self.network = _graph(self.network, *inputs)
             self._is_frozen = True
-        # PyTorch's own optimiser begins with slow passes, and gains nothing here
+        # PyTorch's profiling executor begins with slow passes, and is not faster here
         with torch.jit.optimized_execution(False):  # type: ignore[attr-defined, no-untyped-call]
             answer: Tensor = self.network(*inputs)
         return answer
 
 
 class _Function(nn.Module):
-    """A network without parts or parameters: these are constants, and tracing does not go from part to part."""
+    """A network as one function: its parameters are constants, and tracing does not visit its submodules."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()

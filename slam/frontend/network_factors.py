@@ -3,14 +3,13 @@
 Noise measured beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
 overlapping snippets measured of it, with the correlation of their errors. On the drive this noise is scaled to the
 disagreement with image geometry, apart for straights and turns, and geometry's own noise is added
-(``docs/design/0019``). Errors have heavier tails than normal ones and are correlated from snippet to snippet: the graph
-takes inflated sigmas for that (``docs/design/0020``).
+(``docs/design/noise-and-the-pose-graph.md``). Errors have heavier tails than normal ones and are correlated from
+snippet to snippet: the graph takes inflated sigmas for that (``docs/design/noise-and-the-pose-graph.md``).
 
 Weights without measured noise: the network errs by a ratio of what it measures. For a pair n frames apart the rotation
-sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length
-plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
-nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
-their sigmas times sqrt(m) and count as one.
+sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length plus a
+floor (a share of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
+their errors are taken as fully correlated: m measurements of one pair get their sigmas times sqrt(m) and count as one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What closing loops remembers of a frame: oriented binary corners (ORB) and their points from learned depth."""
+"""Features of a frame for loop closure: ORB (Rublee et al. 2011) and 3-D points from learned depth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EDGE_PX = 16
 
 @dataclass(frozen=True)
 class View:
-    """The features of one frame: about 60 bytes each.
+    """The features of one frame, about 60 bytes each.
 
     ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
     NaN where the learned depth is not trusted, in the unit of the depth.
@@ -41,7 +41,7 @@ class View:
 
 
 class FeatureExtractor:
-    """Takes the features of frames of one sequence, the strongest of each part of the image."""
+    """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
     def __init__(
         self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache

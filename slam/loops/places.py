@@ -1,4 +1,4 @@
-"""What a run keeps so that new images can be found in its map: features, their points and where they were seen."""
+"""The localisation map of a run (``places.npz``): features, their 3-D points and the poses they were seen from."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A session on disk: all that was measured of a drive so far, without its images, so that it can go on.
 
 The frames that follow are looked at as if there had been no pause. Lengths, noise, loops and graph are then found anew
-for the whole drive (``docs/design/0016``).
+for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 
 from __future__ import annotations

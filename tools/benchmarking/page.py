@@ -61,7 +61,7 @@ measured with. Position errors (ATE RMSE) are in metres, mean ± standard deviat
 is the factor that the optimised trajectory still needs.
 
 An experiment beside these runs, kiss-icp on the point clouds of learned depth, is told in
-[design/0012](design/0012-kiss-icp-on-learned-depth.md).
+[design/tried-without-success](design/tried-without-success.md).
 """
 
 

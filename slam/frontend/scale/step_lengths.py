@@ -6,7 +6,7 @@ a unit that wanders. In logarithms all of them are linear in the lengths ``x`` a
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
 
-so that one robust sparse least squares holds the whole drive (``docs/design/0006-lengths-before-the-graph.md``).
+so that one robust sparse least squares holds the whole drive (``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations

@@ -152,6 +152,21 @@ def test_both_packages_are_of_one_distribution_and_one_place() -> None:
     assert Path(erfsfm.__file__).parents[1] == Path(slam.__file__).parents[1]
 
 
+def test_every_folder_of_modules_is_a_package() -> None:
+    """Without ``__init__.py`` a folder imports well enough, but import contracts do not see it."""
+    assert not [name_of(path.parent) for path in MODULES if not (path.parent / "__init__.py").is_file()]
+
+
+def test_git_ignores_no_source() -> None:
+    """A pattern such as ``results/`` would also keep ``slam/results/`` out of commits and out of the wheel."""
+    names = "\n".join(map(name_of, SOURCES))
+    command = ["git", "check-ignore", "--no-index", "--stdin"]
+    listed = subprocess.run(command, cwd=ROOT, input=names, capture_output=True, text=True, check=False)
+    if listed.returncode == 128:
+        pytest.skip("not a git checkout")
+    assert listed.stdout == ""
+
+
 def test_tests_shadow_no_package() -> None:
     assert not list((ROOT / "tests").rglob("__init__.py"))
 

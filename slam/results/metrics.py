@@ -13,7 +13,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
-from slam.evaluation.coverage import coverage, coverage_by_source
+from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
@@ -100,5 +100,5 @@ def _graph(result: SlamResult) -> dict[str, Any]:
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
-    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}
+    covered = coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
+    return summary | {"coverage": covered.overall, "coverage_by_source": covered.by_source}

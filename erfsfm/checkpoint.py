@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import yaml
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from erfsfm.config import NetworkConfig, Section, dump_yaml
+from erfsfm.config import NetworkConfig
+from erfsfm.config_tree import Section, dump_yaml, first_problem
 from erfsfm.errors import CheckpointError, ConfigError
 from erfsfm.files import write_atomically
 from erfsfm.networks.presets import PRESETS, NetworkKind, build
+from erfsfm.yaml_file import YamlError, read_yaml
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
@@ -33,6 +34,8 @@ FILES = ("depth.safetensors", "pose.safetensors")
 
 class ModelRecord(Section):
     """Everything about a pair of networks but their weights."""
+
+    model_config = ConfigDict(allow_inf_nan=True)  # a validation may have measured nothing
 
     format: Literal[1] = FORMAT
     network: NetworkConfig
@@ -187,12 +190,11 @@ def read_record(path: Path) -> ModelRecord:
         CheckpointError: damaged, or of another format.
     """
     try:
-        return ModelRecord.model_validate(yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        where = ".".join(map(str, first["loc"])) if first else ""
-        detail = f"{where or 'all of it'}: {first['msg']}" if first else "it is not YAML"
-        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {detail}") from error
+        return ModelRecord.model_validate(read_yaml(path))
+    except YamlError as error:
+        raise CheckpointError(str(error)) from error
+    except ValidationError as error:
+        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {first_problem(error)}") from error
 
 
 def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:

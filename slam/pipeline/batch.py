@@ -252,7 +252,7 @@ class SlamPipeline:
         geometric = [self._with_length(g, seen, scale, drive) for g in seen.geometric]
         networks = self._by_networks(seen, [rescaled(g, 1.0 / _unit_of(g, scale)) for g in geometric])
         use = self._config.frontend.use
-        if use == "bridge" or (use == "calibrated" and self._noise is None):
+        if use == "gaps" or (use == "calibrated" and self._noise is None):
             networks = without_measured(networks, seen.geometric)
         unscaled = [*networks, *seen.interpolated]
         factors = [rescaled(f, _unit_of(f, scale)) for f in unscaled]

@@ -128,7 +128,7 @@ def load_model(name_or_folder: str | Path) -> Model:
     """Read a shipped model by name, or a folder that training wrote.
 
     Raises:
-        CheckpointError: missing, damaged or of another architecture; one line.
+        CheckpointError: missing, damaged, of another architecture, or not finite; one line.
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
@@ -207,7 +207,7 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         wanted_by: who says what the architecture is, for the error.
 
     Raises:
-        CheckpointError: of another architecture.
+        CheckpointError: of another architecture, or not numbers.
     """
     wanted = net.state_dict()
     missing, extra = wanted.keys() - tensors.keys(), tensors.keys() - wanted.keys()
@@ -222,6 +222,11 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
             raise CheckpointError(
                 f"{origin}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
                 f"another width or preset than {wanted_by}"
+            )
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise CheckpointError(
+                f"{origin}: '{key}' holds NaN or infinite values: the training diverged or the file is damaged; use "
+                "other weights"
             )
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
 

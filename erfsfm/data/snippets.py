@@ -30,6 +30,8 @@ from erfsfm.teacher.structure import StructureCache
 
 logger = logging.getLogger(__name__)
 
+_DEFAULT_VALIDATION = DataConfig().validation  # may name nothing among the data: not everybody simulates
+
 
 @dataclass(frozen=True)
 class Snippet:
@@ -196,6 +198,12 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         raise DataError(
             f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
             "data.exclude, data.validation, data.split and data.leave_out"
+        )
+    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
+        names, wanted = _some([recording.name for recording in found]), _some([*config.validation, *split.validation])
+        raise DataError(
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
+            "or train without validation by data.validation=[]"
         )
     return _without_stops(training, config), _without_stops(validation, config)
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -29,11 +28,12 @@ from slam.frames import DepthMap, Intrinsics
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.observer import Keyframe
 from slam.prediction.cached import CachedNetworks
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.networks import NetworkPredictor, Networks
 from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
+from slam.storage.cache import DiskCache
 from slam.trajectory import Trajectory
 
 SEED = 0
@@ -45,9 +45,10 @@ def main(words: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(words)
     try:
         recording = open_sequence(options.dataset, options.sequence, None, options.frames)
-        networks: Any = DepthPosePredictor.from_weights(options.weights, "cpu")
+        predictor = DepthPosePredictor.from_weights(options.weights, "cpu")
+        networks: Networks = predictor
         if options.cache is not None:
-            networks = CachedNetworks(networks, networks.sha256, options.cache)
+            networks = CachedNetworks(predictor, predictor.sha256, DiskCache(options.cache))
         settings = load_config(None, options.set)
         result = SlamPipeline(recording, NetworkPredictor(networks, recording.intrinsics), settings).estimate()
     except (SlamError, ErfsfmError) as error:
@@ -108,7 +109,7 @@ def registered(
     for depth in depths:
         odometry.register_frame(cloud(depth, intrinsics, far_m, share, rng), np.array([]))
         T_first_camera.append(odometry.last_pose.copy())
-    return invert(T_first_camera[0]) @ np.stack(T_first_camera)
+    return np.asarray(invert(T_first_camera[0]) @ np.stack(T_first_camera), dtype=np.float64)
 
 
 def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:

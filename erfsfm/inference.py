@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sh
 from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
 from erfsfm.data.images import resize_image
 from erfsfm.data.splits import overlapping as overlapping  # likewise
-from erfsfm.errors import ConfigError, DataError
+from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
@@ -26,6 +26,7 @@ from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_nois
 
 logger = logging.getLogger(__name__)
 
+F = TypeVar("F", np.float32, np.float64)
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 _THREADS = max(torch.get_num_threads() - 1, 1)
 
@@ -63,6 +64,7 @@ class DepthPosePredictor:
 
     noise: PoseNoise | None = None
     pose_sha256: str = ""
+    origin: str = "these weights"
 
     def __init__(self, model: Model, device: str = "cpu", sha256: str = "") -> None:
         self.device = choose_device(device)
@@ -85,6 +87,7 @@ class DepthPosePredictor:
         """
         folder = find_weights(name_or_dir)
         predictor = cls(load_model(folder), device, weights_sha256(folder))
+        predictor.origin = str(folder)
         predictor.pose_sha256 = file_sha256(folder / FILES[1])
         noise = read_pose_noise(folder)
         if noise is not None and noise.pose_sha256 != predictor.pose_sha256:
@@ -124,9 +127,13 @@ class DepthPosePredictor:
 
     @torch.inference_mode()
     def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
-        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size."""
+        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size.
+
+        Raises:
+            CheckpointError: the network's output is not finite.
+        """
         disparity: NDArray[np.float32] = self._depth_net(self._tensor(image))[0, 0].float().cpu().numpy()
-        return disparity
+        return self._finite(disparity, "depth")
 
     @torch.inference_mode()
     def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
@@ -141,6 +148,7 @@ class DepthPosePredictor:
 
         Raises:
             ValueError: another number of images than the networks were trained for.
+            CheckpointError: the network's output is not finite.
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
@@ -148,7 +156,16 @@ class DepthPosePredictor:
         inputs = [self._tensor(image) for image in images]
         target = inputs.pop(middle)
         T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
-        return T_source_target
+        return self._finite(T_source_target, "pose")
+
+    def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
+        """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
+        if not np.isfinite(output).all():
+            raise CheckpointError(
+                f"the {kind} network of {self.origin} gives NaN or infinite values: its training diverged; use other "
+                "weights"
+            )
+        return output
 
     def _input(self, image: NDArray[np.uint8]) -> Tensor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""

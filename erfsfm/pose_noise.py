@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from erfsfm.config import Section, dump_yaml
+from erfsfm.config_tree import Section, dump_yaml, first_problem
 from erfsfm.errors import CheckpointError
 from erfsfm.files import write_atomically
+from erfsfm.yaml_file import YamlError, read_yaml
 
 FloatArray = NDArray[np.float64]
 # target, sources, T_source_target (N, 4, 4), photometric residuals (N,); without these, nothing counts as explained
@@ -157,12 +157,13 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
     if not path.is_file():
         return None
     try:
-        return PoseNoise.model_validate(yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        detail = f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}" if first else "it is not YAML"
+        return PoseNoise.model_validate(read_yaml(path))
+    except YamlError as error:
+        raise CheckpointError(f"{error}; remove it, and measure anew with erfsfm calibrate-noise") from error
+    except ValidationError as error:
         raise CheckpointError(
-            f"{path} is not a noise record: {detail}; remove it, and measure anew with erfsfm calibrate-noise"
+            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure anew with erfsfm "
+            "calibrate-noise"
         ) from error
 
 

@@ -15,6 +15,7 @@ import scipy
 from erfsfm import __version__, photometric_residual
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit, overlapping
+from erfsfm.threads import limit_library_threads
 from slam import frontend, loops, se3
 from slam.config import OutputConfig, SlamConfig, dump_yaml, load_config
 from slam.errors import ConfigError, RunError, SlamError
@@ -35,7 +36,6 @@ from slam.results.summary import (
     describe_failure,
 )
 from slam.runtime.imports import import_rerun
-from slam.runtime.threads import limit_library_threads
 from slam.sequences.catalogue import open_sequence
 from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, fingerprint, without_cache
 

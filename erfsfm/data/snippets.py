@@ -30,6 +30,8 @@ from erfsfm.teacher.structure import StructureCache
 
 logger = logging.getLogger(__name__)
 
+_DEFAULT_VALIDATION = DataConfig().validation  # may name nothing among the data: not everybody simulates
+
 
 @dataclass(frozen=True)
 class Snippet:
@@ -67,7 +69,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
 
-        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `Structure`. With
+        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With
         weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
         """
         rng = np.random.default_rng([self._config.training.seed, number])
@@ -196,6 +198,12 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         raise DataError(
             f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
             "data.exclude, data.validation, data.split and data.leave_out"
+        )
+    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
+        names, wanted = _some([recording.name for recording in found]), _some([*config.validation, *split.validation])
+        raise DataError(
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
+            "or train without validation by data.validation=[]"
         )
     return _without_stops(training, config), _without_stops(validation, config)
 

@@ -17,14 +17,14 @@ from erfsfm.data.images import resize_image
 from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.protocols import CAP_M, Networks, refuse_leak
+from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
 
 
-class RawNetworks(Networks, Protocol):
+class RawNetworks(PoseDepthNetworks, Protocol):
     """What this protocol asks for beside the others: the size of the networks' images."""
 
     record: ModelRecord

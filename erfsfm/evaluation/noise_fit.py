@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
-from erfsfm.evaluation.protocols import Networks, refuse_leak, windows
+from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak, windows
 from erfsfm.photometric_residual import PhotometricResidual
 from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses
 
@@ -49,7 +49,7 @@ class PairErrors:
 
 
 def calibrate(
-    networks: Networks, roots: Sequence[Path], sequences: Sequence[str], allow_leak: bool, pose_sha256: str
+    networks: PoseDepthNetworks, roots: Sequence[Path], sequences: Sequence[str], allow_leak: bool, pose_sha256: str
 ) -> tuple[PoseNoise, list[dict[str, Any]]]:
     """Measure the noise of a pose network.
 
@@ -85,7 +85,7 @@ def calibrate(
     return fit(errors, pose_sha256), rows
 
 
-def measure(networks: Networks, recording: Recording) -> PairErrors:
+def measure(networks: PoseDepthNetworks, recording: Recording) -> PairErrors:
     """Errors of all pairs, the truth brought to the networks' unit, which is followed along the drive."""
     T_world_camera = recording.true_poses()
     assert T_world_camera is not None

@@ -21,7 +21,7 @@ from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network,
 CAP_M = 80.0
 
 
-class Networks(Protocol):
+class PoseDepthNetworks(Protocol):
     """What an evaluation asks of trained networks (``erfsfm.inference.DepthPosePredictor``)."""
 
     sources: int
@@ -39,7 +39,7 @@ class Networks(Protocol):
         ...
 
 
-def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
+def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
     """Median-scaled depth errors under 80 m on every fifth frame with true depth.
 
     Returns:
@@ -75,7 +75,7 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
 
 
 def pose_protocol(
-    networks: Networks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
+    networks: PoseDepthNetworks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
     """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and a straight
     constant motion.
@@ -105,7 +105,7 @@ def pose_protocol(
 
 
 def _pose_rows(
-    networks: Networks,
+    networks: PoseDepthNetworks,
     recording: Recording,
     T_world_camera: NDArray[np.float64],
     fidelity: Fidelity,
@@ -129,7 +129,7 @@ def _pose_rows(
     return rows
 
 
-def windows(networks: Networks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
+def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
     """The images of each window of a pose network; no more of them are held than one window has."""
     images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):
@@ -154,7 +154,7 @@ def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, An
     return {"method": name, **mean, "scale_spread": spread, "images": len(errors), "leak": leak}
 
 
-def refuse_leak(networks: Networks, names: Sequence[str], allow_leak: bool) -> bool:
+def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:
     """Whether training saw some of the frames named.
 
     Raises:

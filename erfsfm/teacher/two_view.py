@@ -25,7 +25,7 @@ LEAST_MATCHES = 50
 
 
 @dataclass(frozen=True)
-class TwoView:
+class MotionAndDepth:
     """The second view of a pair, measured from the first.
 
     Attributes:
@@ -44,7 +44,7 @@ class TwoView:
         return not self.T_second_first[:3, 3].any()
 
 
-def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> TwoView | None:
+def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> MotionAndDepth | None:
     """Motion and structure from two grey images ``(H, W)`` of one camera; None where they show no clear motion.
 
     Args:
@@ -56,10 +56,10 @@ def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> T
     if T_second_first is None:
         return None
     if not T_second_first[:3, 3].any():
-        return TwoView(T_second_first, np.zeros_like(flow[..., 0]), np.full_like(flow[..., 0], np.inf))
+        return MotionAndDepth(T_second_first, np.zeros_like(flow[..., 0]), np.full_like(flow[..., 0], np.inf))
     inverse_depth, sigma, off_line_px = _triangulate(flow, T_second_first, K)
     sigma[~trusted | (off_line_px > OFF_LINE_PX)] = np.inf
-    return TwoView(T_second_first, inverse_depth, sigma)
+    return MotionAndDepth(T_second_first, inverse_depth, sigma)
 
 
 def rays(height: int, width: int, K: NDArray[np.float32]) -> Array:

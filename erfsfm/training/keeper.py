@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import Callback
 import erfsfm
 from erfsfm.checkpoint import Model, ModelRecord, commit, read_record, save_model
 from erfsfm.data.splits import merge
+from erfsfm.errors import TrainingError
 from erfsfm.training.module import SelfSupervision
 
 logger = logging.getLogger(__name__)
@@ -60,18 +61,27 @@ class WeightKeeper(Callback):
     def on_exception(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
     ) -> None:
-        """Keep the weights so far, if they are numbers."""
-        numbers = all(torch.isfinite(weights).all() for weights in module.parameters())
-        if isinstance(module, SelfSupervision) and trainer.is_global_zero and trainer.global_step > 0 and numbers:
+        """Keep the weights so far, if they are finite."""
+        if not isinstance(module, SelfSupervision) or not trainer.is_global_zero or trainer.global_step == 0:
+            return
+        if _all_finite(module):
             save_model(self._output / "last", self._model(module, trainer.global_step))
 
     def save(self, module: SelfSupervision, step: int) -> None:
         """Write ``last/``; and the folders whose measure is the best so far.
 
         Without validation the last is the best.
+
+        Raises:
+            TrainingError: weights are NaN or infinite; nothing is written.
         """
         if step == self._saved_step:
             return
+        if not _all_finite(module):
+            raise TrainingError(
+                f"weights are NaN or infinite at step {step}: lower training.learning_rate, or set "
+                "training.gradient_clip or training.precision=32-true, and start anew; older weights are in last/"
+            )
         self._saved_step = step
         model = self._model(module, step)
         save_model(self._output / "last", model)
@@ -109,6 +119,10 @@ class WeightKeeper(Callback):
     def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
         """Add what the run had seen before it was interrupted."""
         self._seen = merge([*self._seen, *state_dict.get("seen", [])])
+
+
+def _all_finite(module: SelfSupervision) -> bool:
+    return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
 
 
 def decisive(metrics: dict[str, float]) -> float:

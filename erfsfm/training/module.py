@@ -55,19 +55,19 @@ class SelfSupervision(lightning.LightningModule):
         snippets = SnippetBatch(
             batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
-        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
-        if not torch.isfinite(outcome.total):
-            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
+        result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
+        if not torch.isfinite(result.total):
+            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
                 "training.gradient_clip, then go on with --resume; the weights so far are in last/"
             )
-        self._refuse_constant(outcome.disparities[0].detach())
-        self.log("loss", outcome.total.detach(), prog_bar=True)
-        self.log_dict({f"loss/{name}": value.detach() for name, value in outcome.terms.items()})
+        self._refuse_constant(result.disparities[0].detach())
+        self.log("loss", result.total.detach(), prog_bar=True)
+        self.log_dict({f"loss/{name}": value.detach() for name, value in result.terms.items()})
         if self.global_step % (20 * self.config.training.log_every) == 0:
-            self._log_pictures(snippets, outcome.disparities[0], outcome.warped)
-        return outcome.total
+            self._log_pictures(snippets, result.disparities[0], result.warped)
+        return result.total
 
     def _refuse_constant(self, disparity: Tensor) -> None:
         """Stop once the disparity ``(B, 1, H, W)`` has been flat in all images for many steps on end."""

@@ -52,7 +52,7 @@ class SnippetBatch:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ObjectiveResult:
     """The loss, its terms, and what the networks said.
 
     ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
@@ -74,7 +74,7 @@ def to_network_range(image: Tensor) -> Tensor:
 
 def evaluate_objective(
     depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
-) -> Outcome:
+) -> ObjectiveResult:
     """Predict depth and poses of a batch and say how badly they explain it.
 
     The networks may run under autocast; geometry and losses keep the images' precision, for a pixel
@@ -88,7 +88,7 @@ def evaluate_objective(
     """
     said = _Prediction.of(depth_net, pose_net, batch, config)
     with torch.autocast(batch.target.device.type, enabled=False):
-        return _judge(said, batch, config)
+        return _evaluate(said, batch, config)
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _adjacent(count: int) -> tuple[int, int]:
     return count // 2 - 1, count // 2
 
 
-def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
+def _evaluate(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
     T_source_target = pose_vector_to_matrix(said.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
@@ -158,7 +158,7 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
         terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
     if batch.T_source_target is not None and batch.bounds is not None:
-        taught = _taught(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
+        taught = _teacher_terms(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
         terms |= taught
         for name, weight in config.teacher.weights.items():
             total = total + weight * taught[name]
@@ -166,10 +166,10 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
         terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
     warped_finest = None if finest is None else finest[0].reshape(batch.sources.shape)
-    return Outcome(total, terms, said.disparities, T_source_target, warped_finest)
+    return ObjectiveResult(total, terms, said.disparities, T_source_target, warped_finest)
 
 
-def _taught(
+def _teacher_terms(
     said: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
 ) -> dict[str, Tensor]:
     """How far the networks are from measured structure.

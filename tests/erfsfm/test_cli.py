@@ -105,10 +105,10 @@ def test_usage(run: Run, arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["train", "--config", "nothing"], "no configuration 'nothing'"),
+        (["train", "--config", "nothing"], "no configuration file or name 'nothing'"),
         (["train", "--config", "tiny"], "--dataset"),
         (["train", "--config", "tiny", "--dataset", "nowhere"], "does not exist"),
-        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'steps'"),
+        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'training.steps'"),
         (["train", "--config", "tiny", "--seed", "-1"], "training.seed"),
         (["predict", "nowhere.png"], "no weights 'default'"),
         (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),

@@ -29,14 +29,14 @@ class BenchmarkSequence:
 
 @dataclass(frozen=True)
 class Configuration:
-    """What a run is told; ``fill`` empties the cache of the networks' answers first, ``full`` wants it there."""
+    """Overrides of a run, and its cache of the networks' outputs: ``fill`` empties it first, ``full`` requires it."""
 
     name: str
     overrides: tuple[str, ...] = ()
     cache: Literal["none", "keep", "fill", "full"] = "none"
 
 
-_UNINFORMATIVE = 100.0  # sigma of a logarithm: nothing is learned from the measurement
+_UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that nothing reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
@@ -58,8 +58,8 @@ _PARTS: dict[str, tuple[str, ...]] = {
         "geometry.neighbour_rotation_ratio=0",
         "geometry.neighbour_direction_ratio=0",
     ),
-    "no bridging": ("gaps.enabled=false",),
-    "network factors only where geometry has none": ("frontend.use=bridge",),
+    "no gap interpolation": ("gaps.enabled=false",),
+    "network factors only where image geometry fails": ("frontend.use=gaps",),
     "no loops": ("loops.enabled=false",),
     "no consistency among loops": ("loops.min_support=0",),
     "no robust kernel": ("pose_graph.kernel=none",),

@@ -9,13 +9,13 @@ from typing import Protocol
 import numpy as np
 
 from slam import se3
-from slam.formats.colmap import write_colmap
 from slam.errors import RunError
-from slam.storage.files import write_atomically
-from slam.loops.places import PLACES, Places
+from slam.formats.colmap import write_colmap
 from slam.formats.ply import read_ply_points
+from slam.loops.places import PLACES, Places
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, write_kitti, write_tum
 
 WHATS = ("mesh", "cloud", "trajectory", "graph", "colmap")

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import SlamError
-from slam.frames import Sequence
 from slam.evaluation.map import accuracy_median_m, completeness, pose_similarity, visible_surface
+from slam.frames import Sequence
 from slam.pipeline.batch import SlamResult
 from slam.results.folder import RunFolder
+from slam.results.summary import null
 from slam.se3 import apply
 from slam.sequences.excerpt import Excerpt
-from slam.results.summary import null
 
 logger = logging.getLogger(__name__)
 

@@ -18,9 +18,9 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.pipeline.batch import SlamResult
+from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
 from slam.se3 import umeyama
 from slam.sequences.continued import Continued
-from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
 from slam.trajectory import Trajectory
 
 

@@ -12,12 +12,13 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.errors import SlamError
+from slam.evaluation.drift import REFERENCE
+from slam.frames import DepthMap, Image
 from slam.results import report_page as page
 from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
-from slam.evaluation.drift import REFERENCE
-from slam.errors import SlamError
-from slam.frames import DepthMap, Image
+from slam.results.folder import RunFolder
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -27,7 +28,6 @@ from slam.results.plots import (
     trajectories_of,
     trajectory_figure,
 )
-from slam.results.folder import RunFolder
 from slam.trajectory import Trajectory
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from slam.results.comparison import (
     lookup,
     written,
 )
-from slam.results.report_page import Cell
 from slam.results.folder import TRAJECTORIES
+from slam.results.report_page import Cell
 
 Metrics = Mapping[str, Any]
 

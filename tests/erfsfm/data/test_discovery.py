@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from erfsfm.data.discovery import discover
-from erfsfm.data.images import image_files, resize_image
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 
@@ -159,12 +158,6 @@ def test_a_folder_called_images_has_its_parents_name(tmp_path: Path, monkeypatch
     assert one(folder).name == "folder/my_drive"
     monkeypatch.chdir(folder)
     assert one(Path()).name == "folder/my_drive"
-
-
-def test_natural_order(tmp_path: Path) -> None:
-    for name in ("10.png", "2.png", "1.png", "._1.png", "notes.txt"):
-        (tmp_path / name).write_bytes(b"")
-    assert [p.name for p in image_files(tmp_path)] == ["1.png", "2.png", "10.png"]
 
 
 def test_grey_images_have_three_channels(tmp_path: Path) -> None:
@@ -342,19 +335,6 @@ def test_folder_without_camera_file(tmp_path: Path) -> None:
 def test_broken_video(tmp_path: Path) -> None:
     (write_camera(tmp_path) / "x.mp4").write_bytes(b"no video")
     assert "x.mp4" in refusal(tmp_path)
-
-
-def test_resize_image_up_is_smooth() -> None:
-    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
-    grown = resize_image(ramp, 16, 64)
-    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
-    assert resize_image(ramp, 8, 16) is ramp
-
-
-def test_resize_image_down_averages() -> None:
-    image = np.zeros((8, 8, 3), np.uint8)
-    image[::2] = 100
-    assert (resize_image(image, 4, 4) == 50).all()
 
 
 def test_simulation_file_with_more_in_it(tmp_path: Path, write_root: Callable[..., Path]) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
 from slam.errors import RunError
+from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
 from slam.results.folder import RunFolder
 
 MakeRun = Callable[..., RunFolder]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError
-from slam.results.export import R_UP_WORLD, export
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
+from slam.results.export import R_UP_WORLD, export
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray
 from slam.trajectory import read_trajectory

@@ -36,7 +36,7 @@ class ImageFiles:
         path, first = self._paths.get(index), self.files.paths[0]
         if path is None:
             raise MissingFrameError(
-                f"no image {self.files.file_name(index)} in {first.parent}: the numbering has a gap"
+                f"no image {self.files.file_name(index)} in {first.parent}: the numbering has a gap there"
             )
         image = read_image(path)
         height, width = image.shape[:2]

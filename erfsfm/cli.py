@@ -77,11 +77,11 @@ def predict(
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.data.images import image_files
     from erfsfm.errors import DataError
     from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
+    from erfsfm.readers.images import list_images
 
-    files = image_files(images) if images.is_dir() else (images,)
+    files = list_images(images) if images.is_dir() else [images]
     if not files:
         raise DataError(f"{images} holds no png or jpg to predict from")
     if output.resolve() in {file.parent.resolve() for file in files}:
@@ -141,10 +141,10 @@ def receptive_field(
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.data.images import image_files, resize_image
     from erfsfm.errors import ConfigError, DataError
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
+    from erfsfm.readers.images import list_images, resize_image
     from erfsfm.receptive_field.figure import draw_fields
     from erfsfm.receptive_field.measure import measure_fields
     from erfsfm.receptive_field.street import street_snippet
@@ -154,7 +154,7 @@ def receptive_field(
     if images is None:
         snippet = street_snippet(5, height, width)
     else:
-        files = image_files(images)[:5] if images.is_dir() else ()
+        files = list_images(images)[:5] if images.is_dir() else []
         if len(files) < 5:
             raise DataError(f"--images wants a folder of five consecutive images; {images} has {len(files)}")
         snippet = [resize_image(read_image(file), height, width) for file in files]

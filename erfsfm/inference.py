@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
 from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
-from erfsfm.data.images import resize_image
 from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
+from erfsfm.readers.images import read_image as read_image  # images come in as they are read for training
+from erfsfm.readers.images import resize_image
 
 logger = logging.getLogger(__name__)
 
@@ -197,18 +198,6 @@ def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray
     if disparity.shape != (height, width):
         disparity = np.asarray(cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     return np.asarray(1 / disparity, dtype=np.float32)
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """An image file as ``(H, W, 3)`` uint8 RGB.
-
-    Raises:
-        DataError: missing or not an image.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DataError(f"{path} is missing or not a readable image")
-    return np.ascontiguousarray(image[..., ::-1])
 
 
 def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

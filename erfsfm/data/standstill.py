@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.data.kitti_raw import velocity
 from erfsfm.data.recordings import Recording
+from erfsfm.readers.kitti_oxts import velocity
 
 STILL_M_S = 0.5  # 5 cm a frame
 STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2

@@ -6,19 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from erfsfm.checkpoint import ModelRecord
 from erfsfm.config import Fidelity
-from erfsfm.data.images import resize_image
 from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
+from erfsfm.readers.images import read_image, resize_image
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
@@ -83,7 +82,7 @@ def eigen_protocol(
     errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
     flat: list[DepthErrors] = []
     for frame in frames:
-        image = _read(frame.image_path())
+        image = read_image(frame.image_path())
         truth = lidar_depth(frame, image.shape[:2], fidelity)
         guess = _depth(networks, image, fidelity)
         found = _compare(guess, truth, "median", fidelity)
@@ -135,7 +134,7 @@ def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity)
     true = displacements(frame, window)
     if fidelity == "default" and true.max() < _STILL_M:
         return None
-    T_source_target = networks.poses([_read(frame.image_path(index)) for index in window])
+    T_source_target = networks.poses([read_image(frame.image_path(index)) for index in window])
     predicted = np.linalg.norm(T_source_target[:, :3, 3], axis=1)
     return float(np.mean(true / np.maximum(predicted, 1e-12)))
 
@@ -155,10 +154,3 @@ def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, 
     scales = np.array([error.scale for error in errors])
     row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
     return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
-
-
-def _read(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DataError(f"{path} is not a readable image; copy it again")
-    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.data.splits import FrameRange
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
+from erfsfm.readers.frame_range import EVERYTHING, FrameRange
 
 CAP_M = 80.0
 
@@ -86,21 +86,28 @@ def pose_protocol(
         DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
             not allowed.
     """
-    recordings = [r for r in reversed(discover(root)) if r.sequence]
-    found = {r.name: r for r in recordings} | {r.sequence: r for r in recordings}
+    found: dict[str, list[Recording]] = {}
+    for each in discover(root):
+        for name in {each.name, each.sequence} if each.sequence else ():
+            found.setdefault(name, []).append(each)
     rows = []
     for name in sequences:
-        span = FrameRange.parse(name)
-        whole = found.get(span.recording)
-        if whole is None:
+        span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
+        if span.recording not in found:
             raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
-        recording = whole.part(span.start, span.stop)
-        T_world_camera = recording.true_poses(fidelity)
-        if T_world_camera is None:
-            raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
-        leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-        shown = whole.name if recording == whole else recording.frames_name
-        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
+        camera = found[span.recording][0].images[0].parent
+        wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
+        parts = [whole.within(span.start, span.stop) for whole in wholes]
+        chosen = [part for part in parts if part is not None]
+        if not chosen:
+            raise DataError(f"{name} names no frame that there is: found {', '.join(w.frames_name for w in wholes)}")
+        for recording in chosen:
+            T_world_camera = recording.true_poses(fidelity)
+            if T_world_camera is None:
+                raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
+            leak = refuse_leak(networks, [recording.frames_name], allow_leak)
+            shown = recording.name if [recording] == wholes else recording.frames_name
+            rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
     return rows
 
 

@@ -81,8 +81,8 @@ def test_calibration_of_another_resolution(refusal: Refusal, tmp_path: Path, wri
     """Raw images may be shrunk, never cropped: their camera knows its own shape."""
     write_raw(tmp_path, stored=(48, 48), speeds=[9] * 6)
     error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
-    assert "0000000000.png is 48 x 48, but camera 02 in" in error
-    assert "is 96 x 64: the images were cropped or are of another camera" in error
+    assert "the images are 48x48, but camera 02 in" in error
+    assert "is 96x64: the images were cropped or are of another camera" in error
 
 
 def test_a_raw_drive_shorter_than_a_snippet(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
@@ -114,7 +114,7 @@ def test_a_damaged_video(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
     path = trip / "drive.mp4"
     path.write_bytes(path.read_bytes()[:600])
     error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "drive.mp4 cannot be read as a video: it is damaged or of an unknown format; copy it again" in error
+    assert "drive.mp4 cannot be opened: it is damaged or of an unknown format; copy it again" in error
 
 
 def test_a_video_of_another_resolution(refusal: Refusal, tmp_path: Path, trip: Path) -> None:

@@ -3,9 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from erfsfm.errors import DataError
+from erfsfm.readers.kitti_calibration import CalibrationFile
 from slam import se3
-from slam.errors import SequenceError
-from slam.sequences.kitti.calibration import CalibrationFile, moved_to_camera
+from slam.sequences.kitti.calibration import moved_to_camera
 
 
 @pytest.fixture
@@ -56,5 +57,5 @@ def test_rig_turning_on_the_spot_moves_the_side_camera() -> None:
     ],
 )
 def test_malformed(calibration, text: str, message: str) -> None:
-    with pytest.raises(SequenceError, match=message):
-        calibration(text).intrinsics("P2", 40, 24)
+    with pytest.raises(DataError, match=message):
+        calibration(text).pinhole("P2", 40, 24)

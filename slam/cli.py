@@ -152,11 +152,10 @@ def export(
 
     Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
     """
-    from slam.mapping import rotate_ply
     from slam.results.export import export as export_run
     from slam.results.folder import RunFolder
 
-    written = export_run(RunFolder.open(run), what, output, up, rotate_ply)
+    written = export_run(RunFolder.open(run), what, output, up)
     typer.echo(f"{what} of {run} in {written}")
 
 

@@ -19,10 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config import MappingConfig
 from slam.errors import SlamError
+from slam.formats.ply import coloured_ply, write_ply
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray, invert, rotation_angle
-from slam.storage.files import write_atomically
 
 _BLOCK_SIDE = 16
 _FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street; growing costs Open3D a second
@@ -141,24 +141,18 @@ class TsdfMap:
         return MapStatistics(triangles, points, blocks, self._fused, self._left_out)
 
     def write_mesh(self, path: Path) -> None:
-        """Write the mesh as binary PLY, atomically; ``SlamError`` if the map is empty."""
-        o3d = import_open3d()
+        """Write the mesh as binary PLY, atomically.
+
+        Raises:
+            SlamError: the map is empty, or (`RunError`) the file cannot be written.
+        """
         mesh = self.mesh()
-        written = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
-        )
-        written.vertex_colors = o3d.utility.Vector3dVector(np.clip(mesh.colours, 0, 1))
-        written.compute_vertex_normals()
-        _write_ply(path, lambda name: o3d.io.write_triangle_mesh(name, written))
+        write_ply(path, coloured_ply(mesh.vertices_world, _vertex_normals(mesh), mesh.colours, mesh.triangles))
 
     def write_cloud(self, path: Path) -> None:
-        """Write the cloud as binary PLY, atomically; ``SlamError`` if the map is empty."""
-        o3d = import_open3d()
+        """Write the cloud as binary PLY, atomically; raises as ``write_mesh``."""
         cloud = self.cloud()
-        written = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_world))
-        written.normals = o3d.utility.Vector3dVector(cloud.normals_world)
-        written.colors = o3d.utility.Vector3dVector(np.clip(cloud.colours, 0, 1))
-        _write_ply(path, lambda name: o3d.io.write_point_cloud(name, written))
+        write_ply(path, coloured_ply(cloud.points_world, cloud.normals_world, cloud.colours))
 
     def _new_grid(self) -> Any:
         o3d = import_open3d()
@@ -316,31 +310,12 @@ def _without_small_components(mesh: MapMesh, min_triangles: int) -> MapMesh:
     return MapMesh(mesh.vertices_world[used], renumbered.reshape(-1, 3), mesh.colours[used])
 
 
+def _vertex_normals(mesh: MapMesh) -> FloatArray:
+    """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
+    o3d = import_open3d()
+    vertices, triangles = o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
+    return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
+
+
 def _array(tensor: Any) -> FloatArray:
     return np.asarray(tensor.numpy(), dtype=np.float64)
-
-
-def rotate_ply(source: Path, target: Path, R_up_world: FloatArray) -> None:
-    """Write the mesh or cloud of one PLY file with vertices and normals turned by ``R_up_world`` ``(3, 3)``.
-
-    Raises:
-        SlamError: the source is no PLY, or the target cannot be written.
-    """
-    o3d = import_open3d()
-    kind = o3d.io.read_file_geometry_type(str(source))
-    is_mesh = bool(int(kind) & int(o3d.io.CONTAINS_TRIANGLES))
-    read = o3d.io.read_triangle_mesh if is_mesh else o3d.io.read_point_cloud
-    geometry = read(str(source))
-    if geometry.is_empty():
-        raise SlamError(f"{source} holds no points: it is damaged or not a PLY; run the sequence again")
-    geometry.rotate(R_up_world, center=np.zeros(3))
-    write = o3d.io.write_triangle_mesh if is_mesh else o3d.io.write_point_cloud
-    _write_ply(target, lambda name: write(name, geometry))
-
-
-def _write_ply(path: Path, write: Callable[[str], bool]) -> None:
-    def fill(partial: Path) -> None:
-        if not write(str(partial)):
-            raise SlamError(f"{path} cannot be written: check the folder and the space on the disk")
-
-    write_atomically(path, fill)

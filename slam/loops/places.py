@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -13,6 +12,7 @@ from slam.errors import RunError
 from slam.frames import Intrinsics
 from slam.loops.descriptors import View
 from slam.se3 import FloatArray
+from slam.storage.archive import reading_archive
 
 PLACES = "places.npz"
 _FORMAT = 1
@@ -48,7 +48,7 @@ class Places:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        try:
+        with reading_archive(path):
             with np.load(path, allow_pickle=False) as file:
                 content = {name: file[name] for name in file.files}
             if int(content["format"]) != _FORMAT:
@@ -59,5 +59,3 @@ class Places:
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
             return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])
-        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise RunError(f"{path} is damaged ({type(error).__name__}): run the sequence again") from error

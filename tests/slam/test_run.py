@@ -22,6 +22,7 @@ from slam.errors import RunError, SlamError
 from slam.pipeline.batch import SlamPipeline
 from slam.pose_graph import PoseGraph
 from slam.results.folder import RunFolder
+from slam.runtime.signals import Terminated
 
 CheckRun = Callable[[Path], dict[str, Any]]
 CopyRoot = Callable[[], Path]
@@ -113,13 +114,7 @@ def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], t
     assert RunFolder.open(output).metrics()["sequence"]["frames"] == 7
     assert not (output / "map_mesh.ply").exists()
     assert (output / "notes.txt").read_text() == "what I saw"
-    assert not (tmp_path / "results").exists()
-
-
-def test_output_of_a_run_that_was_killed_is_used_again(quick: dict[str, Any], tmp_path: Path) -> None:
-    (tmp_path / "killed").mkdir()
-    (tmp_path / "killed" / "run.log").write_text("...")
-    assert run_slam(**quick, output=tmp_path / "killed").metrics()["status"] == "ok"
+    assert not (tmp_path / "results").exists() and not (output / "unfinished").exists()
 
 
 def test_without_map_and_truth_the_reasons_stand_there(
@@ -172,7 +167,9 @@ def test_an_unreadable_image_is_bridged_and_reported(
         assert "000006.png is truncated" in (folder.path / name).read_text()
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")])
+@pytest.mark.parametrize(
+    "error", [Terminated(15), KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")]
+)
 def test_whatever_ends_a_run_its_folder_says_so(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
@@ -183,23 +180,9 @@ def test_whatever_ends_a_run_its_folder_says_so(
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
     metrics = RunFolder.open(tmp_path / "ended").metrics()
-    wanted = {"ValueError": "ValueError: a bug", "RunError": "x"}.get(type(error).__name__, type(error).__name__)
+    told = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
+    wanted = told.get(type(error).__name__, type(error).__name__)
     assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
-
-
-def test_trajectories_stay_where_the_map_cannot_be_written(
-    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(slam.run, "write_map", full)
-    with pytest.raises(OSError, match="No space left"):
-        run_slam(**quick, output=tmp_path / "full")
-    folder = RunFolder.open(tmp_path / "full")
-    assert "No space left" in folder.metrics()["reason"]
-    optimised = folder.trajectory("optimised")
-    assert optimised is not None and len(optimised) == 6
 
 
 def test_an_untrained_pose_network_with_two_sources_runs(

@@ -16,6 +16,7 @@ from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
 from slam.runtime.progress import progress_bar
+from slam.runtime.signals import Terminated
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -343,4 +344,6 @@ def main() -> None:
     except SystemExit as end:
         if end.code == _INTERRUPTED:
             typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
+        elif isinstance(end, Terminated):
+            typer.echo(f"erfsfm-slam: {end}; what was written stays", err=True)
         raise

@@ -128,20 +128,29 @@ def test_shells_complete(typed: str, wanted: str) -> None:
     assert finished.stdout.split() == [wanted], finished.stderr
 
 
-@pytest.mark.parametrize("arguments", ["config", "evaluate estimate.txt estimate.txt", "evaluate --help"])
-@pytest.mark.parametrize("end", ["| true", ">&-"])
-def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
-    (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    finished = subprocess.run(
-        f"{shlex.quote(sys.executable)} -m slam {arguments} {end}",
+def in_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        f"{shlex.quote(sys.executable)} -m slam {arguments}",
         shell=True,
-        cwd=tmp_path,
+        cwd=folder,
         env=os.environ | {"PYTHONPATH": str(Path(slam.__file__).parents[1])},
         capture_output=True,
         text=True,
         check=False,
     )
+
+
+@pytest.mark.parametrize("arguments", ["config", "evaluate estimate.txt estimate.txt", "evaluate --help"])
+@pytest.mark.parametrize("end", ["| true", ">&-"])
+def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
+    (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    finished = in_shell(f"{arguments} {end}", tmp_path)
     assert finished.stderr == "" and finished.stdout == ""
+
+
+def test_a_closed_stderr_stops_nothing(tmp_path: Path) -> None:
+    finished = in_shell("simulate world --route straight --frames 5 --width 104 --height 32 2>&-", tmp_path)
+    assert finished.returncode == 0 and "5 frames in world" in finished.stdout
 
 
 def test_an_error_of_several_lines_is_told_in_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:

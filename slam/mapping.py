@@ -106,7 +106,7 @@ class TsdfMap:
             SlamError: if nothing was fused or seen often enough.
         """
         if self._mesh is None:
-            self._fuse_lonely_frame()
+            self._fuse_single_keyframe()
             extracted = self._extract(self._grid.extract_triangle_mesh)
             mesh = MapMesh(
                 _array(extracted.vertex.positions),
@@ -121,7 +121,7 @@ class TsdfMap:
     def cloud(self) -> MapCloud:
         """The surface as points; ``SlamError`` as for the mesh."""
         if self._cloud is None:
-            self._fuse_lonely_frame()
+            self._fuse_single_keyframe()
             point = self._extract(self._grid.extract_point_cloud).point
             # Open3D's threads finish in any order; sorted, two runs write the same file
             order = np.lexsort(_array(point.positions).T)
@@ -228,8 +228,8 @@ class TsdfMap:
             blocks, depth_image, colour_image, intrinsic, extrinsic, depth_scale, depth_max, truncation
         )
 
-    def _fuse_lonely_frame(self) -> None:
-        """Fuse a single keyframe, for which no second view can be compared."""
+    def _fuse_single_keyframe(self) -> None:
+        """Fuse the only keyframe without a check: there is no second view to compare it with."""
         if self._previous is not None and not self._first_is_fused:
             self._fuse(self._previous, np.ones(self._previous.depth.shape, dtype=bool))
             self._first_is_fused = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +46,7 @@ class RunOptions(TypedDict, total=False):
     camera: Path | None
     weights: str | Path
     config: str | Path | None
-    overrides: list[str] | tuple[str, ...]
+    overrides: Sequence[str]
     frames: str | None
     output: Path | None
     seed: int
@@ -86,7 +87,7 @@ class RunRequest:
     camera: Path | None = None
     weights: str | Path = "default"
     config: str | Path | None = None
-    overrides: list[str] | tuple[str, ...] = ()
+    overrides: Sequence[str] = ()
     frames: str | None = None
     output: Path | None = None
     seed: int = 0
@@ -118,7 +119,7 @@ def run_slam(
         SlamError, ErfsfmError: one line. Whatever ends a run, its folder holds what there is and says why.
     """
     request = RunRequest(dataset, sequence, **options)
-    with run_log() as log, raising_on_termination():
+    with run_log() as log, raising_on_termination() as ignore_signals:
         job = _prepare(request)
         folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
         folder.write_metrics(describe_start(job.provenance))
@@ -127,6 +128,7 @@ def run_slam(
             with limit_library_threads():
                 _run(job, folder)
         except BaseException as error:
+            ignore_signals()
             _leave_failure(folder, log, job.settings.output.report, error)
             if folder.replaces is not None and isinstance(error, SlamError):
                 kept = f"{folder.replaces} keeps its earlier run, this one is in {folder.path}"

@@ -125,14 +125,21 @@ def write_ply(path: Path, ply: Ply) -> None:
     lines.append(f"element vertex {len(ply.vertices)}")
     for name in ply.vertices.dtype.names or ():
         lines.append(f"property {_NAMES[ply.vertices.dtype[name].str[1:]]} {name}")
-    contents = [ply.vertices.tobytes()]
+    parts: list[NDArray[np.void]] = [ply.vertices]
     if ply.triangles is not None:
         lines += [f"element face {len(ply.triangles)}", "property list uchar uint vertex_indices"]
         faces = np.empty(len(ply.triangles), _TRIANGLE)
         faces["count"], faces["vertices"] = 3, ply.triangles
-        contents.append(faces.tobytes())
+        parts.append(faces)
     header = "\n".join([*lines, "end_header", ""]).encode("ascii")
-    write_atomically(path, lambda partial: partial.write_bytes(b"".join([header, *contents])), RunError)
+
+    def fill(partial: Path) -> None:
+        with partial.open("wb") as file:
+            file.write(header)
+            for part in parts:
+                file.write(np.ascontiguousarray(part).view(np.uint8).data)
+
+    write_atomically(path, fill, RunError)
 
 
 def _check(ply: Ply) -> None:

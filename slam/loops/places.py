@@ -27,7 +27,7 @@ class Places:
     T_world_camera: FloatArray
 
     def write(self, path: Path) -> None:
-        """Write as ``.npz``; what each array is stands in ``docs/outputs.md``."""
+        """Write as ``.npz``; ``docs/outputs.md`` describes each array."""
         camera = self.intrinsics
         np.savez_compressed(
             path,
@@ -55,7 +55,7 @@ class Places:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
             width, height, *pinhole = content["camera"].tolist()
             frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-            # beyond the last view there is nothing
+            # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
             return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])

@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import re
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,8 @@ def replace_run(output: Path, place: Path) -> None:
             path.unlink()
     for path in _files(place):
         path.replace(output / path.name)
-    place.rmdir()
+    with suppress(OSError):  # it holds a file of another kind
+        place.rmdir()
 
 
 def stamped(results: Path, sequence: str) -> Path:

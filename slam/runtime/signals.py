@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
@@ -22,11 +22,14 @@ class Terminated(SystemExit):
 
 
 @contextmanager
-def raising_on_termination() -> Iterator[None]:
+def raising_on_termination() -> Iterator[Callable[[], None]]:
     """Raise `Terminated` in the block when the process is told to end.
 
-    Only in the main thread, and only for signals that nobody handles or ignores already. After the first signal
-    others are ignored for the rest of the block: ``timeout`` and shells send the same one several times.
+    Only in the main thread, and only for signals that nobody handles or ignores already.
+
+    Yields:
+        A function that ignores these signals for the rest of the block: ``timeout`` and shells send the same one
+        several times, and what the first one makes the block write must become whole.
     """
     numbers: list[int] = []
     if threading.current_thread() is threading.main_thread():
@@ -34,14 +37,16 @@ def raising_on_termination() -> Iterator[None]:
         numbers = [number for number in known if signal.getsignal(number) is signal.SIG_DFL]
 
     def end(number: int, _: object) -> None:
-        for each in numbers:
-            signal.signal(each, signal.SIG_IGN)
         raise Terminated(number)
+
+    def ignore() -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
 
     for number in numbers:
         signal.signal(number, end)
     try:
-        yield
+        yield ignore
     finally:
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

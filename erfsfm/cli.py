@@ -160,7 +160,7 @@ def receptive_field(
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.receptive_field.figure import draw_fields
-    from erfsfm.receptive_field.measure import measure_fields
+    from erfsfm.receptive_field.measure import field_table, measure_fields
     from erfsfm.receptive_field.street import street_snippet
 
     if output.suffix not in (".png", ".pdf", ".svg"):
@@ -177,18 +177,10 @@ def receptive_field(
     rows = measure_fields(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
-    summaries = [row.summary() for row in rows]
     if as_json:
-        typer.echo(json.dumps(summaries, indent=2))
+        typer.echo(json.dumps([row.summary() for row in rows], indent=2))
         return
-    typer.echo(
-        f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"
-    )
-    for row in summaries:
-        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
-        box = f"{row['columns']} x {row['rows']}"
-        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
-        typer.echo(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+    typer.echo(field_table(rows))
     typer.echo(f"picture in {output}")
 
 

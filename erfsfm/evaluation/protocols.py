@@ -1,4 +1,4 @@
-"""Whole evaluations: trained networks on recordings with truth, beside a baseline that knows nothing."""
+"""Whole evaluations: trained networks on recordings with truth, beside a baseline that uses no image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trained network as the start of another variant of it, or of one twice as wide, that says the same at first.
+"""Initial weights from a trained network of another variant or half the width, with the same output at first.
 
 In another variant the kernels stay, and only where their taps lie is learned. In a wider one every channel stands
 twice and counts half (Chen et al. 2016, Net2Net); a little noise lets the two part.

@@ -107,6 +107,17 @@ def measure_fields(
     return [_row(*which, snippet, offsets_px, learned, device or torch.device("cpu")) for which in wanted]
 
 
+def field_table(rows: Sequence[FieldRow]) -> str:
+    """The summaries of rows as text, a line each below a heading."""
+    lines = [f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"]
+    for row in (row.summary() for row in rows):
+        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
+        box = f"{row['columns']} x {row['rows']}"
+        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
+        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+    return "\n".join(lines)
+
+
 def _row(
     name: str,
     fidelity: Fidelity,

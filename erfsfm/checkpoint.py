@@ -35,7 +35,7 @@ FILES = ("depth.safetensors", "pose.safetensors")
 class ModelRecord(Section):
     """Everything about a pair of networks but their weights."""
 
-    model_config = ConfigDict(allow_inf_nan=True)  # a validation may have measured nothing
+    model_config = ConfigDict(allow_inf_nan=True)  # a metric may be undefined
 
     format: Literal[1] = FORMAT
     network: NetworkConfig
@@ -59,7 +59,7 @@ class Model:
 
 
 class Absent(nn.Module):
-    """Stands where a folder holds only one of the two networks; using it is an error of one line."""
+    """Placeholder where a folder holds only one of the two networks; using it is an error of one line."""
 
     def __init__(self, kind: NetworkKind, folder: Path) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
 
 
 def _require_kind(kind: NetworkKind, name: str) -> None:
-    """Refuse a pose network where depth is wanted, and the reverse; unknown names are the builder's to refuse."""
+    """Refuse a pose network where depth is wanted, and the reverse; `build` refuses unknown names."""
     if name in PRESETS and PRESETS[name].kind != kind:
         known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
         raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
@@ -204,7 +204,7 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         net: of the architecture that the weights should have.
         tensors: weights by name.
         origin: file they came from, for the error.
-        wanted_by: who says what the architecture is, for the error.
+        wanted_by: source of the wanted architecture, for the error.
 
     Raises:
         CheckpointError: of another architecture, or not numbers.

@@ -1,4 +1,4 @@
-"""The one door through which others use the networks: NumPy in, NumPy out."""
+"""Inference with trained networks, the interface for other packages: NumPy in, NumPy out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
+from erfsfm.checkpoint import commit as commit  # for slam, which imports this module alone
 from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
@@ -33,7 +33,7 @@ _THREADS = max(torch.get_num_threads() - 1, 1)
 
 
 def limit_torch_threads() -> None:
-    """Let networks asked in this thread compute on all cores but one, for whatever goes on beside them."""
+    """Let PyTorch in this thread use all cores but one, which stays free for other threads."""
     torch.set_num_threads(_THREADS)
 
 
@@ -60,7 +60,7 @@ class PreparedImage:
 class DepthPosePredictor:
     """Depth of single images and poses of snippets, in one unknown scale.
 
-    ``noise`` is that of the poses, where it was measured with these very weights; else None.
+    ``noise`` is the noise model of the poses if it was measured with these weights, else None.
     """
 
     noise: PoseNoise | None = None
@@ -74,7 +74,7 @@ class DepthPosePredictor:
         self.sources: int = model.record.network.sources
         self._depth_net = model.depth_net.eval().to(self.device)
         self._pose_net: nn.Module = _PoseMatrices(model.pose_net).eval().to(self.device)
-        if self.device.type == "cpu":  # images have the channels of a pixel together, and small kernels gain by it
+        if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
             for network in (self._depth_net, self._pose_net):
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -101,13 +101,13 @@ class DepthPosePredictor:
         return predictor
 
     def freeze(self) -> Self:
-        """Answer by graphs of the networks from now on: the same up to rounding, and sooner on a CPU."""
+        """Trace the networks: the same outputs up to rounding, faster on a CPU."""
         if self.device.type == "cpu":
             self._depth_net, self._pose_net = Frozen(self._depth_net), Frozen(self._pose_net)
         return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
-        """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""
+        """Those of the given recordings (``kitti_odometry/00[0:300]``) that were trained on."""
         return overlapping(names, self.record.trained_on)
 
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -181,7 +181,7 @@ class DepthPosePredictor:
 
 
 class _PoseMatrices(nn.Module):
-    """A pose network that answers for one snippet in transforms, double precision."""
+    """A pose network whose output for one snippet are transforms in double precision."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()

@@ -30,7 +30,7 @@ from slam.storage.files import write_atomically
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Plan, run what is missing, write tables."""
+    """Plan the runs, perform those that are missing, write tables."""
     options = _parser().parse_args(words)
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)

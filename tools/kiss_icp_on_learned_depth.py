@@ -1,8 +1,8 @@
 """An experiment: can kiss-icp, a LiDAR odometry, register the point clouds of learned depth?
 
-The system runs as ever; then the near part of every learned depth map becomes a cloud of points, and kiss-icp (Vizzo et
-al. 2023) registers cloud after cloud. Its trajectory stands in one table with those of the run. What was found is told
-in docs/design/tried-without-success.md.
+The system runs with its usual settings; then the near part of every learned depth map becomes a point cloud, and
+kiss-icp (Vizzo et al. 2023) registers cloud after cloud. Its trajectory is printed in one table with those of the run.
+The result is described in docs/design/tried-without-success.md.
 
 Example: python tools/kiss_icp_on_learned_depth.py --dataset KITTI --sequence 05 --weights sim
 """
@@ -114,8 +114,8 @@ def registered(
 def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:
     """Points ``(P, 3)`` in the camera, metres, of some of the pixels that are near and not at an edge of depth.
 
-    Every frame sees other pixels in another order: with the same rays in each, the road is the same rings of points in
-    every cloud, and registration prefers not to move.
+    The pixels are drawn anew for every frame: with the same rays in each, the road would be the same rings of points in
+    every cloud, which biases registration towards no motion.
     """
     height, width = depth.shape
     camera = intrinsics.resized(width, height)

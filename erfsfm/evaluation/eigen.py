@@ -24,7 +24,7 @@ _FLAT_ROAD_M = 20.0
 
 
 class RawNetworks(PoseDepthNetworks, Protocol):
-    """What this protocol asks for beside the others: the size of the networks' images."""
+    """Networks with their record: this protocol needs the size of their images."""
 
     record: ModelRecord
 
@@ -72,7 +72,7 @@ def eigen_protocol(
 
     Returns:
         Rows ``gt-median`` and ``pose`` of the networks; ``pose`` multiplies depth by the mean over a window's sources
-        of true over predicted distance. Then ``gt-median`` of what knows nothing: a flat road, and 20 m above it.
+        of true over predicted distance. Then ``gt-median`` of a baseline that uses no image: a flat road, cut at 20 m.
 
     Raises:
         DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
@@ -129,7 +129,7 @@ def _compare(
 
 
 def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity) -> float | None:
-    """Mean of true over predicted distance to the sources; None where the car stands, but in paper fidelity."""
+    """Mean of true over predicted distance to the sources; None for a still car, except in paper fidelity."""
     window = frame.window(networks.sources)
     true = displacements(frame, window)
     if fidelity == "default" and true.max() < _STILL_M:

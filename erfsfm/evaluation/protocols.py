@@ -1,4 +1,4 @@
-"""Whole evaluations: trained networks on recordings with truth, beside a baseline that knows nothing."""
+"""Whole evaluations: trained networks on recordings with truth, beside a baseline that uses no image."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAP_M = 80.0
 
 
 class PoseDepthNetworks(Protocol):
-    """What an evaluation asks of trained networks (``erfsfm.inference.DepthPosePredictor``)."""
+    """Depth and pose networks as evaluations use them (``erfsfm.inference.DepthPosePredictor``)."""
 
     sources: int
 
@@ -35,7 +35,7 @@ class PoseDepthNetworks(Protocol):
         ...
 
     def leaks(self, names: Sequence[str]) -> list[str]:
-        """Recordings that training saw."""
+        """Recordings that were trained on."""
         ...
 
 
@@ -43,8 +43,7 @@ def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, ev
     """Median-scaled depth errors under 80 m on every fifth frame with true depth.
 
     Returns:
-        One row for the networks and one for the data's own median depth map, which needs no image:
-        beating it is the least that a network must do.
+        One row for the networks and one for the median depth map of the data, a baseline that uses no image.
 
     Raises:
         DataError: no true depth under the root, or a leak that was not allowed.
@@ -162,10 +161,10 @@ def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, An
 
 
 def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether training saw some of the frames named.
+    """Whether some of the frames were trained on.
 
     Raises:
-        DataError: it did, and that was not allowed.
+        DataError: they were, and that was not allowed.
     """
     leaked = networks.leaks(names)
     if leaked and not allow_leak:

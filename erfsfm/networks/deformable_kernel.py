@@ -86,7 +86,7 @@ class _DeformConv2d(torch.autograd.Function):
                 part = upstream[:, first : first + chunk].flatten(0, 1)  # (B * count, C_out)
                 of_samples = (part @ kernel).view(batch, -1, mask.shape[1], channels)
                 samples = torch.empty_like(of_samples)
-                list(pool.map(_spread, *arguments, repeat(first), of_samples.numpy(), samples.numpy(), *results))
+                list(pool.map(_spread, *arguments, repeat(first), of_samples.numpy(), samples.numpy(), zip(*results)))
                 of_kernel.addmm_(part.T, samples.view(len(part), -1))
         of_weight = of_kernel.view(-1, *weight.shape[2:], channels).permute(0, 3, 1, 2)
         return of_input.permute(0, 3, 1, 2), of_offset.view_as(offset), of_mask.view_as(mask), of_weight, None, None
@@ -101,7 +101,7 @@ def _arrays(input: Tensor, offset: Tensor, mask: Tensor, rows: Tensor, columns: 
     """The first arguments of `_read` and `_spread`, image by image."""
     images = input.detach().permute(0, 2, 3, 1).contiguous().numpy()
     offsets, factors = (tensor.detach().flatten(2).contiguous().numpy() for tensor in (offset, mask))
-    return images, repeat(rows.numpy()), repeat(columns.numpy()), offsets, factors
+    return images, repeat((rows.numpy(), columns.numpy())), offsets, factors
 
 
 def _places_at_once(input: Tensor, mask: Tensor) -> int:
@@ -146,19 +146,19 @@ def _neighbours(place: float, size: int) -> tuple[int, int, float, float, float,
 
 
 @_compiled
-def _read(image: Array, rows: Array, columns: Array, offset: Array, mask: Array, first: int, samples: Array) -> None:
+def _read(image: Array, rest: tuple[Array, Array], offset: Array, mask: Array, first: int, samples: Array) -> None:
     """Sample the taps of some outputs of one image.
 
     Args:
         image: ``(H, W, C)``.
-        rows: tap positions at zero offset, pixels, ``(H_out, k_h)``.
-        columns: the same along the other axis, ``(W_out, k_w)``.
+        rest: rows ``(H_out, k_h)`` and columns ``(W_out, k_w)`` of the taps without offsets, pixels.
         offset: ``(2 * k_h * k_w, H_out * W_out)``.
         mask: ``(k_h * k_w, H_out * W_out)``.
         first: index of the first output.
         samples: receives values times factors, ``(outputs, k_h * k_w, C)``.
     """
     height, width, channels = image.shape
+    rows, columns = rest
     out_w, k_w = columns.shape
     as_image = image.dtype.type  # positions are doubles; in the loop over channels these would halve the speed
     for n in range(samples.shape[0]):
@@ -183,28 +183,25 @@ def _read(image: Array, rows: Array, columns: Array, offset: Array, mask: Array,
 @_compiled
 def _spread(
     image: Array,
-    rows: Array,
-    columns: Array,
+    rest: tuple[Array, Array],
     offset: Array,
     mask: Array,
     first: int,
     of_samples: Array,
     samples: Array,
-    of_image: Array,
-    of_offset: Array,
-    of_mask: Array,
+    gradients: tuple[Array, Array, Array],
 ) -> None:
     """Sample as `_read` does, and propagate the gradient of the samples to image, offset and mask.
 
     Args:
-        image, rows, columns, offset, mask, first: as of `_read`.
+        image, rest, offset, mask, first: as of `_read`.
         of_samples: gradient, ``(outputs, k_h * k_w, C)``.
         samples: receives what `_read` gives.
-        of_image: gradient of ``image``, added to.
-        of_offset: receives that of ``offset``.
-        of_mask: receives that of ``mask``.
+        gradients: that of ``image``, added to; receives those of ``offset`` and ``mask``.
     """
+    of_image, of_offset, of_mask = gradients
     height, width, channels = image.shape
+    rows, columns = rest
     out_w, k_w = columns.shape
     as_image = image.dtype.type
     for n in range(samples.shape[0]):

@@ -25,6 +25,10 @@ class Frozen(nn.Module):
     def __init__(self, network: nn.Module) -> None:
         """Freeze a network in evaluation mode; all inputs will have the shapes of the first."""
         super().__init__()
+        # Image sizes become constants of the graph, as intended. The filters are those of the whole process and stay:
+        # the graph is traced in a thread, and `warnings.catch_warnings` is not safe there.
+        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # type: ignore[attr-defined]
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"torch\.jit\.")
         self.network = network
         self._is_frozen = False
 
@@ -35,8 +39,8 @@ class Frozen(nn.Module):
             self._is_frozen = True
         # PyTorch's profiling executor begins with slow passes, and is not faster here
         with torch.jit.optimized_execution(False):  # type: ignore[attr-defined, no-untyped-call]
-            answer: Tensor = self.network(*inputs)
-        return answer
+            output: Tensor = self.network(*inputs)
+        return output
 
 
 class _Function(nn.Module):
@@ -44,19 +48,17 @@ class _Function(nn.Module):
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.answer = partial(network.requires_grad_(False))
+        self.function = partial(network.requires_grad_(False))
 
     def forward(self, *inputs: Tensor | list[Tensor]) -> Tensor:
-        answer: Tensor = self.answer(*inputs)
-        return answer
+        output: Tensor = self.function(*inputs)
+        return output
 
 
 @torch.inference_mode()
 def _graph(network: nn.Module, *inputs: Tensor | list[Tensor]) -> nn.Module:
     if meets_kernel(network, *inputs):
         return network
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # sizes become constants: that is meant
-        traced = torch.jit.trace(_Function(network).eval(), inputs, check_trace=False)
-        graph: nn.Module = torch.jit.freeze(traced)  # type: ignore[no-untyped-call]
+    traced = torch.jit.trace(_Function(network).eval(), inputs, check_trace=False)
+    graph: nn.Module = torch.jit.freeze(traced)  # type: ignore[no-untyped-call]
     return graph

@@ -1,4 +1,4 @@
-"""A drawn street to look at where no picture is given: a road between two textured walls."""
+"""A drawn street, the input where no images are given: a road between two textured walls."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What classical geometry sees in a snippet: a teacher for both networks that needs no label.
+"""Depth and motion of a snippet by classical two-view geometry: pseudo-labels for both networks.
 
-Each source and the target give depth up to the length of their motion; the lengths are compared where both are
-sure, the depths averaged, and everything is put in heights of the camera over the road.
+Each source with the target gives depth up to the length of their motion. The lengths are brought to one unit where
+both depths are certain, the depths are averaged, and all is expressed in heights of the camera over the road.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
 
 
 def _forward(T_source_target: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Direction of travel at the target, in its frame: from the frames before to the frames after, ``(3,)``."""
+    """Direction of travel in the target's frame, from the frames before to the frames after, ``(3,)``."""
     places = -np.swapaxes(T_source_target[:, :3, :3], 1, 2) @ T_source_target[:, :3, 3:]  # of the sources, (N, 3, 1)
     middle = len(places) // 2
     travelled = np.concatenate([-places[:middle, :, 0], places[middle:, :, 0]])
@@ -88,7 +88,7 @@ def _forward(T_source_target: NDArray[np.float64]) -> NDArray[np.float64] | None
 
 
 class StructureCache:
-    """Structures already measured, as files named by the bytes of their images; None keeps nothing."""
+    """Measured structures as files named by a hash of their images; without a folder nothing is kept."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -110,7 +110,7 @@ class StructureCache:
 
 
 def _read(path: Path) -> TeacherStructure | None:
-    """None if there is no whole structure."""
+    """None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as entry:
             return TeacherStructure(entry["T_source_target"], entry["least"], entry["most"])
@@ -127,7 +127,7 @@ def _write(path: Path, structure: TeacherStructure) -> None:
 
 
 def _relative_lengths(views: Sequence[MotionAndDepth | None]) -> list[float]:
-    """Length of each view's translation over that of the surest view; 0 of a still one, NaN where unknown."""
+    """Length of each view's translation over that of the most certain view; 0 if still, NaN if unknown."""
     sure = [None if v is None or v.still else v.inverse_depth > SURE * v.sigma for v in views]
     counts = [0 if s is None else int(s.sum()) for s in sure]
     best = int(np.argmax(counts))

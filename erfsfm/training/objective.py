@@ -30,9 +30,9 @@ HEIGHTS = 10.0  # camera heights in a taught network's unit: steps are hundredth
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    What classical geometry measured, where it was asked (`erfsfm.teacher.structure`): ``T_source_target``
+    Measurements of the teacher (`erfsfm.teacher.structure`), where one is used: ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
-    Where the networks see them otherwise: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order.
+    With simulated weather: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """
 
     target: Tensor
@@ -53,11 +53,10 @@ class SnippetBatch:
 
 @dataclass(frozen=True)
 class ObjectiveResult:
-    """The loss, its terms, and what the networks said.
+    """The loss, its terms, and the networks' outputs.
 
     ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
-    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution seen from the target, None where no photometric
-    error was asked for.
+    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution warped to the target, None without photometric error.
     """
 
     total: Tensor
@@ -75,16 +74,16 @@ def to_network_range(image: Tensor) -> Tensor:
 def evaluate_objective(
     depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
 ) -> ObjectiveResult:
-    """Predict depth and poses of a batch and say how badly they explain it.
+    """Predict depth and poses of a batch and evaluate the loss.
 
-    The networks may run under autocast; geometry and losses keep the images' precision, for a pixel
-    coordinate does not fit into the eight bits of a bfloat16.
+    The networks may run under autocast; geometry and losses keep the images' precision: a pixel
+    coordinate needs more than the eight bits of a bfloat16.
 
     Args:
         depth_net: in training mode, where it gives a pyramid of disparities.
         pose_net: for as many sources as the batch has.
-        batch: what to explain.
-        config: its ``loss`` and ``network`` sections count.
+        batch: images and intrinsics.
+        config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
     said = _Prediction.of(depth_net, pose_net, batch, config)
     with torch.autocast(batch.target.device.type, enabled=False):
@@ -93,7 +92,7 @@ def evaluate_objective(
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What the networks say, in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
+    """Outputs of the networks in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
 
     disparities: list[Tensor]
     pose_vectors: Tensor
@@ -172,10 +171,10 @@ def _evaluate(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) 
 def _teacher_terms(
     said: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
 ) -> dict[str, Tensor]:
-    """How far the networks are from measured structure.
+    """Loss terms of the teacher's measurements.
 
-    Shape and motion are compared after the unit, which the road gives only roughly, has been fitted to the depth
-    network's; the unit itself is a term of its own.
+    Depth and motion are compared after the teacher's unit, which the road measures only roughly, has been fitted to the
+    depth network's; the unit itself is a separate term.
     """
     finest = said.disparities[0]
     log_scale = bounds.log_scale(finest)
@@ -216,7 +215,7 @@ class _Level:
         )
 
     def warp(self, T_source_target: Tensor) -> tuple[Tensor, Projection]:
-        """All sources seen from the target, ``(B * N, 3, h, w)``, and how they were found."""
+        """All sources warped to the target, ``(B * N, 3, h, w)``, and the projection."""
         count = self.sources.shape[1]
         depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
         K = self.K.repeat_interleave(count, dim=0)

@@ -1,4 +1,4 @@
-"""One training run: data in, an output folder that ``--weights`` takes out."""
+"""One training run; its output folder is what ``--weights`` takes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def train(
         The output folder.
 
     Raises:
-        ConfigError, DataError, TrainingError: what a user can mend, in one line.
+        ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
     folder = OutputFolder(output)
     rank = int(os.environ.get("LOCAL_RANK", 0)) if config.training.devices > 1 else 0
@@ -85,7 +85,9 @@ def train(
     if config.initial_weights and not resume:
         seen = merge([*seen, *_start_from(module, config.initial_weights)])
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
-    loader = DataLoader(draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0)
+    loader = DataLoader(
+        draws, batch, num_workers=workers, worker_init_fn=_single_threaded_worker, persistent_workers=workers > 0
+    )
     trainer = _trainer(config, output, device, quiet or rank > 0, keeper, done_steps)
     if rank == 0:
         folder.write_config(config)
@@ -108,7 +110,7 @@ def _fit(
     validation_loader: DataLoader[dict[str, Tensor]] | None,
     checkpoint: Path | None,
 ) -> None:
-    """Run the loop; what stops it becomes one line."""
+    """Run the training loop; errors that stop it become one line."""
     try:
         with single_threaded_opencv(), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
@@ -125,7 +127,7 @@ def _fit(
 
 
 def _start_from(module: SelfSupervision, name: str) -> list[str]:
-    """Take over trained weights, of another variant or half the width too; what they were trained on."""
+    """Load initial weights, also of another variant or half the width; returns what they were trained on."""
     model = load_model(name)
     wanted = module.config.network
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width")}
@@ -187,13 +189,13 @@ def _trainer(
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """A checkpoint replaces the last one at once, or not at all: Lightning's goes through another file system."""
+    """Checkpoints that are replaced atomically; Lightning's go through another file system."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``."""
         write_atomically(Path(path), lambda part: torch.save(checkpoint, part))
 
 
-def _calm_worker(_: int) -> None:
-    """A worker computes with one thread: the cores belong to the training step."""
+def _single_threaded_worker(_: int) -> None:
+    """One thread in a data loader process: the cores are the training step's."""
     torch.set_num_threads(1)

@@ -31,7 +31,7 @@ def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...
 
 
 def over_seeds(definition: MetricDefinition) -> Cell:
-    """Mean and, where it is more than nothing, sample standard deviation."""
+    """Mean and, where it is not zero, sample standard deviation."""
 
     def cell(group: Sequence[JobResult]) -> str:
         found = values(group, definition)
@@ -47,7 +47,7 @@ def average(definition: MetricDefinition) -> Cell:
 
 
 def average_among(definition: MetricDefinition, among: Sequence[JobResult]) -> Cell:
-    """Mean over those of a group that are among others too."""
+    """Mean over the results of a group that are also in another one."""
     return lambda group: mean(values([o for o in group if o in among], definition), definition.decimals)
 
 
@@ -62,7 +62,7 @@ def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[fl
 
 
 def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
-    """A number of all results that have it."""
+    """The values of a metric, without the results that lack it."""
     found = (lookup(o.metrics, *definition.path)[0] for o in results)
     return [value for value in found if value is not None]
 

@@ -84,7 +84,7 @@ Every drive:
 
 
 def ablation_tables(results: Sequence[JobResult]) -> str:
-    """What each part brings: errors over those of everything on, then the errors themselves."""
+    """Ablation: errors relative to those of everything on, then the errors themselves."""
     errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, TRIANGLES, MEMORY)
     columns = {f"{q.title}: ratio (worst)": against_everything(q, results) for q in errors}
     columns |= {q.title: average(q) for q in others}
@@ -165,7 +165,7 @@ def stage_ms(stage: str) -> Cell:
 
 
 def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
-    """What a reader must know about the numbers, why some are missing and runs failed; a line each."""
+    """Leaks, reasons of missing numbers, and failed runs, a line each."""
     lines: dict[str, None] = {}
     for o in (o for o in results if not o.reason):
         if lookup(o.metrics, "provenance", "leak")[0]:
@@ -179,7 +179,7 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
 
 
 def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: str) -> str:
-    """A section of the page: what was done, then its tables."""
+    """A section of the page: command, commit and seeds, then its tables."""
     commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
     seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
     failed = sum(bool(o.reason) for o in results)

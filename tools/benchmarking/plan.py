@@ -1,4 +1,4 @@
-"""What is to be measured: recordings, configurations and the runs that combine them."""
+"""The runs of a benchmark: recordings, configurations and their combinations."""
 
 from __future__ import annotations
 

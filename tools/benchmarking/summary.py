@@ -1,4 +1,4 @@
-"""Many drives of one kind in one row: how good the worst is, how many closed their loop, what hazards cost."""
+"""One row for each kind of drive: median and worst errors, closed loops, errors with hazards over those without."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def summary_table(results: Sequence[JobResult]) -> str:
 
 
 def kind(o: JobResult) -> str:
-    """What a drive has in common with others."""
+    """Kind of the drive."""
     return o.job.drive.kind
 
 

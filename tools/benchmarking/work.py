@@ -1,4 +1,4 @@
-"""Runs, each in a process of its own, one after another or through Dask, and what they leave."""
+"""Runs, each in a process of its own, one after another or through Dask, and their results."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def revision() -> str:
 
 @contextmanager
 def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
-    """A way to do one thing to many: one after another, or through Dask."""
+    """A ``map`` over jobs: one after another, or through Dask."""
     if count == 1 and scheduler is None:
         yield map
         return

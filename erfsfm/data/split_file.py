@@ -16,7 +16,7 @@ from erfsfm.config_tree import first_problem
 from erfsfm.errors import DataError
 from erfsfm.yaml_file import YamlError, read_yaml
 
-_FRAMES = re.compile(r"(?P<recording>[^\[\]]+)\[(?P<runs>[\d:, ]+)\]")
+_FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
 _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
 
 
@@ -30,7 +30,8 @@ class Split(Section):
     @property
     def test_recordings(self) -> list[str]:
         """Recordings with a frame to test on, without their frames."""
-        return [name.partition("[")[0] for name in self.test]
+        matches = [(name.strip(), _FRAMES.fullmatch(name.strip())) for name in self.test]
+        return [name if match is None else match["recording"] for name, match in matches]
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number.

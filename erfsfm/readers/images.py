@@ -64,7 +64,7 @@ def read_image(path: Path) -> Image:
                 f"image {path} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
                 f"8 bits; convert the images to 8 bits, or multiply their values by 16"
             )
-    return np.ascontiguousarray(_decode(path, data, cv2.IMREAD_COLOR)[..., ::-1])
+    return np.asarray(cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_values(path: Path) -> NDArray[Any]:

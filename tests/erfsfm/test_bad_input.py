@@ -67,6 +67,57 @@ def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: Writ
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_half_an_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, suffix: str) -> None:
+    root = write_root(tmp_path / "root", frames=5, suffix=suffix)
+    image = root / f"sequences/00/image_2/000002{suffix}"
+    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
+    wanted = f"000002{suffix} is truncated at {image.stat().st_size} bytes: copy it again"
+    assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
+    assert wanted in refusal("predict", image.parent, "--weights", weights, "--output", tmp_path / "depth")
+    assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
+
+
+def test_twelve_bits_in_sixteen(refusal: Refusal, tmp_path: Path, weights: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 64, 3), 4095, np.uint16))
+    error = refusal("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth")
+    assert "a.png has 16 bits, but no value above 4095: it looks like 12-bit data" in error
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [("fx: 100", "key 'fx' stands twice"), ("camera_height: 1", "key camera_height is unknown")],
+)
+def test_a_camera_file_that_says_too_much(refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str) -> None:
+    camera = trip / "camera.yaml"
+    camera.write_text(f"{camera.read_text()}{line}\n")
+    assert words in refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
+
+
+def test_brackets_in_a_name(
+    refusal: Refusal,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    write_root: WriteRoot,
+) -> None:
+    """A folder is trained on and predicted from, and its leak is known by name."""
+    root = write_root(tmp_path / "r[o]ot", frames=6)
+    (root / "sequences/00").rename(root / "sequences/s[0]")
+    (root / "poses/00.txt").rename(root / "poses/s[0].txt")
+    run, images = tmp_path / "r[u]n", root / "sequences/s[0]/image_2"
+    small = [*SMALL[:4], "--set", "training.batch=2", "--set", "network.sources=4"]
+    for command in (
+        [*TRAIN, *small, "--set", "network.height=64", "--set", "network.width=96", "--dataset", root, "--output", run],
+        ["predict", images, "--weights", run, "--output", tmp_path / "d[e]pth"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["erfsfm", *map(str, command)])
+        with pytest.raises(SystemExit, match="0"):
+            main()
+    assert len(list((tmp_path / "d[e]pth").iterdir())) == 12
+    error = refusal("evaluate", "pose", "--dataset", root, "--sequence", "s[0]", "--weights", run)
+    assert "leak: these weights were trained on kitti_odometry/s[0][0:6]" in error
+
+
 def test_intrinsics_of_another_resolution(refusal: Refusal, tmp_path: Path) -> None:
     drive = tmp_path / "drive"
     (drive / "images").mkdir(parents=True)

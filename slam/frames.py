@@ -6,32 +6,32 @@ The front end, the graph, the map and the evaluation never import each other; th
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Hashable
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.se3 import FloatArray
+from erfsfm.readers.pinhole import Pinhole
+from slam.se3 import FloatArray, invert
 
+T = TypeVar("T")
 Image = NDArray[np.uint8]
+Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
+Ends = tuple[int, int]  # the two frames of a step or a factor
 LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may give these up
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class Intrinsics(Pinhole):
     """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
     @property
     def K(self) -> FloatArray:
@@ -49,26 +49,40 @@ class Intrinsics:
         v, u = np.mgrid[: self.height, : self.width]
         return np.stack([u, v], axis=-1).astype(np.float64)
 
-    def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera after its image is resized, half-pixel exact."""
-        sx, sy = width / self.width, height / self.height
-        return Intrinsics(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-        )
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds."""
+    """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
+
+    What is computed from the image alone (grey levels, pyramids, features) belongs to the frame: it is made once and
+    lives as long as the frame does.
+    """
 
     index: int
     stamp: float
     image: Image
+    _derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def derived(self, key: Hashable, make: Callable[[], T]) -> T:
+        """What ``make`` computes from the image, made when it is first asked for; any thread may ask."""
+        if key not in self._derived:
+            self._derived.setdefault(key, make())
+        known: T = self._derived[key]
+        return known
+
+    @property
+    def grey(self) -> Grey:
+        """Grey levels ``(H, W)`` uint8."""
+        return self.derived("grey", lambda: np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY), np.uint8))
+
+    @property
+    def digest(self) -> bytes:
+        """SHA-256 of shape and pixels: names the image in a cache."""
+
+        def digest() -> bytes:
+            return hashlib.sha256(repr(self.image.shape).encode() + self.image.tobytes()).digest()
+
+        return self.derived("digest", digest)
 
 
 class Sequence(Protocol):
@@ -117,6 +131,12 @@ class SnippetPoses:
     T_source_target: FloatArray
     residuals: FloatArray | None = None
 
+    @property
+    def T_target_camera(self) -> dict[int, FloatArray]:
+        """Poses ``(4, 4)`` of the snippet's cameras in that of the target, by frame, the target among them."""
+        T_target_source = invert(self.T_source_target)
+        return {**dict(zip(self.sources, T_target_source, strict=True)), self.target: np.eye(4)}
+
 
 class Predictor(Protocol):
     """Learned depth and snippet poses in one common, unknown scale: the networks, a cache or an oracle."""
@@ -131,6 +151,10 @@ class Predictor(Protocol):
         """Poses of the sources of a snippet whose target is the middle frame."""
         ...
 
+    def executor(self) -> Executor:
+        """A new thread in which this predictor is asked, with as many cores as it may use; its user shuts it down."""
+        ...
+
 
 @dataclass(frozen=True)
 class RelativePose:
@@ -139,7 +163,7 @@ class RelativePose:
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
     translation in the units of the measurement. ``source`` names who measured it. ``correlated_sigmas`` ``(6,)``, where
     errors of neighbours are alike: independent errors of these sigmas would add up along a chain as those do.
-    Errors are by Student's t of so many ``student_t_dof`` of freedom; normal where infinite.
+    Errors follow Student's t with ``student_t_dof`` degrees of freedom; they are normal where that is infinite.
     """
 
     from_index: int
@@ -149,6 +173,19 @@ class RelativePose:
     source: str
     correlated_sigmas: FloatArray | None = None
     student_t_dof: float = math.inf
+
+    @property
+    def ends(self) -> Ends:
+        """Both frames."""
+        return self.from_index, self.to_index
+
+    def scaled(self, scale: float) -> RelativePose:
+        """The same measurement in another unit: translation and its sigmas times ``scale``."""
+        T_from_to = self.T_from_to.copy()
+        T_from_to[:3, 3] *= scale
+        units = np.repeat([1.0, scale], 3)
+        correlated = None if self.correlated_sigmas is None else self.correlated_sigmas * units
+        return replace(self, T_from_to=T_from_to, sigmas=self.sigmas * units, correlated_sigmas=correlated)
 
     @property
     def graph_sigmas(self) -> FloatArray:

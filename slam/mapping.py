@@ -1,7 +1,7 @@
-"""The dense map: learned depth, filtered and fused into a truncated signed distance field.
+"""The dense map: learned depth fused into a truncated signed distance field (TSDF).
 
-Curless and Levoy 1996 on Open3D's sparse ``VoxelBlockGrid``. Learned depth is wrong far away, at depth
-edges and where two views disagree; what is left after those three filters is fused.
+Curless and Levoy 1996 on Open3D's sparse ``VoxelBlockGrid``. Learned depth is wrong far away, at depth edges and where
+two views disagree; these three are filtered out before fusion.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray, invert, rotation_angle
 
 _BLOCK_SIDE = 16
-_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street: each time that there are more costs Open3D a second
-_SEED_STRIDE = 4  # Open3D looks for blocks at these pixels alone, and raises where none of them has depth
+_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street; growing costs Open3D a second
+_SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
 _ATTRIBUTES = ("tsdf", "weight", "color")
 
 logger = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class MapStatistics:
 
 
 class TsdfMap:
-    """Fuses depth maps of one camera along its trajectory; lengths are in the trajectory's unit."""
+    """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
 
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         self._config = config
@@ -79,7 +79,7 @@ class TsdfMap:
         self._cloud: MapCloud | None = None
 
     def integrate(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> None:
-        """Filter a depth map against the keyframe before it and fuse it; skip it where that is too near.
+        """Filter a depth map by the previous keyframe and fuse it; skip it where the camera hardly moved.
 
         Args:
             depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
@@ -123,7 +123,7 @@ class TsdfMap:
         if self._cloud is None:
             self._fuse_single_keyframe()
             point = self._extract(self._grid.extract_point_cloud).point
-            # Open3D's threads finish in any order: sorted, two runs give one file
+            # Open3D's threads finish in any order; sorted, two runs write the same file
             order = np.lexsort(_array(point.positions).T)
             positions, normals, colours = (
                 _array(part)[order] for part in (point.positions, point.normals, point.colors)
@@ -181,7 +181,7 @@ class TsdfMap:
         return moved >= config.keyframe_distance_m or turned >= np.deg2rad(config.keyframe_rotation_deg)
 
     def _agrees(self, view: _View, other: _View) -> NDArray[np.bool_]:
-        """Pixels ``(H, W)`` whose depth the other view's depth confirms."""
+        """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         camera = self._intrinsics
         T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
         points = self._rays * view.depth.ravel()  # (3, H*W)
@@ -237,7 +237,7 @@ class TsdfMap:
     def _extract(self, extract: Callable[[float], Any]) -> Any:
         if self._fused == 0:
             raise SlamError("the map is empty: no depth passed the filters")
-        # one frame alone weighs 1: a short sequence must not ask for more than it has
+        # a frame weighs 1: with fewer frames than min_weight nothing would be extracted
         weight = min(self._config.min_weight, self._fused) - 0.5
         unseen = SlamError(f"the map is empty: no surface was seen {self._config.min_weight:g} times")
         try:
@@ -274,7 +274,7 @@ def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
-    """Pixels on either side of a relative depth step: networks smear surfaces across it."""
+    """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
     for near, far in (
         ((slice(None), slice(1, None)), (slice(None), slice(-1))),
@@ -288,12 +288,12 @@ def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
 
 
 def _sorted(mesh: MapMesh) -> MapMesh:
-    """The same mesh in an order that does not depend on how Open3D's threads finished."""
+    """The same mesh in an order that does not depend on Open3D's threads."""
     order = np.lexsort(mesh.vertices_world.T)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     triangles = rank[mesh.triangles]
-    first = triangles.argmin(axis=1)[:, None]  # turning a triangle keeps the side it faces
+    first = triangles.argmin(axis=1)[:, None]  # cyclic rotation keeps the orientation of a triangle
     triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]
     return MapMesh(mesh.vertices_world[order], triangles, mesh.colours[order])

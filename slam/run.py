@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypedDict, Unpack
 
-import cv2
 import numpy as np
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit, overlapping
+from erfsfm.threads import limit_library_threads
 from slam.config import SlamConfig, dump_yaml, load_config
 from slam.errors import ConfigError, RunError, SlamError
 from slam.frames import Intrinsics
@@ -21,7 +21,6 @@ from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
-from slam.prediction.cached import CachedNetworks
 from slam.prediction.networks import NetworkPredictor
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
@@ -33,7 +32,6 @@ from slam.results.run_log import LOG, RunLog, run_log
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.imports import import_rerun
 from slam.runtime.signals import Terminated, raising_on_termination
-from slam.runtime.threads import limit_library_threads
 from slam.sequences.catalogue import open_sequence
 from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
 from slam.storage.fingerprint import code_fingerprint
@@ -165,9 +163,8 @@ def _prepare(request: RunRequest) -> _Job:
         checkpoint = _checkpoint(request.continues, networks.sha256, recording)
         recording = checkpoint.continued(recording)
     predictor, get_or_compute = _predictor(networks, recording.intrinsics, request.cache)
-    _seed(request.seed)
     pipeline = SlamPipeline(
-        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint
+        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
     )
     pipeline.require_possible()
     return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording))
@@ -215,7 +212,8 @@ def _predictor(
     # GPU and CPU answer a little differently and share no entries
     identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
     get_or_compute = CacheNamespace(disk, code).get_or_compute
-    return NetworkPredictor(CachedNetworks(networks, identity, disk), intrinsics, get_or_compute), get_or_compute
+    answers = CacheNamespace(disk, identity).get_or_compute
+    return NetworkPredictor(networks, intrinsics, get_or_compute, answers), get_or_compute
 
 
 def _provenance(request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence) -> Provenance:
@@ -231,11 +229,6 @@ def _provenance(request: RunRequest, networks: DepthPosePredictor, recording: Fr
         trained_on=networks.record.trained_on,
         leak=bool(networks.leaks(recording.provenance())),
     )
-
-
-def _seed(seed: int) -> None:
-    np.random.seed(seed)
-    cv2.setRNGSeed(seed)
 
 
 def _run(job: _Job, folder: RunFolder) -> None:
@@ -270,10 +263,10 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
     keep = job.settings.output.keep
     if keep != "nothing":
-        checkpoint = SessionCheckpoint.of(job.recording, result.observer, job.provenance.weights_sha256)
+        checkpoint = SessionCheckpoint.of(job.recording, result.state, job.provenance.weights_sha256)
         folder.write(DRIVE, checkpoint.write)
     if keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.observer.seen.keyframes))
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
 
 
 def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:

@@ -1,8 +1,8 @@
 """An experiment: can kiss-icp, a LiDAR odometry, register the point clouds of learned depth?
 
-The system runs as ever; then the near part of every learned depth map becomes a cloud of points, and kiss-icp (Vizzo et
-al. 2023) registers cloud after cloud. Its trajectory stands in one table with those of the run. What was found is told
-in docs/design/0012-kiss-icp-on-learned-depth.md.
+The system runs with its usual settings; then the near part of every learned depth map becomes a point cloud, and
+kiss-icp (Vizzo et al. 2023) registers cloud after cloud. Its trajectory is printed in one table with those of the run.
+The result is described in docs/design/tried-without-success.md.
 
 Example: python tools/kiss_icp_on_learned_depth.py --dataset KITTI --sequence 05 --weights sim
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -27,13 +26,13 @@ from slam.errors import SlamError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import DepthMap, Intrinsics
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.observer import Keyframe
-from slam.prediction.cached import CachedNetworks
+from slam.pipeline.observations import Keyframe
 from slam.prediction.networks import NetworkPredictor
 from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
+from slam.storage.cache import CacheNamespace, DiskCache, without_cache
 from slam.trajectory import Trajectory
 
 SEED = 0
@@ -45,11 +44,12 @@ def main(words: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(words)
     try:
         recording = open_sequence(options.dataset, options.sequence, None, options.frames)
-        networks: Any = DepthPosePredictor.from_weights(options.weights, "cpu")
+        networks = DepthPosePredictor.from_weights(options.weights, "cpu")
+        answers = without_cache
         if options.cache is not None:
-            networks = CachedNetworks(networks, networks.sha256, options.cache)
-        settings = load_config(None, options.set)
-        result = SlamPipeline(recording, NetworkPredictor(networks, recording.intrinsics), settings).estimate()
+            answers = CacheNamespace(DiskCache(options.cache), networks.sha256).get_or_compute
+        predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
+        result = SlamPipeline(recording, predictor, load_config(None, options.set)).estimate()
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error
     if result.reference is None or not result.observations.keyframes:
@@ -108,14 +108,14 @@ def registered(
     for depth in depths:
         odometry.register_frame(cloud(depth, intrinsics, far_m, share, rng), np.array([]))
         T_first_camera.append(odometry.last_pose.copy())
-    return invert(T_first_camera[0]) @ np.stack(T_first_camera)
+    return np.asarray(invert(T_first_camera[0]) @ np.stack(T_first_camera), dtype=np.float64)
 
 
 def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:
     """Points ``(P, 3)`` in the camera, metres, of some of the pixels that are near and not at an edge of depth.
 
-    Every frame sees other pixels in another order: with the same rays in each, the road is the same rings of points in
-    every cloud, and registration prefers not to move.
+    The pixels are drawn anew for every frame: with the same rays in each, the road would be the same rings of points in
+    every cloud, which biases registration towards no motion.
     """
     height, width = depth.shape
     camera = intrinsics.resized(width, height)

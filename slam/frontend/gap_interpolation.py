@@ -1,4 +1,4 @@
-"""What connects the frames around those that measured nothing: constant motion, with the doubt it deserves."""
+"""Gap interpolation: frames without a measurement follow the constant-velocity model, with wide sigmas."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from slam.config import GapsConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses, runs
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.motion import Motion
 from slam.se3 import FloatArray, from_rotation_vector, invert
 
-INTERPOLATED_SOURCE = "bridge"
+INTERPOLATED_SOURCE = "interpolated"
 _STEPS_OF_A_MOTION = 3
 _SIGMA_FLOOR = 1e-6
 
@@ -22,13 +24,14 @@ _SIGMA_FLOOR = 1e-6
 class InterpolatedGaps:
     """A run's measurements with their gaps closed, unscaled.
 
-    ``snippets`` has one entry a target, gaps filled with constant motion; ``trusted`` are those that the network
-    measured on usable frames. ``interpolated`` are the factors of steps that nothing measured.
+    ``snippets`` has one entry a target, gaps filled by the constant-velocity model; ``trusted`` are those that the
+    network measured on usable frames. ``steps`` are without frozen frames; ``interpolated`` are the factors of steps
+    that nothing measured; ``frames`` are the interpolated frames and why.
     """
 
     snippets: list[SnippetPoses]
     trusted: list[SnippetPoses]
-    geometric: list[RelativePose]
+    steps: StepTable
     interpolated: list[RelativePose]
     frames: dict[int, str]
 
@@ -37,7 +40,7 @@ def interpolate_gaps(
     count: int,
     sources: int,
     snippets: Sequence[SnippetPoses],
-    geometric: Sequence[RelativePose],
+    steps: StepTable,
     unusable: Mapping[int, str],
     repeated: Collection[int],
     config: GapsConfig,
@@ -48,10 +51,10 @@ def interpolate_gaps(
         count: frames of the sequence.
         sources: sources of a snippet.
         snippets: measured, none of them on an unusable frame.
-        geometric: measured between usable frames; over a gap, between its two ends.
+        steps: measured between usable frames; over a gap, between its two ends.
         unusable: frames that measured nothing, and why.
-        repeated: frames with the very image of the frame before.
-        config: noise of a bridge.
+        repeated: frames with the image of the frame before.
+        config: noise of an interpolated step.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to go on with.
@@ -61,66 +64,57 @@ def interpolate_gaps(
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
     by_network = network_steps(snippets)
-    frozen, geometric = _frozen(by_network, geometric, repeated, new)
+    frozen, steps = _without_frozen(by_network, steps, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     trusted = [s for s in snippets if not frozen.intersection((s.target, *s.sources))]
     filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
-    by_image = {g.from_index: g.T_from_to for g in geometric if g.to_index - g.from_index == 1}
+    by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps if m.ends == (m.ends[0], m.ends[0] + 1)}
     # a network that saw only a frozen image still gives the best guess there is
     known = network_steps(trusted) | by_image or by_network
     covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
     motion = _completed(known, loose)
-    motion |= _equal_steps(geometric, set(loose))
+    motion |= _equal_steps(steps.relative_poses, set(loose))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
     interpolated = [_interpolated_step(step, motion[step], typical, config) for step in loose]
-    return InterpolatedGaps(filled, trusted, list(geometric), interpolated, dict(sorted(frames.items())))
+    return InterpolatedGaps(filled, trusted, steps, interpolated, dict(sorted(frames.items())))
 
 
 def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
     """``T_k_next`` by k of each snippet's target to its next source, and of the steps before the first target."""
     steps: dict[int, FloatArray] = {}
     for snippet in snippets:
-        T_target = {i: invert(T) for i, T in zip(snippet.sources, snippet.T_source_target, strict=True)}
-        T_target[snippet.target] = np.eye(4)
-        ends = range(min(snippet.sources), max(snippet.sources))
-        for k in ends:
+        T_target = snippet.T_target_camera
+        for k in range(min(snippet.sources), max(snippet.sources)):
             if k == snippet.target or k not in steps:
                 steps[k] = invert(T_target[k]) @ T_target[k + 1]
     return steps
 
 
-def _frozen(
-    by_network: Mapping[int, FloatArray],
-    geometric: Sequence[RelativePose],
-    repeated: Collection[int],
-    new: Collection[int],
-) -> tuple[set[int], list[RelativePose]]:
-    """Repeated frames during which the camera went on, and the geometric factors that remain without them.
+def _without_frozen(
+    by_network: Mapping[int, FloatArray], steps: StepTable, repeated: Collection[int], new: Collection[int]
+) -> tuple[set[int], StepTable]:
+    """Repeated frames during which the camera went on, and the steps that remain without them.
 
-    The next new picture tells: from a standing camera it lies at most a step away, from one that drove on as many
-    steps as images were repeated. Where no new picture comes, the camera is taken at its word and stands.
+    The next new image tells: from a standing camera it lies at most a step away, from one that drove on as many
+    steps as images were repeated. Where no new image comes, the camera is taken to stand.
     """
     frozen: set[int] = set()
-    kept = list(geometric)
     for first, last in runs(repeated):
         before = [T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1]
         if not before or last + 1 not in new:
             continue
         expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
-        jump = next((g for g in kept if (g.from_index, g.to_index) == (last, last + 1)), None)
+        jump = steps.motions.get((last, last + 1))
         repeats = last - first + 1
-        if jump is not None and np.linalg.norm(jump.T_from_to[:3, 3]) <= (1 + repeats / 2) * expected:
+        if jump is not None and jump.length_unscaled <= (1 + repeats / 2) * expected:
             continue
         frozen |= set(range(first, last + 1))
-        kept = [g for g in kept if not _touches(g, first, last)]
+        steps = steps.without_frames(range(first, last + 1))
         if jump is not None:
-            kept.append(replace(jump, from_index=first - 1))
-    return frozen, kept
-
-
-def _touches(factor: RelativePose, first: int, last: int) -> bool:
-    return any(first <= end <= last for end in (factor.from_index, factor.to_index))
+            over_gap = Motion(replace(jump.relative_pose, from_index=first - 1))
+            steps = steps.replaced({over_gap.ends: over_gap})
+    return frozen, steps
 
 
 def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:

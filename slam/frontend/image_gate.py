@@ -1,7 +1,8 @@
-"""Frames that show nothing of the road are told apart before they mislead anyone: darkness, noise, repetition."""
+"""Images that show nothing usable are refused before they are measured: blank, noise, upside down, frozen."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -9,52 +10,111 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import GapsConfig
-from slam.frames import Image
+from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
-from slam.storage.serialisation import Learner
 
-_THUMB = (32, 16)  # width, height
+_THUMBNAIL = (32, 16)  # width, height
+_SHRINKING = 4  # averages what compression changes
+_LEAST_GRADIENT = 1e-3
+# an image is frozen where the one before it still moved by this times the largest difference of a copy
+_MOVING = 3.0
+_LEAST_FLIPPED_CORRELATION = 0.3
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
+_Layer = NDArray[np.float32]
 
 
-class ImageGate(Learner):
+@dataclass(frozen=True)
+class GateState:
+    """What the gate compares the next image with.
+
+    ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and whether it
+    ``moved`` clearly against the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length.
+    """
+
+    last: Frame | None = None
+    verdict: Verdict = "new"
+    shrunk: _Layer | None = None
+    moved: bool = False
+    usable: _Layer | None = None
+    doubtful: _Layer | None = None
+
+
+class ImageGate:
     """Looks at the images of one sequence in time order."""
 
-    remembers = ("_last", "_usable", "_doubtful")
-
-    def __init__(self, config: GapsConfig) -> None:
+    def __init__(self, config: GapsConfig, state: GateState | None = None) -> None:
         self._config = config
-        self._last: tuple[Image, Verdict] | None = None
-        self._usable: NDArray[np.float32] | None = None  # thumbs, zero mean and unit length
-        self._doubtful: NDArray[np.float32] | None = None
+        self._state = state or GateState()
 
-    def check(self, image: Image) -> Verdict:
-        """Whether an image ``(H, W, 3)`` shows something new, the same as the one before, or nothing usable."""
-        verdict: Verdict
-        if self._last is None or not np.array_equal(image, self._last[0]):
-            verdict = self._judge(image)
+    def state(self) -> GateState:
+        """What the gate goes on from."""
+        return self._state
+
+    def check(self, frame: Frame) -> Verdict:
+        """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
+        state = self._state
+        if state.last is not None and np.array_equal(frame.image, state.last.image):
+            verdict: Verdict = state.verdict if isinstance(state.verdict, MeasurementFailure) else "repeated"
         else:
-            verdict = self._last[1] if isinstance(self._last[1], MeasurementFailure) else "repeated"
-        self._last = image, verdict
+            verdict = self._judge(frame)
+        self._state = replace(self._state, last=frame, verdict=verdict)
         return verdict
 
-    def _judge(self, image: Image) -> Verdict:
-        contrast = float(np.mean(cv2.meanStdDev(image)[1]))
+    def _judge(self, frame: Frame) -> Verdict:
+        contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < self._config.blank_contrast:
-            # after darkness the picture before it is no measure of what comes
-            self._usable = self._doubtful = None
+            # after darkness the image before it is no measure of what comes
+            self._state = GateState()
             return MeasurementFailure("the image is blank")
-        grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _THUMB, interpolation=cv2.INTER_AREA)
-        thumb = grey.astype(np.float32) - np.float32(grey.mean())
-        length = float(np.linalg.norm(thumb))
-        if length / np.sqrt(thumb.size) < self._config.noise_contrast * contrast:
+        thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
+        length = float(np.linalg.norm(thumbnail))
+        if length / np.sqrt(thumbnail.size) < self._config.noise_contrast * contrast:
             return MeasurementFailure("the image is noise")
-        thumb /= np.float32(length)
-        # two pictures in a row that agree with each other are a new scene, not damage
-        known = [each for each in (self._usable, self._doubtful) if each is not None]
-        if known and max(float((thumb * each).sum()) for each in known) < self._config.min_correlation:
-            self._doubtful = thumb
+        thumbnail /= np.float32(length)
+        failure = self._unlike(thumbnail)
+        if failure is not None:
+            return failure
+        self._state = replace(self._state, usable=thumbnail, doubtful=None)
+        return "repeated" if self._is_copy(frame) else "new"
+
+    def _unlike(self, thumbnail: _Layer) -> MeasurementFailure | None:
+        usable, doubtful = self._state.usable, self._state.doubtful
+        if usable is not None:
+            flipped = float((thumbnail[::-1, ::-1] * usable).sum())
+            if flipped > max(_LEAST_FLIPPED_CORRELATION, float((thumbnail * usable).sum())):
+                self._state = replace(self._state, usable=np.ascontiguousarray(thumbnail[::-1, ::-1]))
+                return MeasurementFailure("the image is upside down")
+        # two images in a row that agree with each other are a new scene, not damage
+        known = [each for each in (usable, doubtful) if each is not None]
+        if known and max(float((thumbnail * each).sum()) for each in known) < self._config.min_correlation:
+            self._state = replace(self._state, doubtful=thumbnail)
             return MeasurementFailure("the image is unlike those before it")
-        self._usable, self._doubtful = thumb, None
-        return "new"
+        return None
+
+    def _is_copy(self, frame: Frame) -> bool:
+        """Whether the image is the last new one, encoded again, although the camera moved just before.
+
+        A camera that comes to a stop slows down first; a video that freezes does not.
+        """
+        height, width = (max(side // _SHRINKING, 1) for side in frame.grey.shape)
+        shrunk = cv2.resize(frame.grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        before, limit = self._state.shrunk, self._config.repeat_difference
+        if before is None or before.shape != shrunk.shape:
+            self._state = replace(self._state, shrunk=shrunk, moved=False)
+            return False
+        difference = _difference(before, shrunk)
+        if difference < limit and self._state.moved:
+            return True
+        self._state = replace(self._state, shrunk=shrunk, moved=difference > _MOVING * limit)
+        return False
+
+
+def _difference(before: _Layer, now: _Layer) -> float:
+    """Mean absolute difference over mean gradient: about the motion in pixels, brightness aside."""
+    difference = now - before
+    difference -= difference.mean()
+    slopes = [cv2.Sobel(before, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
+    gradient = float(np.hypot(*slopes).mean())
+    return float(np.abs(difference).mean()) / max(gradient, _LEAST_GRADIENT)

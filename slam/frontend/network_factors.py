@@ -1,16 +1,15 @@
 """The pose network's snippets as relative-pose factors, and as the raw trajectory they chain to.
 
-Noise that lies beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
-overlapping snippets measured of it, with the correlation of their errors. Roads may be unlike those that the noise was
-measured on: on the drive it is scaled to how far the network is from image geometry, apart for straights and turns, and
-what geometry does not know of itself the network does not know either (``docs/design/0019``). What is left has heavier
-tails than normal errors and lasts from snippet to snippet; the graph takes it for so much more (``docs/design/0020``).
+Noise measured beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
+overlapping snippets measured of it, with the correlation of their errors. On the drive this noise is scaled to the
+disagreement with image geometry, apart for straights and turns, and geometry's own noise is added
+(``docs/design/noise-and-the-pose-graph.md``). Errors have heavier tails than normal ones and are correlated from
+snippet to snippet: the graph takes inflated sigmas for that (``docs/design/noise-and-the-pose-graph.md``).
 
-Weights without it: the network errs by a share of what it measures. For a pair n frames apart the rotation
-sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length
-plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
-nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
-their sigmas times sqrt(m) and count as one.
+Weights without measured noise: the network errs by a ratio of what it measures. For a pair n frames apart the rotation
+sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length plus a
+floor (a share of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
+their errors are taken as fully correlated: m measurements of one pair get their sigmas times sqrt(m) and count as one.
 """
 
 from __future__ import annotations
@@ -27,7 +26,8 @@ from scipy.spatial.transform import Rotation
 from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
 from slam.config import FrontendConfig
 from slam.errors import SlamError
-from slam.frames import RelativePose, SnippetPoses
+from slam.frames import Ends, RelativePose, SnippetPoses
+from slam.frontend.step_table import path_between, shortest_by_start
 from slam.robust import mad_sigma, mad_sigmas
 from slam.se3 import FloatArray, invert, nearest_rotation
 
@@ -70,11 +70,11 @@ def calibrated_factors(
     if not pairs:
         return []
     law = np.stack([noise.sigmas(pair) for pair in pairs])
-    steps = {g.from_index: g for g in geometric if g.to_index == g.from_index + 1}
+    steps = {pose.ends: pose for pose in geometric}
     student_t_dof = config.student_t_dof if len(steps) >= config.noise_steps else math.inf
     from_geometry = _from_geometry(pairs, steps)
     scaling = _scaling(pairs, from_geometry / law, config.noise_steps)
-    sigmas = np.hypot(scaling * law, _unknown_to_geometry(pairs, steps))
+    sigmas = np.hypot(scaling * law, _noise_of_geometry(pairs, steps))
     correlated_sigmas = _persistence(pairs, from_geometry / sigmas, config.noise_steps) * sigmas
     return [
         RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, student_t_dof)
@@ -82,15 +82,16 @@ def calibrated_factors(
     ]
 
 
-def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[int, RelativePose]) -> FloatArray:
-    """What pairs differ from chained steps of image geometry by, ``(P, 6)``; NaN where it did not measure them all."""
-    differ = np.full((len(pairs), 6), np.nan)
-    between = [[steps[k].T_from_to for k in range(pair.first, pair.last) if k in steps] for pair in pairs]
-    rows = [k for k, pair in enumerate(pairs) if len(between[k]) == pair.last - pair.first]
+def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]) -> FloatArray:
+    """Differences of pairs from chained steps of image geometry, ``(P, 6)``; NaN where a step was not measured."""
+    differences = np.full((len(pairs), 6), np.nan)
+    by_start = shortest_by_start(steps)
+    paths = [path_between(by_start, pair.first, pair.last) for pair in pairs]
+    rows = [k for k, path in enumerate(paths) if path is not None]
     if rows:
-        T_geometric = np.stack([reduce(np.matmul, between[k]) for k in rows])
-        differ[rows] = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
-    return differ
+        T_geometric = np.stack([reduce(np.matmul, [steps[ends].T_from_to for ends in paths[k] or ()]) for k in rows])
+        differences[rows] = difference(np.stack([pairs[k].T_first_last for k in rows]), T_geometric)
+    return differences
 
 
 def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
@@ -146,28 +147,33 @@ def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) ->
     return np.asarray(factors * np.sqrt(len(distances)))
 
 
-def _unknown_to_geometry(pairs: Sequence[PairPose], steps: Mapping[int, RelativePose]) -> FloatArray:
-    """Sigmas ``(P, 6)`` of the steps that pairs span, as geometry states them; the usual ones where it has none."""
+def _noise_of_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]) -> FloatArray:
+    """Sigmas ``(P, 6)`` of the steps between the frames of pairs, as geometry states them; else its usual ones."""
     if not steps:
         return np.zeros((len(pairs), 6))
-    usual = np.median([step.sigmas for step in steps.values()], axis=0)
-    own = [[steps[k].sigmas if k in steps else usual for k in range(pair.first, pair.last)] for pair in pairs]
-    return np.stack([np.linalg.norm(sigmas, axis=0) for sigmas in own])
+    by_start = shortest_by_start(steps)
+    usual = np.median([steps[ends].sigmas for ends in by_start.values()], axis=0)
+    sigmas = []
+    for pair in pairs:
+        between = []
+        frame = pair.first
+        while frame < pair.last:
+            ends = by_start.get(frame)
+            known = ends is not None and ends[1] <= pair.last
+            between.append(steps[ends].sigmas if known and ends is not None else usual)
+            frame = ends[1] if known and ends is not None else frame + 1
+        sigmas.append(np.linalg.norm(between, axis=0))
+    return np.stack(sigmas)
 
 
 def without_measured(factors: Sequence[RelativePose], geometric: Sequence[RelativePose]) -> list[RelativePose]:
-    """The factors that span at least one step between neighbouring frames that geometry did not measure.
+    """The factors between whose frames image geometry did not measure every step.
 
-    The network errs alike on neighbouring snippets: beside a geometric factor of the same step, many of its
-    factors would count as many opinions where they are one, and a worse one.
+    The network's errors on neighbouring snippets are correlated: beside a geometric factor of the same step, many of
+    its factors would count as many measurements where they are one, and a worse one.
     """
-    measured = {g.from_index for g in geometric if g.to_index == g.from_index + 1}
-
-    def spans_a_gap(factor: RelativePose) -> bool:
-        first, last = _pair(factor.from_index, factor.to_index)
-        return not measured.issuperset(range(first, last))
-
-    return [factor for factor in factors if spans_a_gap(factor)]
+    by_start = shortest_by_start(pose.ends for pose in geometric)
+    return [factor for factor in factors if path_between(by_start, *sorted(factor.ends)) is None]
 
 
 def measured_noise(
@@ -218,17 +224,13 @@ def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     _check_cover(snippets, count)
     first, last = snippets[0], snippets[-1]
     T_first_camera = np.tile(np.eye(4), (count, 1, 1))  # in the camera of the first target until the end
-    for source, T_source_target in zip(first.sources, first.T_source_target, strict=True):
-        if source < first.target:
-            T_first_camera[source] = invert(T_source_target)
+    T_first_camera[: first.target] = [first.T_target_camera[k] for k in range(first.target)] or np.zeros((0, 4, 4))
     for snippet in snippets[:-1]:
-        T_next_target = snippet.T_source_target[snippet.sources.index(snippet.target + 1)]
-        T_next = T_first_camera[snippet.target] @ invert(T_next_target)
+        T_next = T_first_camera[snippet.target] @ snippet.T_target_camera[snippet.target + 1]
         T_next[:3, :3] = nearest_rotation(T_next[:3, :3])
         T_first_camera[snippet.target + 1] = T_next
-    for source, T_source_target in zip(last.sources, last.T_source_target, strict=True):
-        if source > last.target:
-            T_first_camera[source] = T_first_camera[last.target] @ invert(T_source_target)
+    for k in range(last.target + 1, count):
+        T_first_camera[k] = T_first_camera[last.target] @ last.T_target_camera[k]
     T_world_camera: FloatArray = invert(T_first_camera[0]) @ T_first_camera
     T_world_camera[0] = np.eye(4)
     return T_world_camera

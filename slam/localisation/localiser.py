@@ -9,6 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from erfsfm.errors import DataError
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.folder import image_folder
+from erfsfm.readers.images import list_images, read_image
 from slam.config import LoopsConfig, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
@@ -18,9 +22,7 @@ from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, invert, rotation_angle
-from slam.sequences.camera_file import CAMERA_FILE, CameraFile, read_camera_file, read_explicit
-from slam.sequences.folder import image_folder
-from slam.sequences.images import list_images, read_image
+from slam.sequences.camera_file import beside, read_explicit
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
@@ -47,7 +49,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
         camera: their ``camera.yaml``; None for the one beside them, or else the camera of the run.
 
     Raises:
-        SlamError: no images, no places in the run, or a camera file that does not fit.
+        SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
     """
     paths = _image_paths(images)
     places = Places.read(run.require(PLACES))
@@ -64,7 +66,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
             if undistortion is not None:
                 image = undistortion.apply(image)
             yield localiser.locate(path.name, image)
-        except SequenceError as error:
+        except (SequenceError, DataError) as error:
             yield Localisation(path.name, reason=str(error))
 
 
@@ -137,7 +139,7 @@ class Localiser:
         if isinstance(found, str):
             return found
         T_world_camera = T_world_place @ invert(found.T_image_points)
-        return _PoseHypothesis(place.index, T_world_camera, len(found.inliers), found.depth)
+        return _PoseHypothesis(place.index, T_world_camera, found.inliers, found.depth)
 
     def _agree(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
         T = invert(one.T_world_camera) @ other.T_world_camera
@@ -167,11 +169,8 @@ def _image_paths(images: Path) -> list[Path]:
 
 
 def _camera_file(explicit: Path | None, folder: Path) -> CameraFile | None:
-    if explicit is not None:
-        return read_explicit(explicit)
-    beside = folder / CAMERA_FILE
-    return read_camera_file(beside) if beside.is_file() else None
+    return beside(folder) if explicit is None else read_explicit(explicit)
 
 
 def _pinhole(camera: CameraFile) -> Intrinsics:
-    return Undistortion(camera).intrinsics if camera.is_distorted else camera.intrinsics
+    return Undistortion(camera).intrinsics if camera.is_distorted else Intrinsics.of(camera.pinhole)

@@ -1,4 +1,4 @@
-"""What closing loops remembers of a frame: oriented binary corners (ORB) and their points from learned depth."""
+"""Features of a frame for loop closure: ORB (Rublee et al. 2011) and 3-D points from learned depth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import LoopsConfig
-from slam.frames import DepthMap, Frame, Image, Intrinsics
+from slam.frames import DepthMap, Frame, Grey, Intrinsics
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 Descriptors = NDArray[np.uint8]
@@ -21,7 +21,7 @@ _EDGE_PX = 16
 
 @dataclass(frozen=True)
 class View:
-    """The features of one frame: about 60 bytes each.
+    """The features of one frame, about 60 bytes each.
 
     ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
     NaN where the learned depth is not trusted, in the unit of the depth.
@@ -41,7 +41,7 @@ class View:
 
 
 class FeatureExtractor:
-    """Takes the features of frames of one sequence, the strongest of each part of the image."""
+    """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
     def __init__(
         self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
@@ -67,17 +67,16 @@ class FeatureExtractor:
         """
         settings = (self._config.max_features, self._config.corner_contrast)
         pixels, descriptors = self._get_or_compute(
-            "features", (frame.image, repr(settings)), lambda: self._features(frame.image)
+            "features", (frame, repr(settings)), lambda: self._features(frame.grey)
         )
         points = self._points(pixels, depth_unscaled, height_unscaled)
         return View(frame.index, pixels, descriptors, points)
 
-    def _features(self, image: Image) -> Answer:
+    def _features(self, grey: Grey) -> Answer:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         found = self._orb.detect(grey, None)
-        chosen = [found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)]
-        chosen, descriptors = self._orb.compute(grey, chosen)
+        strongest = _strongest_per_cell(found, grey.shape, self._config.max_features)
+        chosen, descriptors = self._orb.compute(grey, [found[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
         return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors

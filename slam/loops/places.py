@@ -1,4 +1,4 @@
-"""Features of a run's frames, with 3-D points and poses, kept so that new images can be localised in its map."""
+"""The localisation map of a run (``places.npz``): features, their 3-D points and the poses they were seen from."""
 
 from __future__ import annotations
 

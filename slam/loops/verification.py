@@ -1,13 +1,12 @@
-"""A loop is measured or refused: matched corners against learned depth, in both directions.
+"""Verification of a loop candidate: perspective-n-point on learned depth, in both directions.
 
-Every gate is free of scale: pixels, shares, degrees, and lengths as a share of the depth of what was seen.
+All thresholds are independent of scale: pixels, ratios, degrees, and lengths over the depth of the points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -15,16 +14,14 @@ from scipy.spatial.transform import Rotation
 from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.descriptors import View, hamming
-from slam.robust import mad_sigma
+from slam.resection import Resection, consensus, refine
 from slam.se3 import FloatArray, invert, make, rotation_angle
 from slam.storage.cache import GetOrCompute, without_cache
-
-_LEAST_PIXEL_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A measured loop; ``inliers`` is the smaller of both directions."""
+    """A verified loop; ``inliers`` is the smaller of both directions."""
 
     measured: RelativePose
     inliers: int
@@ -36,13 +33,13 @@ class Loop:
         return self.measured.from_index, self.measured.to_index
 
     def refused(self, reason: str) -> RejectedLoop:
-        """The same loop, refused after all."""
+        """The same loop, rejected for a reason."""
         return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)
 
 
 @dataclass(frozen=True)
 class RejectedLoop:
-    """A loop that was looked at and refused, with as much as was measured of it."""
+    """A rejected candidate or loop, with what was measured of it."""
 
     from_index: int
     to_index: int
@@ -56,14 +53,19 @@ class LoopVerifier:
     """Measures ``T_earlier_later`` between two views of one camera, in the unit of their points."""
 
     def __init__(
-        self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+        self,
+        config: LoopsConfig,
+        intrinsics: Intrinsics,
+        get_or_compute: GetOrCompute = without_cache,
+        seed: int = 0,
     ) -> None:
         self._config = config
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
+        self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
-        """Measure the pose of the later view in the earlier one, or say why not."""
+        """Measure the pose of the later view in the earlier one, or reject it with a reason."""
         given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
         rows_earlier, rows_later = self._get_or_compute(
             "corners alike", given, lambda: matches(earlier, later, self._config)
@@ -80,8 +82,8 @@ class LoopVerifier:
         backward = self.resect(later.points[rows_later], earlier.pixels[rows_earlier])
         T_earlier_later = invert(forward.T_image_points)
         if isinstance(backward, str):
-            return refused(f"backwards {backward}", len(forward.inliers), T_earlier_later)
-        inliers = min(len(forward.inliers), len(backward.inliers))
+            return refused(f"backwards {backward}", forward.inliers, T_earlier_later)
+        inliers = min(forward.inliers, backward.inliers)
         difference = forward.T_image_points @ backward.T_image_points
         turned_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, backward.depth)
@@ -94,49 +96,35 @@ class LoopVerifier:
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         return Loop(measured, inliers, score)
 
-    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Resection | str:
+    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
         """The camera that sees ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or why there is none.
 
         Points with NaN are left out.
         """
         config = self._config
         known = np.isfinite(points).all(axis=1)
-        points, pixels = points[known].astype(np.float64), pixels[known].astype(np.float64)
-        if len(points) < config.min_inliers:
-            return f"only {len(points)} matches have a trusted depth"
-        cv2.setRNGSeed(0)
-        found, rotation, translation, chosen = cv2.solvePnPRansac(
-            points,
-            pixels,
-            self._intrinsics.K,
-            None,
-            iterationsCount=config.ransac_iterations,
-            reprojectionError=config.reprojection_px,
-            confidence=0.999,
-        )
-        count = 0 if not found or chosen is None else len(chosen)
-        if count < config.min_inliers or count < config.min_inlier_ratio * len(points):
-            return f"only {count} of {len(points)} matches agree"
-        chosen = chosen.ravel()
-        extent = pixels[chosen].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
+        points_known, pixels_known = points[known].astype(np.float64), pixels[known].astype(np.float64)
+        if len(points_known) < config.min_inliers:
+            return f"only {len(points_known)} matches have a trusted depth"
+        K = self._intrinsics.K
+        found = consensus(points_known, pixels_known, K, config.ransac_iterations, config.reprojection_px, self._seed)
+        count = 0 if found is None else len(found[2])
+        if found is None or count < config.min_inliers or count < config.min_inlier_ratio * len(points_known):
+            return f"only {count} of {len(points_known)} matches agree"
+        extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < config.min_spread_ratio or extent[1] < config.min_spread_ratio / 2:
             return f"{count} agreeing matches in a corner of the image"
-        rotation, translation = cv2.solvePnPRefineLM(
-            points[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
-        )
-        T_image_points = make(Rotation.from_rotvec(rotation.ravel()).as_matrix(), translation.ravel())
-        sigmas = _resection_sigmas(points[chosen], pixels[chosen], rotation, translation, self._intrinsics.K)
-        return Resection(T_image_points, chosen, float(np.median(points[chosen, 2])), sigmas)
+        return Sighting(refine(points_known, pixels_known, K, found), float(np.median(points_known[found[2], 2])))
 
     def _sigmas(
-        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Resection, backward: Resection
+        self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Sighting, backward: Sighting
     ) -> FloatArray:
-        """Sigmas ``(6,)`` in camera b: of corners in both directions, of learned depth, of what they disagree about.
+        """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
-        Both directions see the same corners, and neighbouring corners err together: the second gains nothing.
+        Both directions use the same corners, whose errors are correlated: averaging them does not narrow the sigmas.
         """
         config = self._config
-        corners = config.corner_sigma_widening * np.hypot(forward.sigmas, backward.sigmas)
+        corners = config.corner_sigma_widening * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
         turned = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
         disagreement = np.concatenate([turned, difference[:3, 3]]) / 2
         way = config.length_relative_sigma * float(np.linalg.norm(T_a_b[:3, 3]))
@@ -147,31 +135,25 @@ class LoopVerifier:
 
 
 @dataclass(frozen=True)
-class Resection:
-    """``T_image_points`` takes the points to the camera of the image; ``depth`` is their median z.
+class Sighting:
+    """Points seen again by the camera of an image, at a median z-depth in the camera that measured them."""
 
-    ``sigmas`` ``(6,)``: of rotation and translation in the image's camera, were its corners to err independently.
-    """
-
-    T_image_points: FloatArray
-    inliers: NDArray[np.intp]
+    resection: Resection
     depth: float
-    sigmas: FloatArray
 
+    @property
+    def T_image_points(self) -> FloatArray:
+        """Takes the points to the camera of the image ``(4, 4)``."""
+        return self.resection.T_camera_points
 
-def _resection_sigmas(
-    points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray, K: FloatArray
-) -> FloatArray:
-    """Sigmas ``(6,)`` of a resection from the Jacobian and the size of its reprojection residuals."""
-    projected, jacobian = cv2.projectPoints(points, rotation, translation, K, None)
-    residual = (projected.reshape(-1, 2) - pixels).ravel()
-    sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
-    J = jacobian[:, :6]
-    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6)))))
+    @property
+    def inliers(self) -> int:
+        """Number of points that agree."""
+        return len(self.resection.inliers)
 
 
 def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of both views that are each other's nearest by Hamming distance, clearly before the second nearest."""
+    """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     distance = hamming(first.descriptors, second.descriptors)
@@ -184,7 +166,7 @@ def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.
 
 
 def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:
-    """The mean of two measurements of one transform that lie close together."""
+    """The mean of two close measurements of one transform."""
     R_a_b = T_a_b[:3, :3]
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(R_a_b.T @ T_a_b_again[:3, :3]).as_rotvec())
     return make(R_a_b @ half.as_matrix(), 0.5 * (T_a_b[:3, 3] + T_a_b_again[:3, 3]))

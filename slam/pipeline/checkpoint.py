@@ -1,7 +1,7 @@
-"""What a run folder keeps so that the drive can go on (``run --continue``): all that was measured, and no images of it.
+"""A session on disk: all that was measured of a drive so far, without its images, so that it can go on.
 
-The frames that follow are looked at as if there had been no pause, and lengths, noise, loops and graph are then found
-anew for the whole drive (``docs/design/0016``).
+The frames that follow are looked at as if there had been no pause. Lengths, noise, loops and graph are then found anew
+for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 
 from __future__ import annotations
@@ -14,46 +14,36 @@ from typing import Self
 
 import numpy as np
 
-from slam.errors import RunError, SlamError
+from slam.errors import RunError
 from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.image_gate import GateState
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import TriangulatedPoints, UnitRelativePose
-from slam.frontend.visual.odometry import Motion
+from slam.frontend.visual.heading_prior import HeadingPrior
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.odometry import OdometryState
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.visual.tracking import Corners, SeenImage
+from slam.frontend.visual.tracking import Corners, TrackerState
 from slam.loops.descriptors import View
-from slam.pipeline.observer import Keyframe, Observations, Observer
+from slam.pipeline.observations import Keyframe, Observations
+from slam.pipeline.observer import ObserverState, RecentFrame
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
 from slam.storage.archive import reading_archive
-from slam.storage.serialisation import Memento, Serialiser
+from slam.storage.serialisation import Serialiser
 from slam.storage.spill import SpillFile
 
 DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
-_SERIALISER = Serialiser(
-    *(
-        Corners,
-        Frame,
-        UnitRelativePose,
-        Intrinsics,
-        Motion,
-        Observations,
-        MeasurementFailure,
-        RelativePose,
-        GroundPlane,
-        RoadStep,
-        SeenImage,
-    ),
-    *(SnippetPoses, RelativeRotation, TriangulatedPoints, View),
-)
 
 
 @dataclass(frozen=True)
 class SessionCheckpoint:
-    """A drive up to its last frame, looked at by the networks ``weights_sha256``; the rest as of a `FrameSequence`."""
+    """A drive up to its last frame, measured with the networks ``weights_sha256``; the rest as of a `Sequence`."""
 
     name: str
     sources: tuple[str, ...]
@@ -62,12 +52,12 @@ class SessionCheckpoint:
     camera_height_m: float | None
     stamps: FloatArray
     reference: FloatArray | None
-    seen: Observations
-    observer: Observer | Memento
+    state: ObserverState
 
     @classmethod
-    def of(cls, sequence: FrameSequence, observer: Observer, weights_sha256: str) -> Self:
-        """A drive whose last frame an observer has seen."""
+    def of(cls, sequence: FrameSequence, state: ObserverState, weights_sha256: str) -> Self:
+        """A drive whose last frame an observer has seen; of its images nothing is kept."""
+        without_images = replace(state, seen=replace(state.seen, keyframes=[], examples=[]))
         return cls(
             sequence.name,
             sequence.provenance(),
@@ -76,13 +66,12 @@ class SessionCheckpoint:
             sequence.camera_height_m,
             sequence.stamps,
             sequence.reference,
-            replace(observer.seen, keyframes=[], examples=[]),
-            observer,
+            without_images,
         )
 
     def write(self, path: Path) -> None:
         """Write all of it; what is in the file stands in ``docs/outputs.md``."""
-        _SERIALISER.write(path, **vars(self))
+        _SERIALISER.write(path, self)
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -92,10 +81,9 @@ class SessionCheckpoint:
             RunError: missing, damaged or of another version.
         """
         content = _SERIALISER.read(path)
-        try:
-            return cls(**content)
-        except TypeError as error:
-            raise RunError(f"{path} is damaged: run the sequence again") from error
+        if not isinstance(content, cls):
+            raise RunError(f"{path} is damaged: run the sequence again")
+        return content
 
     @classmethod
     def open(cls, folder: Path) -> Self:
@@ -105,10 +93,10 @@ class SessionCheckpoint:
                 f"{folder} cannot be continued: it has no {DRIVE}; give a folder that 'erfsfm-slam run' wrote and "
                 "finished, and not with output.keep=nothing"
             )
-        drive = cls.read(folder / DRIVE)
+        checkpoint = cls.read(folder / DRIVE)
         if (folder / KEYFRAMES).is_file():
-            drive.seen.keyframes.extend(_read_keyframes(folder / KEYFRAMES))
-        return drive
+            checkpoint.state.seen.keyframes.extend(_read_keyframes(folder / KEYFRAMES))
+        return checkpoint
 
     def continued(self, following: FrameSequence) -> Continued:
         """All frames of the drive with those that follow.
@@ -119,16 +107,12 @@ class SessionCheckpoint:
         known = (self.name, self.intrinsics, self.stamps, self.camera_height_m, self.reference, self.sources)
         return Continued(*known, following)
 
-    def resume(self, observer: Observer) -> None:
-        """Let an observer go on after the last frame.
 
-        Raises:
-            RunError: what is kept does not fit this version.
-        """
-        if not isinstance(self.observer, Memento):
-            raise SlamError(f"the drive on {self.name} is still being looked at")
-        observer.seen = self.seen
-        self.observer.teach(observer)
+_SERIALISER = Serialiser(
+    *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
+    *(Corners, DynamicMask, HeadingPrior, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
+    *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
+)
 
 
 def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -12,11 +13,11 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.scale.road_plane import rescaled, resolve_mode
+from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import Measurements, SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.observer import Observer
+from slam.pipeline.observer import Observer, ObserverState
 from slam.pose_graph import IncrementalPoseGraph
 from slam.prediction.networks import NetworkPredictor
 from slam.runtime.timing import Stopwatch
@@ -42,6 +43,7 @@ class Slam:
         sweep_frames: int = 100,
         noise: PoseNoise | None = None,
         weights_sha256: str = "",
+        seed: int = 0,
     ) -> None:
         """Prepare for the first frame.
 
@@ -53,7 +55,8 @@ class Slam:
             update_frames: the graph is solved after so many frames, and when it is asked.
             sweep_frames: loops are looked for after so many frames; 0 leaves it to ``close_loops``.
             noise: of the snippet poses; None measures it against image geometry alone.
-            weights_sha256: of the networks, so that what others saw is not resumed.
+            weights_sha256: of the networks, so that a session of others is not resumed.
+            seed: of all RANSAC draws.
 
         Raises:
             SlamError: a scale mode that wants more than images.
@@ -67,9 +70,10 @@ class Slam:
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = config.model_copy(update={"mapping": without_map})
         self._weights_sha256 = weights_sha256
-        self._drive = LiveSequence(intrinsics, camera_height_m)
-        self._pipeline = SlamPipeline(self._drive, predictor, config, noise=noise)
-        self._observer = Observer(predictor, intrinsics, config, Stopwatch())
+        self._sequence = LiveSequence(intrinsics, camera_height_m)
+        self._config, self._predictor, self._seed = config, predictor, seed
+        self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
+        self._observer = self._observe(None)
         self._graph = IncrementalPoseGraph(config.pose_graph)
         self._shortest = predictor.sources + 1
         self._update_frames, self._sweep_frames = update_frames, sweep_frames
@@ -99,7 +103,17 @@ class Slam:
 
     def __len__(self) -> int:
         """Number of frames so far."""
-        return len(self._drive)
+        return len(self._sequence)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the threads; what was measured can still be asked for."""
+        self._observer.close()
 
     def add_frame(self, image: Image, stamp: float) -> None:
         """Take the next frame.
@@ -111,31 +125,34 @@ class Slam:
         Raises:
             ValueError: another size, type or order.
         """
-        size = (self._drive.intrinsics.height, self._drive.intrinsics.width, 3)
+        size = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3)
         if image.shape != size or image.dtype != np.uint8:
             raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
-        if len(self) and not stamp > self._drive.stamps[-1]:
-            raise ValueError(f"stamps must increase; got {stamp} after {self._drive.stamps[-1]}")
+        if not np.isfinite(stamp) or (len(self) and not stamp > self._sequence.stamps[-1]):
+            raise ValueError(f"stamps must increase; got {stamp} after {self._sequence.stamps[-1:].tolist()}")
         image = image.copy()  # it is looked at again when the next one comes
         image.setflags(write=False)
         index = len(self)
-        self._drive.stamps = np.append(self._drive.stamps, stamp)
-        self._observer.add(index, Frame(index, float(stamp), image))
+        try:
+            self._observer.add(index, Frame(index, float(stamp), image))
+        finally:  # an error may be about the frame before
+            if self._observer.frames > index:
+                self._sequence.stamps = np.append(self._sequence.stamps, stamp)
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
             self.close_loops()
         elif len(self) % self._update_frames == 0:
             self._update()
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Keep all that was measured in a file, for `resume`; frames may go on coming.
 
         Raises:
             SlamError: the file cannot be written.
         """
-        self._observer.flush()
-        write_atomically(path, SessionCheckpoint.of(self._drive, self._observer, self._weights_sha256).write)
+        checkpoint = SessionCheckpoint.of(self._sequence, self._observer.state(), self._weights_sha256)
+        write_atomically(Path(path), checkpoint.write)
 
-    def resume(self, path: Path) -> None:
+    def resume(self, path: str | Path) -> None:
         """Go on after the last frame of what `save` kept, as if there had been no pause; loops are looked for anew.
 
         Raises:
@@ -143,12 +160,13 @@ class Slam:
         """
         if len(self):
             raise SlamError(f"{path} is resumed before the first frame; {len(self)} came already")
-        drive = SessionCheckpoint.read(path)
-        mine = (self._drive.intrinsics, self._drive.camera_height_m, self._weights_sha256)
-        if (drive.intrinsics, drive.camera_height_m, drive.weights_sha256) != mine:
+        checkpoint = SessionCheckpoint.read(Path(path))
+        mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
+        if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        drive.resume(self._observer)
-        self._drive.stamps = drive.stamps
+        self._observer.close()
+        self._observer = self._observe(checkpoint.state)
+        self._sequence.stamps = checkpoint.stamps
 
     def trajectory(self) -> Trajectory:
         """All frames so far; where no snippet has been seen yet, the camera is taken to stand.
@@ -160,7 +178,7 @@ class Slam:
             raise SlamError("no trajectory before the first frame")
         if len(self._T_world_camera) < len(self):
             self._update()
-        return Trajectory(self._drive.stamps, self._T_world_camera.copy())
+        return Trajectory(self._sequence.stamps, self._T_world_camera.copy())
 
     def close_loops(self) -> LoopClosures:
         """Look for places seen before among all frames so far; the graph takes those that agree."""
@@ -171,6 +189,11 @@ class Slam:
             self._solve(measured)
         return self._loops
 
+    def _observe(self, state: ObserverState | None) -> Observer:
+        return Observer(
+            self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
+        )
+
     def _update(self) -> None:
         measured = self._measure()
         if measured is None:
@@ -180,14 +203,14 @@ class Slam:
 
     def _measure(self) -> Measurements | None:
         self._observer.flush()
-        if not self._observer.seen.snippets:
+        if not self._observer.has_snippets:
             return None
         return self._pipeline.measure(self._mode, self._observer.closed())
 
     def _solve(self, measured: Measurements) -> None:
         now = measured.scale.per_frame
         loops = [loop.measured for loop in self._loops.accepted]
-        current = [rescaled(edge, float(now[edge.from_index] / self._per_frame[edge.from_index])) for edge in loops]
+        current = [edge.scaled(float(now[edge.from_index] / self._per_frame[edge.from_index])) for edge in loops]
         self._T_world_camera = self._graph.update([*measured.factors, *current], measured.T_odometry)
 
 

@@ -1,53 +1,70 @@
-"""The trained networks behind the ``Predictor`` protocol: frames in, snippet poses and depth out."""
+"""The trained networks behind the ``Predictor`` protocol: frames in, snippet poses and depth out.
+
+Answers of the networks may come from a cache. They are named there by the networks' identity and the digest of each
+image; disparity is kept as the network gave it, at its own size and precision.
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from typing import Protocol
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.inference import depth_at
+from erfsfm.inference import depth_at, limit_torch_threads
 from erfsfm.photometric_residual import PhotometricResidual
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
 from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 
 class Networks(Protocol):
-    """What is asked of networks by image: ``erfsfm.inference.DepthPosePredictor``, or a cache before it."""
+    """What is asked of the networks (``erfsfm.inference.DepthPosePredictor``): each image is prepared once."""
 
     sources: int
 
-    def disparity(self, image: Image) -> NDArray[np.float32]:
-        """Unscaled 1/depth ``(h, w)`` of an image, at the networks' own size."""
+    def prepare(self, image: Image) -> Any:
+        """An image as the networks take it."""
         ...
 
-    def poses(self, images: Sequence[Image]) -> NDArray[np.float64]:
-        """``T_source_target`` ``(N, 4, 4)`` of N + 1 images in time order, the target in the middle."""
+    def disparity(self, image: Any) -> NDArray[np.float32]:
+        """Unscaled 1/depth ``(h, w)`` of a prepared image, at the networks' own size."""
+        ...
+
+    def poses(self, images: Sequence[Any]) -> NDArray[np.float64]:
+        """``T_source_target`` ``(N, 4, 4)`` of N + 1 prepared images in time order, the target in the middle."""
         ...
 
 
 class NetworkPredictor:
-    """Answers by frame what networks answer by image."""
+    """Depth and snippet poses of the frames of one sequence, by the networks."""
 
     def __init__(
-        self, networks: Networks, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+        self,
+        networks: Networks,
+        intrinsics: Intrinsics,
+        get_or_compute: GetOrCompute = without_cache,
+        answers: GetOrCompute = without_cache,
     ) -> None:
         """Ask networks about the frames of one sequence.
 
         Args:
             networks: whom to ask.
             intrinsics: of all images.
-            recall: remembers what is measured of images and answers together.
+            get_or_compute: a cache of what is measured on images and answers together.
+            answers: a cache of the networks' answers, of these very networks alone.
         """
         self._networks = networks
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
+        self._answers = answers
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
-        self._known: deque[tuple[int, NDArray[np.float32]]] = deque(maxlen=networks.sources + 1)
         self.sources = networks.sources
+
+    def executor(self) -> Executor:
+        """One thread, in which torch leaves a core to whatever goes on beside the networks."""
+        return ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=limit_torch_threads)
 
     def depth(self, frame: Frame) -> DepthMap:
         """Unscaled z-depth ``(H, W)`` at the image's size."""
@@ -56,23 +73,33 @@ class NetworkPredictor:
 
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
-        images = [frame.image for frame in frames]
-        T_source_target = self._networks.poses(images)
+
+        def ask() -> Answer:
+            return (self._networks.poses([self._prepared(frame) for frame in frames]),)
+
+        (T_source_target,) = self._answers("poses", frames, ask)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
-        disparity = self._disparity(frames[middle])
-        given: list[Given] = [*images, disparity, T_source_target, repr(self._intrinsics)]
-
-        def judge() -> Answer:
-            return (self._residual.shares(images, disparity, T_source_target),)
-
-        (residuals,) = self._get_or_compute("photometric residual", given, judge)
+        residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
         return SnippetPoses(frames[middle].index, sources, T_source_target, residuals)
 
+    def _residuals(
+        self, frames: Sequence[Frame], disparity: NDArray[np.float32], T_source_target: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Photometric residual ``(N,)`` of each source, as a share of the images' difference."""
+
+        def measure() -> Answer:
+            return (self._residual.shares([frame.image for frame in frames], disparity, T_source_target),)
+
+        given: list[Given] = [*frames, disparity, T_source_target, repr(self._intrinsics)]
+        (residuals,) = self._get_or_compute("photometric residual", given, measure)
+        return residuals
+
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
-        for index, disparity in self._known:
-            if index == frame.index:
-                return disparity
-        disparity = self._networks.disparity(frame.image)
-        self._known.append((frame.index, disparity))
-        return disparity
+        def ask() -> Answer:
+            return (self._networks.disparity(self._prepared(frame)),)
+
+        return frame.derived((self, "disparity"), lambda: self._answers("disparity", [frame], ask)[0])
+
+    def _prepared(self, frame: Frame) -> Any:
+        return frame.derived((self, "prepared"), lambda: self._networks.prepare(frame.image))

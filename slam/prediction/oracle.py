@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -60,6 +61,10 @@ class OraclePredictor:
         self._noise = noise
         walk = np.random.default_rng([noise.seed, _Stream.SCALE]).normal(size=len(T_world_camera))
         self._unit = unscaled_factor * np.exp(noise.scale_drift_sigma * np.cumsum(walk))  # (N,)
+
+    def executor(self) -> Executor:
+        """One thread."""
+        return ThreadPoolExecutor(max_workers=1, thread_name_prefix="oracle")
 
     def depth(self, frame: Frame) -> DepthMap:
         """True depth in the unscaled unit of its frame, with a smooth relative error."""

@@ -13,7 +13,7 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
-from slam.evaluation.coverage import coverage, coverage_by_source
+from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
@@ -57,7 +57,7 @@ def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provena
             "reason": "the run has not ended, or was killed while it made the map",
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
-            | describe_gaps(result.observations.bridged)
+            | describe_gaps(result.observations.interpolated)
             | {"continued_at": _frames_before(sequence)},
             "timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)),
             "scale": _scale(result),
@@ -128,5 +128,5 @@ def _graph(result: SlamResult) -> dict[str, Any]:
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
-    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}
+    covered = coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
+    return summary | {"coverage": covered.overall, "coverage_by_source": covered.by_source}

@@ -10,7 +10,7 @@ import numpy as np
 from slam.errors import SlamError
 from slam.frames import Intrinsics
 from slam.pipeline.batch import SlamResult
-from slam.pipeline.observer import Keyframe
+from slam.pipeline.observations import Keyframe
 from slam.runtime.imports import import_rerun
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically

@@ -10,11 +10,9 @@ import hashlib
 import json
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Lock
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +22,23 @@ from slam.storage.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
-Given = str | NDArray[Any]
+
+class Digestible(Protocol):
+    """Something large that names itself by a digest of its content."""
+
+    @property
+    def digest(self) -> bytes:
+        """SHA-256."""
+        ...
+
+
+Given = str | Digestible | NDArray[Any]
 Answer = tuple[NDArray[Any], ...]
 GetOrCompute = Callable[[str, Sequence[Given], Callable[[], Answer]], Answer]
 
 _FORMAT = b"erfsfm-slam cache 2"
 _CHECK_BYTES = 16
 _LENGTH_BYTES = 4
-_REMEMBERED_DIGESTS = 8
 
 
 def without_cache(kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
@@ -50,8 +57,6 @@ class DiskCache:
         """
         self._folder = folder
         self._is_writable = True
-        self._digests: deque[tuple[NDArray[Any], bytes]] = deque(maxlen=_REMEMBERED_DIGESTS)
-        self._hashing = Lock()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -85,19 +90,6 @@ class DiskCache:
             logger.warning("the cache keeps nothing more: %s", error)
             self._is_writable = False
 
-    def digest(self, given: Given) -> bytes:
-        """Of a text, or of shape and bytes of an array; an image is given several times and hashed once."""
-        if isinstance(given, str):
-            return hashlib.sha256(given.encode()).digest()
-        with self._hashing:
-            for known, digest in self._digests:
-                if known is given:
-                    return digest
-            digest = hashlib.sha256(repr(given.shape).encode() + given.tobytes()).digest()
-            if given.ndim == 3:
-                self._digests.append((given, digest))
-            return digest
-
     def _path(self, key: str) -> Path:
         return self._folder / key[:2] / key
 
@@ -127,7 +119,7 @@ class CacheNamespace:
         """
         named = hashlib.sha256(b"\0".join((_FORMAT, self._identity, kind.encode())))
         for each in given:
-            named.update(self._cache.digest(each))
+            named.update(_digest(each))
         key = named.hexdigest()
         known = self._cache.read(key)
         if known is not None:
@@ -137,6 +129,14 @@ class CacheNamespace:
         answer = compute()
         self._cache.write(key, answer)
         return answer
+
+
+def _digest(given: Given) -> bytes:
+    """Of a text, of shape and bytes of an array, or what something says of itself."""
+    if not isinstance(given, str | np.ndarray):
+        return given.digest
+    content = given.encode() if isinstance(given, str) else repr(given.shape).encode() + given.tobytes()
+    return hashlib.sha256(content).digest()
 
 
 def _packed(answer: Answer) -> bytes:

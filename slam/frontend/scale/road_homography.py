@@ -8,7 +8,6 @@ plays no part, so this length neither shares the networks' bias nor drifts.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -16,18 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import RoadConfig
-from slam.frames import Frame, Image, Intrinsics
+from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, without_cache
-from slam.storage.serialisation import Learner
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # where the search begins; refinement reaches the next
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
-_REMEMBERED = 100
+_STEPS_KEPT = 100
 
 _Layer = NDArray[np.float32]
 
@@ -41,18 +39,21 @@ class RoadStep:
     normal: FloatArray
 
 
-class RoadHomography(Learner):
-    """Aligns the road between neighbouring frames of one sequence and learns how the camera sits above it.
+class RoadHomography:
+    """Aligns the road between two frames of one sequence by its homography, and learns the road's normal.
 
-    A car ahead hides most of a long strip of road and stands still in the image. Where the long strip is refused, a
-    short and wide one is asked, which ends before such a car; it is less sure.
+    A car ahead hides most of a long strip of road and stands still in the image. Where the long strip fails, a short
+    and wide one is used, which ends before such a car; it is less accurate.
     """
 
-    remembers = ("_directions",)
-
     def __init__(
-        self, config: RoadConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+        self,
+        config: RoadConfig,
+        intrinsics: Intrinsics,
+        get_or_compute: GetOrCompute = without_cache,
+        directions: tuple[FloatArray, ...] = (),
     ) -> None:
+        """Prepare for the first step, or go on from the ``directions`` of motion so far (`state`)."""
         self._config = config
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
@@ -60,20 +61,23 @@ class RoadHomography(Learner):
         near = _Shape(config.near_heights, config.near_half_width_heights, config.near_relative_sigma)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
         self._strips = [_strip(intrinsics, self._top_row, shape, config.points) for shape in (long, near)]
-        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
-        self._seen: deque[tuple[Image, list[_Layer]]] = deque(maxlen=2)
+        self._directions = directions
+
+    def state(self) -> tuple[FloatArray, ...]:
+        """Directions of motion ``(3,)`` of the last steps."""
+        return self._directions
 
     def measure(self, previous: Frame, current: Frame, T_previous_current: FloatArray) -> RoadStep | MeasurementFailure:
         """Measure the length of a step whose rotation and direction are known.
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
-            current: the next frame.
+            current: the later frame.
             T_previous_current: its pose in the earlier camera, of any length but zero.
         """
         T_unit = T_previous_current.copy()
         T_unit[:3, 3] /= np.linalg.norm(T_unit[:3, 3])
-        self._directions.append(T_unit[:3, 3])
+        self._directions = (*self._directions, T_unit[:3, 3])[-_STEPS_KEPT:]
         expected = self._expected()
         long, near = self._strips
         measured = self._measured_on(long, previous, current, T_unit, expected)
@@ -116,8 +120,8 @@ class RoadHomography(Learner):
             return plane, np.array([correlation, standing])
 
         settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
-        given = (previous.image, current.image, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
-        plane, alike = self._get_or_compute("road aligned", given, align)
+        given = (previous, current, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
+        plane, alike = self._get_or_compute("road homography", given, align)
         return plane, float(alike[0]), float(alike[1])
 
     def _expected(self) -> FloatArray:
@@ -131,16 +135,14 @@ class RoadHomography(Learner):
         return np.asarray(normal / np.linalg.norm(normal))
 
     def _layers(self, frame: Frame) -> list[_Layer]:
-        """Coarse and fine image ``(H', W, 3)`` below the horizon, freed of slow shading, each with its slopes."""
-        for image, layers in self._seen:
-            if image is frame.image:
-                return layers
-        grey = cv2.cvtColor(frame.image[self._top_row :], cv2.COLOR_RGB2GRAY).astype(np.float32)
+        """Coarse and fine image ``(H', W, 3)`` below the horizon, freed of slow shading, each with its gradients."""
+        return frame.derived(("road layers", self._top_row, self._intrinsics.fx), lambda: self._filtered(frame))
+
+    def _filtered(self, frame: Frame) -> list[_Layer]:
+        grey = frame.grey[self._top_row :].astype(np.float32)
         fine = grey - cv2.GaussianBlur(grey, (0, 0), max(0.01 * self._intrinsics.fx, 1.5))
         coarse = cv2.GaussianBlur(fine, (0, 0), max(0.004 * self._intrinsics.fx, 1.0))
-        layers = [_with_slopes(layer) for layer in (coarse, fine)]
-        self._seen.append((frame.image, layers))
-        return layers
+        return [_with_gradients(layer) for layer in (coarse, fine)]
 
     def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
         """Grey and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
@@ -237,6 +239,6 @@ def _correlation(a: FloatArray, b: FloatArray) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
 
 
-def _with_slopes(layer: _Layer) -> _Layer:
+def _with_gradients(layer: _Layer) -> _Layer:
     slopes = [cv2.Sobel(layer, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)]
     return np.asarray(cv2.merge([layer, *slopes]))

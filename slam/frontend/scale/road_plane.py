@@ -1,163 +1,69 @@
-"""The unit of learned depth: from the road below the camera, or from a reference.
+"""The ground plane in front of the camera, fitted to learned depth.
 
-The road plane is fitted to the learned depth of every frame. With the plane
-``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
+With the plane ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
 ray, and the ray is free of noise, so the fit is not biased by the depth's errors as a fit of points is.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import ScaleConfig, ScaleMode
-from slam.frames import DepthMap, Intrinsics, RelativePose
+from slam.config import ScaleConfig
+from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
-from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 
 _POINTS = 1500
+_LEAST_POINTS = 50
 _HYPOTHESES = 150
 _REWEIGHTINGS = 8
 
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """The road under one camera: distance, unit normal ``(3,)`` down to it, share of inliers in [0, 1]."""
+    """The road under one camera: its distance, unit normal ``(3,)`` down to it, and inlier ratio in [0, 1]."""
 
     height_unscaled: float
     normal: FloatArray
     inlier_ratio: float
 
 
-@dataclass(frozen=True)
-class ScaleEstimate:
-    """``value`` times an unscaled length is a length in the mode's unit.
+class GroundPlaneFitter:
+    """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
 
-    ``spread`` is the relative sigma of the single frames' values.
-    """
+    def __init__(self, config: ScaleConfig, intrinsics: Intrinsics, seed: int = 0) -> None:
+        """Choose the pixels of the trapezoid; other seeds draw other RANSAC samples."""
+        self._config = config
+        self._seed = seed
+        self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)
 
-    value: float
-    spread: float
-    frames_used: int
-
-
-def resolve_mode(config: ScaleConfig, camera_height_m: float | None) -> ScaleMode:
-    """The mode that ``auto`` stands for: camera-height where the height is known, else none."""
-    if config.mode != "auto":
-        return config.mode
-    return "none" if camera_height_m is None else "camera-height"
-
-
-def fit_ground_plane(
-    depth_unscaled: DepthMap, intrinsics: Intrinsics, config: ScaleConfig
-) -> GroundPlane | MeasurementFailure:
-    """Fit the road in a trapezoid before the car, by RANSAC and reweighted least squares on inverse depth.
-
-    Args:
-        depth_unscaled: learned z-depth ``(H, W)`` at the size of ``intrinsics``.
-        intrinsics: the camera, pixels.
-        config: trapezoid, tolerances and the largest tilt.
-    """
-    rows, columns, all_rays = _trapezoid(intrinsics, config)
-    inverse_depth = 1.0 / np.maximum(depth_unscaled[rows, columns].astype(np.float64), 1e-9)
-    usable = np.isfinite(inverse_depth) & (inverse_depth < 1e8)
-    if usable.sum() < 50:
-        return MeasurementFailure("the depth before the car is not usable")
-    rays = all_rays[usable]  # (P, 3)
-    inverse_depth = inverse_depth[usable]
-    scaled_normal = _ransac(rays, inverse_depth, config)
-    if scaled_normal is None:
-        return MeasurementFailure(f"no plane within {config.max_tilt_deg:g} deg of level before the car")
-    scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, config.inlier_relative_depth)
-    height = 1.0 / float(np.linalg.norm(scaled_normal))
-    normal = scaled_normal * height
-    inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None], config)[0].mean())
-    if normal[1] < np.cos(np.deg2rad(config.max_tilt_deg)):
-        return MeasurementFailure(f"the plane before the car is tilted by more than {config.max_tilt_deg:g} deg")
-    if inlier_ratio < config.min_inlier_ratio:
-        return MeasurementFailure(f"only {inlier_ratio:.0%} of the pixels before the car lie on one plane")
-    return GroundPlane(height, normal, inlier_ratio)
+    def fit(self, depth_unscaled: DepthMap) -> GroundPlane | MeasurementFailure:
+        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics."""
+        config = self._config
+        inverse_depth = 1.0 / np.maximum(depth_unscaled[self._rows, self._columns].astype(np.float64), 1e-9)
+        usable = np.isfinite(inverse_depth) & (inverse_depth < 1e8)
+        if usable.sum() < _LEAST_POINTS:
+            return MeasurementFailure("the depth in front of the car is not usable")
+        rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
+        scaled_normal = _ransac(rays, inverse_depth, config, self._seed)
+        if scaled_normal is None:
+            return MeasurementFailure(f"no plane within {config.max_tilt_deg:g} deg of level in front of the car")
+        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, config.inlier_relative_depth)
+        height = 1.0 / float(np.linalg.norm(scaled_normal))
+        normal = scaled_normal * height
+        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None], config)[0].mean())
+        if normal[1] < np.cos(np.deg2rad(config.max_tilt_deg)):
+            return MeasurementFailure(
+                f"the plane in front of the car is tilted by more than {config.max_tilt_deg:g} deg"
+            )
+        if inlier_ratio < config.min_inlier_ratio:
+            return MeasurementFailure(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
+        return GroundPlane(height, normal, inlier_ratio)
 
 
-def scale_from_road(
-    roads: Sequence[GroundPlane | MeasurementFailure], camera_height_m: float | None, config: ScaleConfig
-) -> ScaleEstimate | MeasurementFailure:
-    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
-    height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = [height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
-    return estimate_scale(np.array(ratios), config)
-
-
-def scale_from_reference(
-    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray, config: ScaleConfig
-) -> ScaleEstimate | MeasurementFailure:
-    """True path length over estimated path length of the first ``reference_frames`` frames."""
-    estimated, true = (
-        np.linalg.norm(np.diff(T[: config.reference_frames, :3, 3], axis=0), axis=1)
-        for T in (T_world_camera_unscaled, T_world_camera_true)
-    )
-    if estimated.sum() <= 0 or true.sum() <= 0:
-        return MeasurementFailure(f"the camera does not move within the first {config.reference_frames} frames")
-    value = float(true.sum() / estimated.sum())
-    moving = estimated > 0.1 * estimated.mean()
-    spread = float(np.std(true[moving] / estimated[moving] / value))
-    return ScaleEstimate(value, spread, len(estimated) + 1)
-
-
-def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
-    """One scale from a ratio per frame ``(K,)``: their median, frames many MADs away left out."""
-    ratios = np.asarray(ratios, dtype=np.float64)
-    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(ratios) < config.min_frames:
-        return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {config.min_frames} are needed")
-    logarithms = np.log(ratios)
-    deviations = np.abs(logarithms - np.median(logarithms))
-    kept = logarithms[deviations <= config.rejection_mads * mad_sigma(deviations) + 1e-12]
-    spread = mad_sigma(kept - np.median(kept))
-    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
-
-
-def scale_track(
-    roads: Sequence[GroundPlane | MeasurementFailure],
-    camera_height_m: float | None,
-    estimate: ScaleEstimate,
-    config: ScaleConfig,
-) -> FloatArray:
-    """The scale near each frame ``(N,)``: a running median of the road's ratios.
-
-    Learned depth breathes: its unit wanders along a drive. Where ``smoothing_frames`` around a frame hold
-    too few usable roads, the estimate of the whole drive stands in.
-    """
-    height = 1.0 if camera_height_m is None else camera_height_m
-    ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
-    bound = config.rejection_mads * max(estimate.spread, 0.02)
-    ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
-    half = config.smoothing_frames // 2
-    track = np.full(len(ratios), estimate.value)
-    for k in range(len(ratios)):
-        near = ratios[max(k - half, 0) : k + half + 1]
-        if np.isfinite(near).sum() >= config.min_frames:
-            track[k] = np.nanmedian(near)
-    return track
-
-
-def rescaled(relative_pose: RelativePose, scale: float) -> RelativePose:
-    """A measurement in other units: translation and its sigmas times ``scale``."""
-    T_from_to = relative_pose.T_from_to.copy()
-    T_from_to[:3, 3] *= scale
-    units = np.repeat([1.0, scale], 3)
-    correlated_sigmas = None if relative_pose.correlated_sigmas is None else relative_pose.correlated_sigmas * units
-    return replace(
-        relative_pose, T_from_to=T_from_to, sigmas=relative_pose.sigmas * units, correlated_sigmas=correlated_sigmas
-    )
-
-
-@functools.lru_cache(maxsize=4)
 def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """Rows, columns ``(P,)`` and rays ``(P, 3)`` of about ``_POINTS`` pixels.
 
@@ -183,9 +89,9 @@ def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.
     return v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
 
-def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig) -> FloatArray | None:
+def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig, seed: int) -> FloatArray | None:
     """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
     minimal = rays[samples]  # (S, 3, 3)
     solvable = np.abs(np.linalg.det(minimal)) > 1e-6

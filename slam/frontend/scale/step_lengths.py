@@ -6,12 +6,12 @@ a unit that wanders. In logarithms all of them are linear in the lengths ``x`` a
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
 
-so that one robust sparse least squares holds the whole drive (``docs/design/0006-lengths-before-the-graph.md``).
+so that one robust sparse least squares holds the whole drive (``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +19,9 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
 
 from slam.config import LengthConfig
+from slam.frames import Ends
 from slam.frontend.visual.epipolar import TriangulatedPoints
-from slam.frontend.visual.odometry import Motion
+from slam.frontend.visual.motion import Motion
 from slam.robust import mad_sigma, weighted_median
 from slam.se3 import FloatArray
 
@@ -72,30 +73,33 @@ class StepLengths:
 
 
 def gather_evidence(
-    motions: Mapping[int, Motion], absolute: Mapping[int, tuple[float, float]], believed_unit: FloatArray
+    links: Sequence[Ends],
+    motions: Mapping[Ends, Motion],
+    absolute: Mapping[Ends, tuple[float, float]],
+    prior_unit: FloatArray,
 ) -> StepEvidence:
-    """All evidence on the lengths of the steps ``k -> k + 1`` of a drive.
+    """All that was measured of the lengths of a drive's steps, one row a link.
 
     Args:
-        motions: what corners measured of step k.
-        absolute: length of step k in the unit wanted, and its relative sigma.
-        believed_unit: that unit per unscaled length near each frame ``(N,)``.
+        links: steps that follow each other.
+        motions: the triangulated ones.
+        absolute: length in the unit wanted, and its relative sigma.
+        prior_unit: that unit per unscaled length near each frame ``(N,)``.
     """
-    evidence = StepEvidence.empty(len(believed_unit) - 1)
-    triangulated: dict[int, TriangulatedPoints] = {}
-    for step, motion in motions.items():
-        if motion.triangulated is None:
-            continue
-        triangulated[step] = motion.triangulated
-        unscaled = float(np.linalg.norm(motion.relative_pose.T_from_to[:3, 3]))
-        evidence.learned[step] = np.log(unscaled * believed_unit[step])
-        if step in absolute:
-            length, evidence.absolute_sigma[step] = absolute[step]
-            evidence.absolute[step] = np.log(length)
-    for step in triangulated:
-        ratio = length_ratio(triangulated[step - 1], triangulated[step]) if step - 1 in triangulated else None
-        if ratio is not None:
-            evidence.ratio[step], evidence.ratio_sigma[step] = ratio
+    evidence = StepEvidence.empty(len(links))
+    before: TriangulatedPoints | None = None
+    for row, ends in enumerate(links):
+        motion = motions.get(ends)
+        points = None if motion is None else motion.triangulated
+        if motion is not None and points is not None:
+            evidence.learned[row] = np.log(motion.length_unscaled * prior_unit[ends[0]])
+            if ends in absolute:
+                length, evidence.absolute_sigma[row] = absolute[ends]
+                evidence.absolute[row] = np.log(length)
+            ratio = None if before is None else length_ratio(before, points)
+            if ratio is not None:
+                evidence.ratio[row], evidence.ratio_sigma[row] = ratio
+        before = points
     return evidence
 
 

@@ -1,66 +1,64 @@
-"""Where in the image things lately moved by themselves.
+"""Where in the image objects lately moved by themselves.
 
-A car ahead stays where it is in the image for minutes. Some of its corners fit the camera's motion by chance, and these
-bend it; but most do not, and those beside them are then not to be believed either (``docs/design/0014``).
+A car ahead stays at one place of the image for minutes. Some of its corners fit the camera's motion by chance and bias
+it, but most do not: where many corners were outliers lately, the others are weighted down
+(``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations
 
-from copy import copy
+from dataclasses import dataclass, replace
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.se3 import FloatArray
-from slam.storage.serialisation import Learner
 
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
-# what was seen is half forgotten after seven steps
+# a step's inliers are half forgotten after seven steps
 _KEPT = 0.9
-# so many corners' worth of belief that a place is like the rest of the image
-_BELIEVED_CORNERS = 0.5
+# weight, in corners, of the prior that a cell has the inlier ratio of the whole image
+_PRIOR_CORNERS = 0.5
 
 
-class DynamicMask(Learner):
-    """The share of corners that fitted the camera's motion, place by place, over the last steps of one drive."""
+@dataclass(frozen=True)
+class DynamicMask:
+    """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially.
 
-    remembers = ("_fitting", "_all")
+    ``sharpness`` is the power of a cell's inlier ratio over that of the whole image; 0 weights all cells alike.
+    """
 
-    def __init__(self, width: int, height: int, sharpness: float) -> None:
-        """Nothing seen yet.
+    inliers: FloatArray
+    corners: FloatArray
+    sharpness: float
 
-        Args:
-            width: of the images, pixels.
-            height: likewise.
-            sharpness: power of a place's share over the usual one; 0 believes all places alike.
-        """
-        self._sharpness = sharpness
+    @classmethod
+    def empty(cls, width: int, height: int, sharpness: float) -> Self:
+        """Nothing seen yet in images of so many pixels."""
         shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
-        self._fitting, self._all = np.zeros(shape), np.zeros(shape)
+        return cls(np.zeros(shape), np.zeros(shape), sharpness)
 
     def weights(self, pixels: FloatArray) -> FloatArray:
-        """How far the image is to be believed at ``pixels`` ``(M, 2)``, beside the rest of it: ``(M,)`` in (0, 1]."""
-        if self._all.sum() < 1.0:
+        """Weights in (0, 1] ``(M,)`` of corners at ``pixels`` ``(M, 2)``."""
+        if self.corners.sum() < 1.0:
             return np.ones(len(pixels))
-        usual = self._fitting.sum() / self._all.sum()
-        fitting, seen = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self._fitting, self._all))
-        share = (fitting + _BELIEVED_CORNERS * usual) / (seen + _BELIEVED_CORNERS)
-        return np.asarray(np.minimum(share[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** self._sharpness)
+        usual = self.inliers.sum() / self.corners.sum()
+        inliers, corners = (cv2.GaussianBlur(kind, (0, 0), _SPREAD_CELLS) for kind in (self.inliers, self.corners))
+        ratio = (inliers + _PRIOR_CORNERS * usual) / (corners + _PRIOR_CORNERS)
+        return np.asarray(np.minimum(ratio[self._cells(pixels)] / max(usual, 1e-3), 1.0) ** self.sharpness)
 
-    def learn(self, pixels: FloatArray, fitting: NDArray[np.bool_]) -> None:
-        """Remember which corners, now at ``pixels`` ``(M, 2)``, fitted a step's motion ``(M,)``."""
-        self._all, self._fitting = _KEPT * self._all, _KEPT * self._fitting
+    def updated(self, pixels: FloatArray, is_inlier: NDArray[np.bool_]) -> Self:
+        """The mask after one more step, whose corners now lie at ``pixels`` ``(M, 2)``."""
+        inliers, corners = _KEPT * self.inliers, _KEPT * self.corners
         cells = self._cells(pixels)
-        np.add.at(self._all, cells, 1.0)
-        np.add.at(self._fitting, cells, fitting.astype(float))
-
-    def as_now(self) -> DynamicMask:
-        """What was seen so far, which nothing learnt later changes."""
-        return copy(self)  # learning makes arrays anew
+        np.add.at(corners, cells, 1.0)
+        np.add.at(inliers, cells, is_inlier.astype(float))
+        return replace(self, inliers=inliers, corners=corners)
 
     def _cells(self, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         column, row = (np.floor(pixels.T / _CELL_PX)).astype(np.int64)
-        height, width = self._all.shape
+        height, width = self.corners.shape
         return np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)

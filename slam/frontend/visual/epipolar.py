@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
+from slam.resection import consensus, ransac_order
 from slam.se3 import FloatArray, nearest_rotation
 
 _TRIMMINGS = 4
 _RESECTIONS = 200
+_LEAST_POINTS = 8
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,9 @@ class UnitRelativePose:
 
 @dataclass(frozen=True)
 class TriangulatedPoints:
-    """``M`` scene points that a motion triangulated, by the names of their tracks ``(M,)``.
+    """``M`` scene points that a motion triangulated, by the identifiers of their tracks ``track_ids`` ``(M,)``.
 
-    z-depths ``(M,)`` in both cameras are in units of the motion's length; ``relative_sigma`` ``(M,)`` is relative.
+    z-depths ``(M,)`` in both cameras are in units of the motion's length, ``relative_sigma`` ``(M,)`` is that of both.
     """
 
     track_ids: NDArray[np.int64]
@@ -40,10 +42,12 @@ class TriangulatedPoints:
 
 
 def unit_pose_by_essential(
-    rays_previous: FloatArray, rays_current: FloatArray, tolerance: float
+    rays_previous: FloatArray, rays_current: FloatArray, tolerance: float, seed: int = 0
 ) -> UnitRelativePose | None:
     """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` of z = 1."""
-    cv2.setRNGSeed(0)
+    order = ransac_order(len(rays_previous), seed)
+    rays_previous, rays_current = rays_previous[order], rays_current[order]
+    cv2.setRNGSeed(seed)
     E, mask = cv2.findEssentialMat(
         rays_previous[:, :2].copy(),
         rays_current[:, :2].copy(),
@@ -53,48 +57,43 @@ def unit_pose_by_essential(
         threshold=tolerance,
         maxIters=1000,
     )
-    if E is None or E.shape != (3, 3) or int(mask.sum()) < 8:
+    if E is None or E.shape != (3, 3) or int(mask.sum()) < _LEAST_POINTS:
         return None
-    agreeing = mask.ravel().astype(bool)
-    return _facing(E, rays_previous[agreeing], rays_current[agreeing])
+    inliers = mask.ravel().astype(bool)
+    return _in_front(E, rays_previous[inliers], rays_current[inliers])
 
 
-def _facing(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) -> UnitRelativePose:
-    """Of the four motions of an essential matrix the one with most points before both cameras."""
+def _in_front(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray) -> UnitRelativePose:
+    """Of the four motions of an essential matrix the one with most points in front of both cameras."""
     R, R_twisted, direction = cv2.decomposeEssentialMat(E)
     unit_poses = [
         UnitRelativePose(turned, sign * direction.ravel()) for turned in (R, R_twisted) for sign in (1.0, -1.0)
     ]
 
-    def before_both(unit_pose: UnitRelativePose) -> int:
+    def in_front_of_both(unit_pose: UnitRelativePose) -> int:
         depth = triangulated_depth(rays_previous, rays_current, unit_pose)
         return int(((depth > 0) & (depth_in_current(rays_previous, depth, unit_pose) > 0)).sum())
 
-    return max(unit_poses, key=before_both)
+    return max(unit_poses, key=in_front_of_both)
 
 
 def unit_pose_by_pnp(
-    rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, tolerance: float
+    rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, tolerance: float, seed: int = 0
 ) -> UnitRelativePose | None:
     """The motion with most support among the same rays where their depths ``(M,)`` are known, else NaN.
 
-    What moves by itself cannot join with the scene here: its depth tells it apart.
+    Dynamic objects do not fit the static scene here: their depth tells them apart.
     """
     known = np.isfinite(depth_previous)
-    if known.sum() < 8:
+    if known.sum() < _LEAST_POINTS:
         return None
-    cv2.setRNGSeed(0)
-    found, turned, moved, _ = cv2.solvePnPRansac(
-        rays_previous[known] * depth_previous[known, None],
-        rays_current[known, :2].copy(),
-        np.eye(3),
-        None,
-        iterationsCount=_RESECTIONS,
-        reprojectionError=tolerance,
-        confidence=0.999,
-    )
-    length = float(np.linalg.norm(moved)) if found else 0.0
-    return UnitRelativePose(cv2.Rodrigues(turned)[0], moved.ravel() / length) if length > 0 else None
+    points = rays_previous[known] * depth_previous[known, None]
+    found = consensus(points, rays_current[known, :2].copy(), np.eye(3), _RESECTIONS, tolerance, seed)
+    if found is None:
+        return None
+    rotation, translation, _ = found
+    length = float(np.linalg.norm(translation))
+    return UnitRelativePose(cv2.Rodrigues(rotation)[0], translation / length) if length > 0 else None
 
 
 def parallax_px(
@@ -113,7 +112,7 @@ def parallax_px(
 def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> FloatArray:
     """``R_current_previous`` that explains the matched rays ``(M, 3)`` best without any translation.
 
-    Orthogonal Procrustes on unit rays, trimmed to the better three quarters so that movers do not turn it.
+    Orthogonal Procrustes on unit rays, trimmed to the better three quarters, so that dynamic objects do not bias it.
     """
     unit_previous = rays_previous / np.linalg.norm(rays_previous, axis=1, keepdims=True)
     unit_current = rays_current / np.linalg.norm(rays_current, axis=1, keepdims=True)
@@ -143,6 +142,6 @@ def depth_in_current(rays_previous: FloatArray, depth_previous: FloatArray, unit
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``a x b`` of ``(3,)`` or ``(3, M)``; NumPy's own spends most of its time on choosing axes."""
+    """``a x b`` of ``(3,)`` or ``(3, M)``; several times faster than NumPy's own."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -1,6 +1,6 @@
-"""Relative poses from the images themselves: rotation and direction from corners, length from learned depth.
+"""Relative poses from optical flow: rotation and direction from corners, length from learned depth.
 
-As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax carries one, its length from the
+As in DF-VO (Zhan et al. 2020): an essential matrix where the parallax determines one, its length from the
 ratio of learned to triangulated depth; perspective-n-point against learned depth where it does not.
 """
 
@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
-from slam.frames import DepthMap, Frame, Intrinsics, RelativePose
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import (
@@ -25,20 +23,23 @@ from slam.frontend.visual.epipolar import (
     rotation_between,
     triangulated_depth,
 )
+from slam.frontend.visual.heading_prior import HeadingPrior
+from slam.frontend.visual.motion import Motion, pose_sigmas
+from slam.frontend.visual.motion_history import MotionHistory, usual_error
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.visual.step_noise import StepNoise
-from slam.frontend.visual.tracking import CornerTracker, Tracks
+from slam.frontend.visual.tracking import CornerTracker, TrackerState, Tracks
 from slam.frontend.visual.two_view import CORNER_CORRELATION, Matches, TwoViewEstimate, TwoViewEstimator
+from slam.resection import consensus, refine
 from slam.robust import mad_sigma, weighted_median
 from slam.se3 import FloatArray, invert, make
 from slam.storage.cache import GetOrCompute, without_cache
-from slam.storage.serialisation import Learner
 
 ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MIN_RATIOS = 8
+_PNP_ITERATIONS = 200
 _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a camera that stands still, or whose motion points alone determine
@@ -46,71 +47,42 @@ _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A measured ``relative_pose``, its length by learned depth, unscaled.
+class OdometryState:
+    """What visual odometry goes on from; ``last`` is the motion that led to the last frame, where one was measured."""
 
-    Where corners alone gave rotation and direction, ``triangulated`` holds what they triangulated and
-    ``direction_sigmas`` ``(3,)`` the noise of the direction in the later camera, radians; else both are None.
-    """
-
-    relative_pose: RelativePose
-    triangulated: TriangulatedPoints | None = None
-    direction_sigmas: FloatArray | None = None
-
-    @property
-    def own_noise(self) -> StepNoise:
-        """What the corners promise of rotation and direction.
-
-        Raises:
-            ValueError: it has no direction apart from its length.
-        """
-        if self.direction_sigmas is None:
-            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
-        return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
-
-    def with_rotation(self, R_current_previous: FloatArray) -> Motion:
-        """The same way seen from the current camera, with another turn ``(3, 3)``."""
-        T_current_previous = make(R_current_previous, invert(self.relative_pose.T_from_to)[:3, 3])
-        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=invert(T_current_previous)))
-
-    def with_length(
-        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise
-    ) -> RelativePose:
-        """The same rotation and direction with a length from elsewhere, and the noise that the drive showed there.
-
-        Args:
-            length: in the unit wanted.
-            relative_sigma: its relative sigma.
-            relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
-            noise: of rotation and direction, beside the corners' own.
-        """
-        own = self.own_noise
-        T_previous_current = self.relative_pose.T_from_to.copy()
-        T_previous_current[:3, 3] *= length / np.linalg.norm(T_previous_current[:3, 3])
-        rotation, direction = np.hypot(own.rotation, noise.rotation), np.hypot(own.direction, noise.direction)
-        sigmas, correlated_sigmas = (
-            _sigmas(T_previous_current, rotation, direction, share)
-            for share in (relative_sigma, relative_correlated_sigma)
-        )
-        return replace(
-            self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, correlated_sigmas=correlated_sigmas
-        )
+    tracker: TrackerState
+    dynamic_mask: DynamicMask
+    history: MotionHistory
+    last_frame: int = -1
+    last: Motion | None = None
 
 
-class VisualOdometry(Learner):
+class VisualOdometry:
     """Measures ``T_previous_current`` between frames of one sequence, in the unscaled unit of depth."""
 
-    remembers = ("_tracker", "_dynamic_mask", "_two_views", "_last")
-
     def __init__(
-        self, config: GeometryConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
+        self,
+        config: GeometryConfig,
+        intrinsics: Intrinsics,
+        get_or_compute: GetOrCompute = without_cache,
+        seed: int = 0,
+        state: OdometryState | None = None,
     ) -> None:
+        """Prepare for the first frames, or go on from a ``state``; other seeds draw other RANSAC samples."""
         self._config = config
         self._intrinsics = intrinsics
-        self._tracker = CornerTracker(config, get_or_compute)
-        self._dynamic_mask = DynamicMask(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness)
-        self._two_views = TwoViewEstimator(config, intrinsics.fx, get_or_compute)
-        self._last: tuple[UnitRelativePose, float] | None = None
+        self._seed = seed
+        self._tracker = CornerTracker(config, get_or_compute, None if state is None else state.tracker)
+        self._two_views = TwoViewEstimator(config, intrinsics.fx, get_or_compute, seed)
+        self._state = state or OdometryState(
+            self._tracker.state(),
+            DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
+            MotionHistory(HeadingPrior(float(np.deg2rad(config.heading_prior_sigma_deg)))),
+        )
+
+    def state(self) -> OdometryState:
+        """What the odometry goes on from."""
+        return replace(self._state, tracker=self._tracker.state())
 
     def measure(
         self,
@@ -119,7 +91,7 @@ class VisualOdometry(Learner):
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
     ) -> Motion | MeasurementFailure:
-        """Measure the motion between two frames.
+        """Measure the motion between two frames; of several that lead to a frame, the first is learned from.
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
@@ -128,33 +100,29 @@ class VisualOdometry(Learner):
             height_unscaled: camera height in the same unit; where known, farther depths than
                 ``max_depth_heights`` of it are not trusted.
         """
-        adjacent = current.index == previous.index + 1
-        predicted_flow = None
-        if self._config.predicted_flow and adjacent and self._last is not None:
-            predicted_flow = PredictedFlow(*self._last, depth_previous_unscaled, self._intrinsics)
-        tracks = self._tracker.track(previous, current, predicted_flow)
-        if len(tracks.previous) < self._config.min_inliers:
-            return MeasurementFailure(f"only {len(tracks.previous)} corners could be followed")
-        learned = _sample(depth_previous_unscaled, tracks.previous)
-        depth = self._trusted(learned, height_unscaled)
-        step = (previous.index, current.index)
-        measured = (
-            self._still(step, tracks, depth)
-            or self._by_essential(step, tracks, learned, depth)
-            or (self._by_points(step, tracks, depth))
-        )
-        if adjacent:
-            self._last = (
-                None
-                if isinstance(measured, MeasurementFailure)
-                else _unit_pose_and_length(measured.relative_pose.T_from_to)
+        is_first = self._state.last_frame != current.index
+        flow = self._predicted_flow(previous, current, depth_previous_unscaled) if is_first else None
+        tracks = self._tracker.track(previous, current, flow)
+        if len(tracks) < self._config.min_inliers:
+            measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
+        else:
+            learned = _sample(depth_previous_unscaled, tracks.previous)
+            depth = self._trusted(learned, height_unscaled)
+            ends = (previous.index, current.index)
+            measured = (
+                self._still(ends, tracks, depth)
+                or self._by_essential(ends, tracks, learned, depth, is_first)
+                or self._by_points(ends, tracks, depth)
             )
+        if is_first:
+            last = measured if isinstance(measured, Motion) else None
+            self._state = replace(self._state, last_frame=current.index, last=last)
         return measured
 
-    def relative_rotation_task(
+    def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
     ) -> Callable[[], RelativeRotation | None]:
-        """How to measure the turn between frames some steps apart, both measured already.
+        """How to measure the rotation between frames some steps apart, both measured already.
 
         Args:
             first: the earlier frame.
@@ -163,20 +131,21 @@ class VisualOdometry(Learner):
             T_first_last: the motion as its steps were measured, unscaled.
 
         Returns:
-            Measures it, in any thread, by what is known now; None where too few corners tell.
+            A function that measures it by what is known now, for any thread; None where it has too few corners.
         """
         known = _unit_pose_and_length(T_first_last)
         if known is None:
             return lambda: None
-        follow = self._tracker.ask_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
-        dynamic_mask, depth_relative_error = self._dynamic_mask.as_now(), self._two_views.depth_relative_error
+        find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
+        mask, history = self._state.dynamic_mask, self._state.history
+        depth_error = usual_error(history.depth_relative_errors, self._config.depth_relative_sigma)
 
         def measure() -> RelativeRotation | None:
-            tracks = follow()
-            if len(tracks.previous) < self._config.min_inliers:
+            tracks = find()
+            if len(tracks) < self._config.min_inliers:
                 return None
-            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), dynamic_mask)
-            found = self._two_views.refined(matches, known[0], depth_relative_error)
+            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), mask)
+            found = self._two_views.refined(matches, known[0], depth_error)
             if found is None or found.inliers.sum() < self._config.min_inliers:
                 return None
             sigmas = np.sqrt(np.diag(found.covariance)[:3])
@@ -184,16 +153,26 @@ class VisualOdometry(Learner):
 
         return measure
 
+    def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
+        """By the constant-velocity model, where the last motion ended at the earlier frame and took as many frames."""
+        last = self._state.last
+        if not self._config.predicted_flow or last is None or last.ends[1] != previous.index:
+            return None
+        if last.ends[1] - last.ends[0] != current.index - previous.index:
+            return None
+        known = _unit_pose_and_length(last.relative_pose.T_from_to)
+        return None if known is None else PredictedFlow(*known, depth_previous, self._intrinsics)
+
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
         farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
         return np.where(depth < farthest, depth, np.nan)
 
-    def _matches(self, tracks: Tracks, learned: FloatArray, dynamic_mask: DynamicMask) -> Matches:
-        weights = dynamic_mask.weights(tracks.previous)
-        return Matches(self._intrinsics.rays(tracks.previous), self._intrinsics.rays(tracks.current), learned, weights)
+    def _matches(self, tracks: Tracks, learned: FloatArray, mask: DynamicMask) -> Matches:
+        rays_previous, rays_current = self._intrinsics.rays(tracks.previous), self._intrinsics.rays(tracks.current)
+        return Matches(rays_previous, rays_current, learned, mask.weights(tracks.previous))
 
-    def _still(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | None:
+    def _still(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | None:
         flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
         if flow >= self._config.still_flow_px or not np.isfinite(depth).any():
             return None
@@ -201,24 +180,34 @@ class VisualOdometry(Learner):
         typical_radius_px = 0.25 * self._intrinsics.width
         translation = max(flow, 0.1) * float(np.nanmedian(depth)) / typical_radius_px
         sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
-        return Motion(RelativePose(*step, np.eye(4), sigmas, STILL_SOURCE))
+        return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE))
 
     def _by_essential(
-        self, step: tuple[int, int], tracks: Tracks, learned: FloatArray, depth: FloatArray
+        self, ends: Ends, tracks: Tracks, learned: FloatArray, depth: FloatArray, is_first: bool
     ) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, learned, self._dynamic_mask)
+        matches = self._matches(tracks, learned, self._state.dynamic_mask)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         # an essential matrix of a pure rotation invents a translation: only believe one that is needed
         turned = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
-        two_view = self._two_views.estimate(matches)
-        if two_view is not None and step[1] == step[0] + 1:
-            self._dynamic_mask.learn(tracks.current, two_view.inliers)
-        if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
+        estimated = self._two_views.estimate(matches, self._state.history)
+        if estimated is None or estimated[0].inliers.sum() < self._config.min_inliers:
             return None
+        two_view, history = estimated
+        motion = self._triangulated(ends, tracks, matches, depth, two_view)
+        if motion is not None and is_first:
+            mask = self._state.dynamic_mask.updated(tracks.current, two_view.inliers)
+            self._state = replace(self._state, dynamic_mask=mask, history=history)
+        return motion
+
+    def _triangulated(
+        self, ends: Ends, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
+    ) -> Motion | None:
+        """The motion with its length by learned depth, None where too few points measure that."""
+        rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
         parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
         depth_previous = triangulated_depth(rays_previous, rays_current, unit_pose)
@@ -235,8 +224,8 @@ class VisualOdometry(Learner):
         triangulated = TriangulatedPoints(
             tracks.track_ids[solid], depth_previous[solid], depth_current[solid], relative_sigma[solid]
         )
-        sigmas = _sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
-        return Motion(RelativePose(*step, T_previous_current, sigmas, ESSENTIAL_SOURCE), triangulated, direction)
+        sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
+        return Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), triangulated, direction)
 
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
@@ -245,47 +234,23 @@ class VisualOdometry(Learner):
         floor = np.deg2rad(self._config.direction_floor_deg)
         return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.unit_pose.direction**2, 0.0)))
 
-    def _by_points(self, step: tuple[int, int], tracks: Tracks, depth: FloatArray) -> Motion | MeasurementFailure:
+    def _by_points(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | MeasurementFailure:
         """Perspective-n-point of the later image's corners on the earlier frame's learned depth."""
         known = np.isfinite(depth)
         if known.sum() < self._config.min_inliers:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
         points_previous = self._intrinsics.rays(tracks.previous[known]) * depth[known, None]
-        pixels = tracks.current[known]
-        cv2.setRNGSeed(0)
-        found, rotation, translation, chosen = cv2.solvePnPRansac(
-            points_previous,
-            pixels,
-            self._intrinsics.K,
-            None,
-            iterationsCount=200,
-            reprojectionError=self._config.reprojection_px,
-            confidence=0.999,
-        )
-        count = 0 if not found or chosen is None else len(chosen)
-        if count < self._config.min_inliers:
+        pixels, K = tracks.current[known], self._intrinsics.K
+        found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, self._config.reprojection_px, self._seed)
+        count = 0 if found is None else len(found[2])
+        if found is None or count < self._config.min_inliers:
             return MeasurementFailure(f"little parallax, and only {count} corners agree with the learned depth")
-        chosen = chosen.ravel()
-        rotation, translation = cv2.solvePnPRefineLM(
-            points_previous[chosen], pixels[chosen], self._intrinsics.K, None, rotation, translation
-        )
-        R_current_previous = Rotation.from_rotvec(rotation.ravel()).as_matrix()
-        sigmas = self._points_sigmas(points_previous[chosen], pixels[chosen], rotation, translation)
-        T_previous_current = invert(make(R_current_previous, translation.ravel()))
-        return Motion(RelativePose(*step, T_previous_current, sigmas, PNP_SOURCE))
-
-    def _points_sigmas(
-        self, points: FloatArray, pixels: FloatArray, rotation: FloatArray, translation: FloatArray
-    ) -> FloatArray:
-        """Sigmas ``(6,)`` from the reprojection's Jacobian, widened by the learned depth's own error."""
-        projected, jacobian = cv2.projectPoints(points, rotation, translation, self._intrinsics.K, None)
-        residual = (projected.reshape(-1, 2) - pixels).ravel()
-        sigma = max(mad_sigma(residual), 0.1)
-        J = jacobian[:, :6]
-        own = CORNER_CORRELATION * sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J + 1e-12 * np.eye(6))))
-        length = float(np.linalg.norm(translation))
+        resection = refine(points_previous, pixels, K, found)
+        length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
+        # corners err together, and so does learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
-        return np.asarray(np.hypot(own, floors))
+        sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
+        return Motion(RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE))
 
 
 def _unit_pose_and_length(T_previous_current: FloatArray) -> tuple[UnitRelativePose, float] | None:
@@ -296,16 +261,6 @@ def _unit_pose_and_length(T_previous_current: FloatArray) -> tuple[UnitRelativeP
         if length > 0
         else None
     )
-
-
-def _sigmas(
-    T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_relative_sigma: float
-) -> FloatArray:
-    """Sigmas ``(6,)`` from those of rotation and direction ``(3,)`` and of the length, in the current camera."""
-    along = np.abs(invert(T_previous_current)[:3, 3])
-    length = float(np.linalg.norm(along))
-    translation = np.hypot(length * direction, length_relative_sigma * along)
-    return np.concatenate([rotation, np.maximum(translation, 1e-3 * length)])
 
 
 def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:

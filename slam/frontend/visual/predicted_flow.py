@@ -1,8 +1,9 @@
-"""The next image as learned depth and the motion so far foretell it, so that corners can be followed through it.
+"""Optical flow predicted by learned depth and the constant-velocity model, to track corners through it.
 
-Seen from a moving car a window on the road stretches by a fifth from frame to frame, one on a near wall by a tenth. A
-tracker that only shifts windows follows whatever part of one has most texture: single corners err by half a pixel, and
-those on the road all together upwards, which looks like a camera that pitches (``docs/design/0013``).
+From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
+Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
+single corners err by half a pixel, and those on the road all upwards, which looks like a camera that pitches
+(``docs/design/visual-front-end.md``). Warping the later image back by the predicted flow removes the stretch.
 """
 
 from __future__ import annotations
@@ -14,21 +15,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Intrinsics
+from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.storage.cache import Given
 
 _NEAREST = 1e-6
 
-Grey = NDArray[np.uint8]
 Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedFlow:
-    """Where the pixels of an image go by a motion of ``unit_pose`` and ``length`` through ``depth_previous``.
+    """Where the pixels of an image go under a motion (``unit_pose``, ``length``) of a static scene.
 
-    ``length`` and depth ``(H, W)`` are in one unit; where there is no depth, the scene is taken to be far.
+    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; where there is no depth, the scene is taken to be far.
     """
 
     unit_pose: UnitRelativePose
@@ -38,16 +38,16 @@ class PredictedFlow:
 
     @property
     def given(self) -> tuple[Given, ...]:
-        """All that it depends on, for a memory."""
+        """All that the flow depends on, for a cache key."""
         moved = self.length * self.unit_pose.direction
         return self.unit_pose.R_current_previous, moved, self.depth_previous, repr(self.intrinsics)
 
-    def undone(self, current: Grey) -> Grey:
-        """The later image ``(H, W)`` with the foreseen motion undone: what is foreseen right stands where it stood."""
+    def warp_back(self, current: Grey) -> Grey:
+        """The later image ``(H, W)`` warped back: where the flow is predicted right, pixels stand where they stood."""
         return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
     def in_current(self, pixels: Pixels) -> Pixels:
-        """Where pixels ``(M, 2)`` of the undone image lie in the later one."""
+        """Where pixels ``(M, 2)`` of the warped image lie in the later one."""
         if len(pixels) == 0:
             return pixels
         u, v = np.ascontiguousarray(pixels.T)

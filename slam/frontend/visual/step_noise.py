@@ -1,10 +1,9 @@
-"""How far corners err on this drive and at this step, as the drive itself shows: no truth is looked at.
+"""Noise of the steps of a drive beside the corners' own covariance, estimated from the drive itself without truth.
 
-Corners promise sigmas that hold where the camera is all that errs. On the road more goes wrong than they know of -
-stamps, the mount, whatever is not a pinhole - and it goes wrong in proportion to how the camera shakes, how it turns,
-and where a step does not fit the steps beside it. So the sigmas of each step are widened by shares of what of these the
-corners' own noise does not explain. The shares in ``GeometryConfig`` were fitted once
-(``docs/design/0009-noise-from-the-drive-itself.md``).
+The covariance of corners holds for an ideal pinhole. On the road there is more: time stamps, the mount, lens errors. It
+grows with the camera's rotation jitter, with its rotation, and with how far a step lies from its neighbours. So the
+sigmas of each step are inflated by ratios of what of these the corners' own noise does not explain. The ratios in
+``GeometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from slam.se3 import FloatArray, invert
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
 _THIRD_DIFFERENCE = np.sqrt(20.0)
-# white noise makes a step differ from what its neighbours foretell by so many of its sigmas
+# white noise makes a step differ from the prediction by its neighbours by so many of its sigmas
 _NEIGHBOUR_RESIDUAL_OF_NOISE = 1.5
 
 
@@ -40,61 +39,66 @@ class StepNoise:
 def inflate_step_sigmas(
     T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: GeometryConfig
 ) -> dict[int, StepNoise]:
-    """The noise of each step of a drive beside what its corners know of.
+    """The noise of each step of a drive beside the corners' own.
 
     Args:
-        T_previous_current: steps that corners measured, by their first frame; lengths are not looked at.
-        own: the sigmas that the corners of each step promise.
-        config: the shares.
+        T_previous_current: steps by their place in the drive, neighbours one apart; lengths are not used.
+        own: the sigmas by the corners' own covariance.
+        config: the ratios.
     """
     if not T_previous_current:
         return {}
-    turned = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
-    along = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
-    shake = _beyond(rotation_jitter(turned), np.median([own[k].rotation for k in turned], axis=0))
+    rotations = {k: Rotation.from_matrix(T[:3, :3]).as_rotvec() for k, T in T_previous_current.items()}
+    directions = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
+    jitter = _unexplained(rotation_jitter(rotations), np.median([own[k].rotation for k in rotations], axis=0))
     noise = {}
-    for k, turn in turned.items():
-        rotation = [config.jitter_rotation_ratio * shake, config.turn_rotation_ratio * turn]
-        jolted, swerved = (
-            _beyond(neighbour_residual(values, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * known)
-            for values, known in ((turned, own[k].rotation), (along, own[k].direction))
+    for k, rotation in rotations.items():
+        rotation_residual, direction_residual = (
+            _unexplained(neighbour_residual(values, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * known)
+            for values, known in ((rotations, own[k].rotation), (directions, own[k].direction))
         )
-        rotation.append(config.neighbour_rotation_ratio * jolted)
-        aside = config.jitter_direction_ratio * np.linalg.norm(shake) * np.sqrt(np.maximum(1.0 - along[k] ** 2, 0.0))
-        direction = np.hypot(aside, config.neighbour_direction_ratio * swerved)
-        noise[k] = StepNoise(np.linalg.norm(rotation, axis=0), direction)
+        rotation_sigmas = [
+            config.jitter_rotation_ratio * jitter,
+            config.turn_rotation_ratio * rotation,
+            config.neighbour_rotation_ratio * rotation_residual,
+        ]
+        across = np.sqrt(np.maximum(1.0 - directions[k] ** 2, 0.0))
+        jitter_sigma = config.jitter_direction_ratio * np.linalg.norm(jitter) * across
+        direction = np.hypot(jitter_sigma, config.neighbour_direction_ratio * direction_residual)
+        noise[k] = StepNoise(np.linalg.norm(rotation_sigmas, axis=0), direction)
     return noise
 
 
-def rotation_jitter(turned: Mapping[int, FloatArray]) -> FloatArray:
-    """What of the steps' rotation vectors no smooth motion explains: sigmas ``(3,)``, radians, 0 with few steps.
+def rotation_jitter(rotations: Mapping[int, FloatArray]) -> FloatArray:
+    """Sigmas ``(3,)``, radians, of the part of the steps' rotation vectors that no smooth motion explains.
 
-    Third differences remove any turn that changes evenly; their middle size withstands jolts.
+    Third differences remove any rotation that changes evenly; their median withstands single jumps. Zero with few
+    steps.
     """
-    steps = sorted(k for k in turned if all(k + n in turned for n in range(1, 4)))
+    steps = sorted(k for k in rotations if all(k + n in rotations for n in range(1, 4)))
     if len(steps) < _LEAST_STEPS:
         return np.zeros(3)
-    third = np.array([turned[k + 3] - 3 * turned[k + 2] + 3 * turned[k + 1] - turned[k] for k in steps])
+    third = np.array([rotations[k + 3] - 3 * rotations[k + 2] + 3 * rotations[k + 1] - rotations[k] for k in steps])
     return np.asarray(mad_sigmas(third) / _THIRD_DIFFERENCE)
 
 
 def neighbour_residual(values: Mapping[int, FloatArray], step: int) -> FloatArray:
-    """How far a step's value ``(3,)`` lies from what the steps beside it foretell, 0 where none do.
+    """How far a step's value ``(3,)`` lies from the prediction by its neighbours, 0 where there are none.
 
-    Foretold by the two steps before, by the two after, and by one on each side; the middle of these withstands one
+    Predicted by the two steps before, by the two after, and by one on each side; the median of these withstands one
     bad neighbour.
     """
     lines = [((-1, 0.5), (1, 0.5)), ((-1, 2.0), (-2, -1.0)), ((1, 2.0), (2, -1.0))]
-    foretold = [
-        sum((share * values[step + n] for n, share in line), np.zeros(3))
+    predicted = [
+        sum((weight * values[step + n] for n, weight in line), np.zeros(3))
         for line in lines
         if all(step + n in values for n, _ in line)
     ]
-    return np.asarray(np.abs(values[step] - np.median(foretold, axis=0))) if foretold else np.zeros(3)
+    return np.asarray(np.abs(values[step] - np.median(predicted, axis=0))) if predicted else np.zeros(3)
 
 
-def _beyond(seen: FloatArray, known: FloatArray) -> FloatArray:
-    """What of a deviation ``(3,)`` sigmas that are known of ``(3,)`` do not explain."""
+def _unexplained(seen: FloatArray, known: FloatArray) -> FloatArray:
+    """The part of a deviation ``(3,)`` that known sigmas ``(3,)`` do not explain."""
     return np.asarray(np.sqrt(np.maximum(seen**2 - known**2, 0.0)))
 
 

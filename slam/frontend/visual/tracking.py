@@ -1,149 +1,155 @@
-"""Corners followed from image to image: Shi-Tomasi, pyramidal Lucas-Kanade, checked backwards.
+"""Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade, forward-backward check.
 
-Where the next image is foreseen, corners are followed twice, as they are and through their foreseen change of shape,
-and go where their windows look more alike.
+Where learned depth and the motion so far predict the flow, corners are tracked twice: in the image as it is, and in the
+image warped back by the predicted flow. The result whose windows correlate better is taken.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import GeometryConfig
-from slam.frames import Frame, Image
-from slam.frontend.visual.predicted_flow import Grey, Pixels, PredictedFlow
+from slam.frames import Frame, Grey
+from slam.frontend.visual.predicted_flow import Pixels, PredictedFlow
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, without_cache
-from slam.storage.serialisation import Learner
 
-_REMEMBERED = 4
-# what is left to find is small where motion was foreseen
-_FORESEEN_LEVELS = 2
+# predicted flow leaves small displacements to find
+_PREDICTED_LEVELS = 2
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """The same ``M`` scene points in two images, pixels ``(M, 2)`` each, and their names ``(M,)``.
+    """The same ``M`` scene points in two images: pixels ``(M, 2)`` each, and ``track_ids`` ``(M,)``.
 
-    A corner keeps its name from frame to frame for as long as it can be followed.
+    A corner keeps its identifier from frame to frame for as long as it is tracked.
     """
 
     previous: FloatArray
     current: FloatArray
     track_ids: NDArray[np.int64]
 
+    def __len__(self) -> int:
+        return len(self.track_ids)
 
-class CornerTracker(Learner):
-    """Follows corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
 
-    remembers = ("_seen", "_next_track_id")
+@dataclass(frozen=True)
+class Corners:
+    """Corners of one image: pixels ``(M, 2)`` and ``track_ids`` ``(M,)``."""
 
-    def __init__(self, config: GeometryConfig, get_or_compute: GetOrCompute = without_cache) -> None:
+    pixels: Pixels
+    track_ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """Corners of the last frames by frame index, and the next free track identifier."""
+
+    corners: dict[int, Corners]
+    next_track_id: int = 0
+
+
+class CornerTracker:
+    """Tracks corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
+
+    def __init__(
+        self,
+        config: GeometryConfig,
+        get_or_compute: GetOrCompute = without_cache,
+        state: TrackerState | None = None,
+    ) -> None:
         self._config = config
         self._get_or_compute = get_or_compute
-        self._seen: OrderedDict[int, SeenImage] = OrderedDict()
-        self._next_track_id = 0
+        self._state = state or TrackerState({})
+        self._frames_kept = max(*config.steps, config.rotation_baseline_steps) + 2
+
+    def state(self) -> TrackerState:
+        """What the tracker goes on from."""
+        return self._state
 
     def track(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None) -> Tracks:
-        """Corners of ``previous`` found again in ``current``, with what is foreseen of it, if anything."""
-        first, second = self._see(previous), self._see(current)
-        if first.corners is None:
-            self._fill(first, _no_corners())
-        assert first.corners is not None
-        forward, kept = self._found_again(first, second, first.corners.pixels, predicted_flow)
-        track_ids = first.corners.track_ids[kept]
-        if second.corners is None:
-            self._fill(second, Corners(forward[kept], track_ids))
-        return Tracks(first.corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), track_ids)
+        """Corners of ``previous`` found again in ``current``, with the flow predicted between them, if any."""
+        corners = self._state.corners.get(previous.index)
+        if corners is None:
+            corners = self._filled(previous, _no_corners())
+        forward, kept = self._found_again(previous, current, corners.pixels, predicted_flow)
+        track_ids = corners.track_ids[kept]
+        if current.index not in self._state.corners:
+            self._filled(current, Corners(forward[kept], track_ids))
+        return Tracks(corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), track_ids)
 
-    def ask_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
-        """How to find corners of ``previous`` that were followed to the next frame in a later one that is foreseen.
+    def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
+        """How to find corners of ``previous`` that were tracked on in a later frame some steps away.
 
-        What is returned finds them, in any thread.
+        The function returned finds them; any thread may call it.
         """
-        first, second = self._see(previous), self._see(current)
-        following = self._seen.get(previous.index + 1)
-        if first.corners is None or following is None or following.corners is None:
+        corners = self._state.corners.get(previous.index)
+        following = min((index for index in self._state.corners if index > previous.index), default=None)
+        if corners is None or following is None:
             return lambda: Tracks(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64))
-        followed = np.isin(first.corners.track_ids, following.corners.track_ids)
-        points, track_ids = first.corners.pixels[followed], first.corners.track_ids[followed]
+        tracked = np.isin(corners.track_ids, self._state.corners[following].track_ids)
+        points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
-        def follow() -> Answer:
-            way = _through(second.grey, self._config.window_px, predicted_flow)
-            found = self._followed(first.grey, second.grey, points, [way])
+        def flow() -> Answer:
+            way = _warped(current.grey, self._config.window_px, predicted_flow)
+            found = self._best_flow(previous.grey, current.grey, points, [way])
             return found.pixels, found.kept
 
         def find() -> Tracks:
             settings = repr((self._config.window_px, self._config.forward_backward_px))
-            given = first.image, second.image, points, settings, *predicted_flow.given
-            pixels, kept = self._get_or_compute("corners across a span", given, follow)
+            given = previous, current, points, settings, *predicted_flow.given
+            pixels, kept = self._get_or_compute("flow across a baseline", given, flow)
             return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), track_ids[kept])
 
         return find
 
     def _found_again(
-        self, first: SeenImage, second: SeenImage, points: Pixels, predicted_flow: PredictedFlow | None
+        self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
-        """Where points ``(M, 2)`` went and which can be believed, sought wider where they are few."""
+        """Where points ``(M, 2)`` went and which are reliable; searched in wider windows where these are few."""
         config = self._config
 
-        def follow() -> Answer:
-            found = self._follow(first.grey, second.grey, points, config.window_px, predicted_flow)
+        def flow() -> Answer:
+            found = self._flow(first.grey, second.grey, points, config.window_px, predicted_flow)
             if found.kept.sum() < config.few_corners:
-                alike = _exposed_like(second.grey, first.grey)
-                wider = self._follow(first.grey, alike, points, config.wide_window_px, predicted_flow)
+                exposed = _exposed_like(second.grey, first.grey)
+                wider = self._flow(first.grey, exposed, points, config.wide_window_px, predicted_flow)
                 found = max(found, wider, key=lambda way: way.kept.sum())
             return found.pixels, found.kept
 
-        settings = (
-            config.window_px,
-            config.wide_window_px,
-            config.few_corners,
-            config.pyramid_levels,
-            config.forward_backward_px,
-        )
-        given = (
-            first.image,
-            second.image,
-            points,
-            repr(settings),
-            *(() if predicted_flow is None else predicted_flow.given),
-        )
-        pixels, kept = self._get_or_compute("corners found again", given, follow)
+        windows = config.window_px, config.wide_window_px, config.few_corners
+        settings = repr((*windows, config.pyramid_levels, config.forward_backward_px))
+        predicted = () if predicted_flow is None else predicted_flow.given
+        given = (first, second, points, settings, *predicted)
+        pixels, kept = self._get_or_compute("optical flow", given, flow)
         return pixels, kept
 
-    def _see(self, frame: Frame) -> SeenImage:
-        seen = self._seen.get(frame.index)
-        if seen is None or seen.image is not frame.image:
-            grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-            seen = self._seen[frame.index] = SeenImage(frame.image, grey)
-        self._seen.move_to_end(frame.index)
-        while len(self._seen) > _REMEMBERED:
-            self._seen.popitem(last=False)
-        return seen
-
-    def _fill(self, seen: SeenImage, arrived: Corners) -> None:
-        """Give a frame the corners that arrived and new ones where there is room."""
-        config = self._config
+    def _filled(self, frame: Frame, arrived: Corners) -> Corners:
+        """Remember for a frame the corners that arrived, and new ones where there is room."""
+        config, next_id = self._config, self._state.next_track_id
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
-            settings = (room, config.corner_quality, config.corner_spacing_px)
+            settings = repr((room, config.corner_quality, config.corner_spacing_px))
             (fresh,) = self._get_or_compute(
-                "fresh corners", (seen.image, pixels, repr(settings)), lambda: (self._fresh(seen.grey, pixels, room),)
+                "new corners", (frame, pixels, settings), lambda: (self._detected(frame.grey, pixels, room),)
             )
             pixels = np.concatenate([pixels, fresh])
-            track_ids = np.concatenate([track_ids, self._next_track_id + np.arange(len(fresh))])
-            self._next_track_id += len(fresh)
-        seen.corners = Corners(pixels, track_ids)
+            track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
+            next_id += len(fresh)
+        corners = Corners(pixels, track_ids)
+        kept = sorted({*self._state.corners, frame.index})[-self._frames_kept :]
+        known = {**self._state.corners, frame.index: corners}
+        self._state = replace(self._state, corners={index: known[index] for index in kept}, next_track_id=next_id)
+        return corners
 
-    def _fresh(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
+    def _detected(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
         """At most ``room`` corners ``(M, 2)`` away from those known."""
         config = self._config
         free = _away_from(pixels, int(config.corner_spacing_px), grey.shape)
@@ -152,28 +158,28 @@ class CornerTracker(Learner):
         )
         return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
-    def _follow(
+    def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
     ) -> _Found:
-        """Where points ``(M, 2)`` went, as they are or through what is foreseen, and which of them can be believed."""
+        """Where points ``(M, 2)`` went, directly or through the predicted flow, and which are reliable."""
         ways = [_Way(second, side, self._config.pyramid_levels)]
         if predicted_flow is not None:
-            ways.append(_through(second, side, predicted_flow))
-        return self._followed(first, second, points, ways)
+            ways.append(_warped(second, side, predicted_flow))
+        return self._best_flow(first, second, points, ways)
 
-    def _followed(self, first: Grey, second: Grey, points: Pixels, ways: Sequence[_Way]) -> _Found:
-        """Points ``(M, 2)`` by the way that leaves windows most alike, of those that lead back."""
+    def _best_flow(self, first: Grey, second: Grey, points: Pixels, ways: Sequence[_Way]) -> _Found:
+        """Points ``(M, 2)`` by the way whose windows differ least, of those that pass the forward-backward check."""
         pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
         if len(points) == 0:
             return _Found(pixels, kept)
-        arrived = [_flow(first, way.image, points, way) for way in ways]
-        unlike = np.stack([np.where(found, unlike, np.inf) for _, found, unlike in arrived])
-        for choice in np.argsort(unlike, axis=0, kind="stable"):
+        arrived = [_lucas_kanade(first, way.image, points, way) for way in ways]
+        difference = np.stack([np.where(found, difference, np.inf) for _, found, difference in arrived])
+        for choice in np.argsort(difference, axis=0, kind="stable"):
             for n, (way, (forward, found, _)) in enumerate(zip(ways, arrived, strict=True)):
                 tried = np.flatnonzero(~kept & (choice == n) & found)
                 if len(tried) == 0:
                     continue
-                backward, found_back, _ = _flow(way.image, first, forward[tried], way)
+                backward, found_back, _ = _lucas_kanade(way.image, first, forward[tried], way)
                 error = np.abs(backward - points[tried]).max(axis=1)
                 returned = tried[found_back & (error < self._config.forward_backward_px)]
                 pixels[returned], kept[returned] = way.in_current(forward[returned]), True
@@ -184,9 +190,9 @@ class CornerTracker(Learner):
 
 @dataclass(frozen=True)
 class _Way:
-    """An image in which points are sought with windows of ``side`` over so many ``levels`` above it.
+    """An image in which points are searched with windows of ``side`` over ``levels`` of its pyramid.
 
-    ``in_current`` says where in the later image something of it lies.
+    ``in_current`` takes pixels of that image to the later one.
     """
 
     image: Grey
@@ -195,14 +201,16 @@ class _Way:
     in_current: Callable[[Pixels], Pixels] = lambda pixels: pixels
 
 
-def _through(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Way:
-    """Through the later image with what is foreseen undone."""
-    return _Way(predicted_flow.undone(second), side, _FORESEEN_LEVELS, predicted_flow.in_current)
+def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Way:
+    """Through the later image warped back by the predicted flow."""
+    return _Way(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
-def _flow(start: Grey, end: Grey, pixels: Pixels, way: _Way) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
-    """Where pixels ``(M, 2)`` went, which of them went anywhere, and how far their windows differ ``(M,)``."""
-    moved, status, unlike = cv2.calcOpticalFlowPyrLK(
+def _lucas_kanade(
+    start: Grey, end: Grey, pixels: Pixels, way: _Way
+) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
+    """Where pixels ``(M, 2)`` went, which of them were found, and how far their windows differ ``(M,)``."""
+    moved, status, difference = cv2.calcOpticalFlowPyrLK(
         start,
         end,
         pixels.reshape(-1, 1, 2),
@@ -211,23 +219,15 @@ def _flow(start: Grey, end: Grey, pixels: Pixels, way: _Way) -> tuple[Pixels, ND
         maxLevel=way.levels,
         criteria=_CRITERIA,
     )
-    return moved.reshape(-1, 2), status.ravel().astype(bool), unlike.ravel()
+    return moved.reshape(-1, 2), status.ravel().astype(bool), difference.ravel()
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Where points went ``(M, 2)``, and which of them can be believed ``(M,)``."""
+    """Where points went ``(M, 2)``, and which of them are reliable ``(M,)``."""
 
     pixels: Pixels
     kept: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Corners of one image, pixels ``(M, 2)``, and their names ``(M,)``."""
-
-    pixels: Pixels
-    track_ids: NDArray[np.int64]
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -250,12 +250,3 @@ def _exposed_like(grey: Grey, other: Grey) -> Grey:
 
 def _no_corners() -> Corners:
     return Corners(np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
-
-
-@dataclass
-class SeenImage:
-    """An image, its grey levels, and its corners once they are known."""
-
-    image: Image
-    grey: Grey
-    corners: Corners | None = None

@@ -1,15 +1,14 @@
 """The motion between two views that corners, learned depth and the drive so far agree on.
 
-Corners alone can be misled: when most of what stands out in an image is a car that turns with the camera, its corners
-and the distant ones lie on the epipolar lines of a motion that neither of them made (``docs/design/0010``). Two judges
-tell it from the true one. A motion says how far each corner shifts along its epipolar line, and so does learned depth;
-and a vehicle moves the way it has moved.
+Corners alone can mislead: where most of them lie on a car that turns with the camera, its corners and distant ones lie
+on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further measurements tell
+the motions apart. A motion predicts how far each corner shifts along its epipolar line, and so does learned depth; and
+a vehicle moves in the direction in which it has moved.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +16,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.config import GeometryConfig
-from slam.frontend.visual.epipolar import UnitRelativePose, triangulated_depth, unit_pose_by_essential, unit_pose_by_pnp
-from slam.frontend.visual.heading_prior import HeadingPrior
+from slam.frontend.visual.epipolar import (
+    UnitRelativePose,
+    triangulated_depth,
+    unit_pose_by_essential,
+    unit_pose_by_pnp,
+)
+from slam.frontend.visual.motion_history import MotionHistory, MotionPrior, usual_error
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
-from slam.storage.serialisation import Learner
 
 _ITERATIONS = 10
 # reweighting alone closes half of the distance in an iteration: a step goes further by this
@@ -31,8 +34,6 @@ _OVERSTEP = 1.4
 _CONVERGED = 1e-5
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
-_REMEMBERED = 100
-_LEAST_REMEMBERED = 10
 _RESECTION_PX = 2.0
 # along its line a corner is an inlier within this many sigmas
 _ALONG_SIGMAS = 2.5
@@ -70,75 +71,64 @@ class TwoViewEstimate:
     inliers: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class MotionPrior:
-    """What a drive has shown so far: error of learned depth as a share, axis of motion ``(3,)`` and its sigma."""
+class TwoViewEstimator:
+    """Estimates the motions of one drive; what it has learned so far is given to it."""
 
-    depth_relative_error: float
-    axis: FloatArray
-    axis_sigma: float
-
-
-class TwoViewEstimator(Learner):
-    """Estimates the motions of one drive, one after the other."""
-
-    remembers = ("_directions", "_depth_relative_errors", "_heading_prior", "_last")
-
-    def __init__(self, config: GeometryConfig, focal_px: float, get_or_compute: GetOrCompute = without_cache) -> None:
+    def __init__(
+        self,
+        config: GeometryConfig,
+        focal_px: float,
+        get_or_compute: GetOrCompute = without_cache,
+        seed: int = 0,
+    ) -> None:
         self._config = config
         self._focal_px = focal_px
         self._get_or_compute = get_or_compute
-        self._directions: deque[FloatArray] = deque(maxlen=_REMEMBERED)
-        self._depth_relative_errors: deque[float] = deque(maxlen=_REMEMBERED)
-        self._heading_prior = HeadingPrior(float(np.deg2rad(config.heading_prior_sigma_deg)))
-        self._last: UnitRelativePose | None = None
+        self._seed = seed
 
-    def estimate(self, matches: Matches) -> TwoViewEstimate | None:
-        """Rotation and direction of the next motion; None where corners agree on none."""
-        believed = matches.weights >= _LEAST_PROPOSING_WEIGHT
-        first, second = matches.rays_previous[believed], matches.rays_current[believed]
-        proposed = self._proposed(first, second)
-        motion_prior = self._motion_prior(matches, proposed)
-        candidates = [self._refined(matches, proposed, motion_prior)]
+    def estimate(self, matches: Matches, history: MotionHistory) -> tuple[TwoViewEstimate, MotionHistory] | None:
+        """Rotation and direction of the next motion, and the history with it; None where corners agree on none."""
+        reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
+        first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
+        proposed = self._by_essential(first, second)
+        prior = self._prior(matches, proposed, history)
+        candidates = [self._refined(matches, proposed, prior)]
         if candidates[0] is None or candidates[0].inliers.mean() < self._config.early_exit_inlier_ratio:
-            by_points = self._resected(first, second, matches.depth_previous[believed])
-            candidates += [self._refined(matches, other, motion_prior) for other in (by_points, self._last)]
+            by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
+            candidates += [self._refined(matches, other, prior) for other in (by_points, history.last)]
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
             return None
-        best = max(found, key=lambda candidate: _support(candidate, motion_prior))
-        self._directions.append(best.unit_pose.direction)
-        self._depth_relative_errors.append(self._depth_relative_error(matches, best.unit_pose))
-        self._last, covariance = self._heading_prior.fused(best.unit_pose, CORNER_CORRELATION**2 * best.covariance)
-        return TwoViewEstimate(self._last, covariance / CORNER_CORRELATION**2, best.inliers)
-
-    @property
-    def depth_relative_error(self) -> float:
-        """By how much learned depth erred so far, as a share; at least what it is always expected to."""
-        return self._usual(self._depth_relative_errors)
+        best = max(found, key=lambda candidate: _support(candidate, prior))
+        widened = CORNER_CORRELATION**2 * best.covariance
+        fused, covariance = history.heading_prior.fuse(best.unit_pose, widened)
+        error = self._depth_relative_error(matches, best.unit_pose)
+        estimate = TwoViewEstimate(fused, covariance / CORNER_CORRELATION**2, best.inliers)
+        return estimate, history.with_step(best.unit_pose, widened, fused, error)
 
     def refined(self, matches: Matches, start: UnitRelativePose, depth_relative_error: float) -> TwoViewEstimate | None:
-        """The motion that corners agree on near one that is well known; it is not remembered, nor what was before.
+        """The motion that corners agree on near one that is well known.
 
-        Learned depth tells motions apart, and here there is nothing left to tell apart: it weighs little.
+        Learned depth is needed to choose between motions. Near a known motion there is nothing to choose, so its weight
+        is small.
         """
         sigma = float(np.deg2rad(self._config.direction_prior_sigma_deg))
         return self._refined(
             matches, start, MotionPrior(_PATCH_WIDENING * depth_relative_error, start.direction, sigma)
         )
 
-    def _proposed(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
+    def _by_essential(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
         tolerance = self._config.inlier_px / self._focal_px
-        given = first, second, repr(tolerance)
+        given = first, second, repr((tolerance, self._seed))
         return self._cached_unit_pose(
-            "motion by consensus", given, lambda: unit_pose_by_essential(first, second, tolerance)
+            "motion by essential matrix", given, lambda: unit_pose_by_essential(first, second, tolerance, self._seed)
         )
 
-    def _resected(self, first: FloatArray, second: FloatArray, depth: FloatArray) -> UnitRelativePose | None:
+    def _by_pnp(self, first: FloatArray, second: FloatArray, depth: FloatArray) -> UnitRelativePose | None:
         tolerance = _RESECTION_PX / self._focal_px
-        given = first, second, depth, repr(tolerance)
+        given = first, second, depth, repr((tolerance, self._seed))
         return self._cached_unit_pose(
-            "motion by depth", given, lambda: unit_pose_by_pnp(first, second, depth, tolerance)
+            "motion by PnP", given, lambda: unit_pose_by_pnp(first, second, depth, tolerance, self._seed)
         )
 
     def _cached_unit_pose(
@@ -151,26 +141,16 @@ class TwoViewEstimator(Learner):
         known = self._get_or_compute(kind, given, answer)
         return UnitRelativePose(*known) if known else None
 
-    def _motion_prior(self, matches: Matches, proposed: UnitRelativePose | None) -> MotionPrior:
-        """Until the drive has shown how learned depth errs, the proposed motion tells."""
-        shares = list(self._depth_relative_errors) or (
-            [] if proposed is None else [self._depth_relative_error(matches, proposed)]
-        )
-        share = self._usual(shares)
-        if len(self._directions) < _LEAST_REMEMBERED:
-            return MotionPrior(share, np.zeros(3), np.inf)
-        directions = np.array(self._directions)
-        axis = np.median(directions, axis=0)
-        axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
-        spread = mad_sigma(np.arccos(np.clip(directions @ axis, -1.0, 1.0)))
-        return MotionPrior(share, axis, float(np.hypot(np.deg2rad(self._config.direction_prior_sigma_deg), spread)))
-
-    def _usual(self, depth_relative_errors: Iterable[float]) -> float:
-        floor = self._config.depth_relative_sigma
-        return max(floor, float(np.nanmedian([*depth_relative_errors, floor])))
+    def _prior(self, matches: Matches, proposed: UnitRelativePose | None, history: MotionHistory) -> MotionPrior:
+        """Until the drive has shown how learned depth errs, the proposed motion does."""
+        errors = history.depth_relative_errors
+        if not errors and proposed is not None:
+            errors = (self._depth_relative_error(matches, proposed),)
+        error = usual_error(errors, self._config.depth_relative_sigma)
+        return history.prior(error, float(np.deg2rad(self._config.direction_prior_sigma_deg)))
 
     def _depth_relative_error(self, matches: Matches, unit_pose: UnitRelativePose) -> float:
-        """By how much learned depth differs from that of the corners near their epipolar lines, scale aside."""
+        """Relative error of learned depth against triangulated depth of inlier corners, scale aside."""
         ratios = self._ratios(matches, unit_pose, self._residuals(matches))
         if len(ratios) < _LEAST_POINTS:
             return np.nan
@@ -189,33 +169,31 @@ class TwoViewEstimator(Learner):
     def _residuals(self, matches: Matches) -> Residuals:
         return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
 
-    def _refined(
-        self, matches: Matches, start: UnitRelativePose | None, motion_prior: MotionPrior
-    ) -> TwoViewEstimate | None:
+    def _refined(self, matches: Matches, start: UnitRelativePose | None, prior: MotionPrior) -> TwoViewEstimate | None:
         if start is None:
             return None
 
         def refine() -> Answer:
-            found = self._fitted(matches, start, motion_prior)
+            found = self._fitted(matches, start, prior)
             if found is None:
                 return ()
             return found.unit_pose.R_current_previous, found.unit_pose.direction, found.covariance, found.inliers
 
         settings = repr(
             (
-                motion_prior.depth_relative_error,
-                motion_prior.axis_sigma,
+                prior.depth_relative_error,
+                prior.axis_sigma,
                 self._config.inlier_px,
                 self._config.along_px,
                 self._focal_px,
             )
         )
         corners = (matches.rays_previous, matches.rays_current, matches.depth_previous, matches.weights)
-        begin = (start.R_current_previous, start.direction, motion_prior.axis)
-        known = self._get_or_compute("motion by all", (*corners, *begin, settings), refine)
+        begin = (start.R_current_previous, start.direction, prior.axis)
+        known = self._get_or_compute("two-view refinement", (*corners, *begin, settings), refine)
         return TwoViewEstimate(UnitRelativePose(known[0], known[1]), known[2], known[3].astype(bool)) if known else None
 
-    def _fitted(self, matches: Matches, start: UnitRelativePose, motion_prior: MotionPrior) -> TwoViewEstimate | None:
+    def _fitted(self, matches: Matches, start: UnitRelativePose, prior: MotionPrior) -> TwoViewEstimate | None:
         """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
         Across its epipolar line a corner has the noise of the image, along it that of learned depth.
@@ -231,7 +209,7 @@ class TwoViewEstimator(Learner):
             across, by_motion = residuals.across(unit_pose, tangent)
             along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
             near = np.abs(across) < self._config.inlier_px
-            sigma_along = np.hypot(self._config.along_px, motion_prior.depth_relative_error * shift_px)
+            sigma_along = np.hypot(self._config.along_px, prior.depth_relative_error * shift_px)
             inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
             if inliers.sum() < _LEAST_POINTS:
                 return None
@@ -243,9 +221,9 @@ class TwoViewEstimator(Learner):
             normal[:5, :5] += (weights * by_motion) @ by_motion.T
             gradient = by_all @ (weights_along * along)
             gradient[:5] += by_motion @ (weights * across)
-            astray = unit_pose.direction - np.copysign(1.0, motion_prior.axis @ unit_pose.direction) * motion_prior.axis
-            normal[3:5, 3:5] += np.eye(2) / motion_prior.axis_sigma**2
-            gradient[3:5] += tangent.T @ astray / motion_prior.axis_sigma**2
+            astray = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
+            normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
+            gradient[3:5] += tangent.T @ astray / prior.axis_sigma**2
             step = -_OVERSTEP * np.linalg.solve(normal, gradient)
             if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
                 break
@@ -258,10 +236,10 @@ class TwoViewEstimator(Learner):
         return TwoViewEstimate(unit_pose, lift @ np.linalg.inv(normal)[:5, :5] @ lift.T, inliers)
 
 
-def _support(candidate: TwoViewEstimate, motion_prior: MotionPrior) -> float:
+def _support(candidate: TwoViewEstimate, prior: MotionPrior) -> float:
     """Inliers, less what a motion off the usual axis costs; forwards and backwards are alike."""
-    cosine = abs(float(motion_prior.axis @ candidate.unit_pose.direction))
-    astray = float(np.arccos(min(cosine, 1.0))) / motion_prior.axis_sigma
+    cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
+    astray = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
     return float(candidate.inliers.sum()) - 0.5 * astray**2 / _OUTLIER_COST
 
 

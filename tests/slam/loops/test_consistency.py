@@ -46,7 +46,7 @@ def test_a_loop_alone_needs_to_be_strong() -> None:
 def test_a_loop_that_would_fold_the_drive_is_refused() -> None:
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, ring(), CONFIG)
-    assert kept == [] and all("moves the trajectory by" in r.reason for r in refused)
+    assert kept == [] and all("corrects the odometry by" in r.reason for r in refused)
 
 
 def test_loops_of_one_image_do_not_support_each_other() -> None:

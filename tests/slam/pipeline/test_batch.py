@@ -276,7 +276,7 @@ def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt)
         measured_on=["simulated/600"],
         pairs=99,
     )
-    every, gaps = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "bridge"))
+    every, gaps = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "gaps"))
     pairs = {(f.from_index, f.to_index) for f in every.factors if f.source == "network"}
     assert pairs == {(k, k + 1) for k in range(1, 23)} | {(k, k + 2) for k in range(23)}
     assert len(gaps.factors) < len(every.factors)

@@ -1,0 +1,112 @@
+"""All relative-pose factors of a run, made once from everything that was measured, and the odometry they chain to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from erfsfm.pose_noise import PoseNoise
+from slam.config import FrontendConfig, GeometryConfig
+from slam.frames import Ends, RelativePose, SnippetPoses
+from slam.frontend.network_factors import (
+    NETWORK_SOURCE,
+    calibrated_factors,
+    measured_noise,
+    network_factors,
+    without_measured,
+)
+from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.step_table import StepTable, links
+from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
+from slam.se3 import FloatArray, invert, nearest_rotation
+
+
+@dataclass(frozen=True)
+class Unscaled:
+    """What was measured in the networks' unit: steps of image geometry, the pose network's snippets, gaps."""
+
+    steps: StepTable
+    snippets: Sequence[SnippetPoses]
+    interpolated: Sequence[RelativePose]
+
+
+def make_factors(
+    measured: Unscaled,
+    scale: Scale,
+    lidar_steps: Sequence[RelativePose],
+    noise: PoseNoise | None,
+    frontend: FrontendConfig,
+    geometry: GeometryConfig,
+) -> list[RelativePose]:
+    """All relative poses with their noise, in the unit of the scale.
+
+    Args:
+        measured: in the networks' unit.
+        scale: that unit near each frame, and the lengths of steps.
+        lidar_steps: already in the unit of the scale.
+        noise: of the pose network; None measures it against image geometry on this drive.
+        frontend: which factors of the pose network are used.
+        geometry: noise of image geometry.
+    """
+    geometric = _geometric(measured.steps, scale, geometry)
+    if noise is None:
+        networks = network_factors(measured.snippets, measured_noise(measured.snippets, geometric, frontend))
+    else:
+        networks = calibrated_factors(measured.snippets, geometric, noise, frontend)
+    if frontend.use == "gaps" or (frontend.use == "calibrated" and noise is None):
+        networks = without_measured(networks, geometric)
+
+    def scaled(poses: Sequence[RelativePose]) -> list[RelativePose]:
+        return [pose.scaled(scale.unit_at(pose)) for pose in poses]
+
+    return [*scaled([*networks, *measured.interpolated]), *lidar_steps, *scaled(geometric)]
+
+
+def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
+    """The front end without a graph ``(N, 4, 4)``: each frame by the step of geometry that leads to it, else network.
+
+    Args:
+        factors: in the unit of the scale; of several that lead to a frame from equally near, the last one is taken.
+        T_network: the raw network trajectory, unscaled.
+        scale: of the network's steps.
+    """
+    arriving: dict[int, RelativePose] = {}
+    for factor in factors:
+        first, last = factor.ends
+        if factor.source != NETWORK_SOURCE and (last not in arriving or arriving[last].from_index <= first < last):
+            arriving[last] = factor
+    increments = invert(T_network[:-1]) @ T_network[1:]
+    increments[:, :3, 3] *= scale.per_frame[:-1, None]
+    T_world_camera = np.tile(np.eye(4), (len(T_network), 1, 1))
+    for k in range(1, len(T_network)):
+        step = arriving.get(k)
+        first, T_first_camera = (k - 1, increments[k - 1]) if step is None else (step.from_index, step.T_from_to)
+        T_world_camera[k] = T_world_camera[first] @ T_first_camera
+        T_world_camera[k, :3, :3] = nearest_rotation(T_world_camera[k, :3, :3])
+    return T_world_camera
+
+
+def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[RelativePose]:
+    """Every step of image geometry, unscaled: with its own length where that was measured, else by learned depth."""
+    noise = _step_noise(steps, scale, config)
+    factors = []
+    for ends, motion in steps.motions.items():
+        length = scale.lengths.get(ends)
+        if motion.triangulated is None or length is None:
+            factors.append(motion.relative_pose)
+            continue
+        pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])
+        factors.append(replace(pose, student_t_dof=config.student_t_dof))
+    return factors
+
+
+def _step_noise(steps: StepTable, scale: Scale, config: GeometryConfig) -> Mapping[Ends, StepNoise]:
+    """Noise of the triangulated steps beside the corners' own, by their places in the drive."""
+    motions = steps.triangulated
+    place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
+    T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}
+    own = {n: motions[ends].own_noise for ends, n in place.items()}
+    inflated = inflate_step_sigmas(T_by_place, own, config)
+    return {ends: inflated[n] for ends, n in place.items()}

@@ -1,0 +1,86 @@
+"""Rotations of single steps corrected by relative rotations across several steps.
+
+A corner errs by as much over two steps as over one, and where its window drifts to one side it does so in every step.
+Measured between frames that lie farther apart, the same error is made half as often
+(``docs/design/visual-front-end.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.linalg import spsolve
+from scipy.spatial.transform import Rotation
+
+from slam.frames import Ends
+from slam.frontend.step_table import StepTable, path_between, shortest_by_start
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.se3 import FloatArray, invert
+
+# sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
+_STEP_WIDENING = 3.0
+_ITERATIONS = 4
+_OUTLIER_SIGMAS = 3.0
+_BLOCK = np.arange(9)
+
+
+def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRotation]) -> StepTable:
+    """The table with the rotations that explain single steps and relative rotations best, robustly.
+
+    Least squares over one small rotation for each triangulated step, in its current camera. The error of a relative
+    rotation is the sum of those of its steps, each seen from its last camera.
+
+    Args:
+        table: of all steps.
+        relative_rotations: those with a step that is not triangulated are not used.
+    """
+    motions = table.triangulated
+    by_start = shortest_by_start(motions)
+    paths = [(rotation, path_between(by_start, *rotation.ends)) for rotation in relative_rotations]
+    usable = [(rotation, path) for rotation, path in paths if path]
+    if not usable:
+        return table
+    A, target = _equations(motions, usable)
+    # relative rotations that overlap share their images: as many as overlap count as one
+    overlapping = max(len(path) for _, path in usable)
+    sigmas = np.concatenate([motion.relative_pose.sigmas[:3] for motion in motions.values()])
+    own = 1.0 / (_STEP_WIDENING * sigmas) ** 2
+    prior = coo_array((own, (np.arange(len(own)),) * 2)).tocsr()
+    correction = np.zeros(len(own))
+    for _ in range(_ITERATIONS):
+        residual = np.linalg.norm((A @ correction - target).reshape(-1, 3), axis=1)
+        weights = np.repeat(1.0 / (1.0 + (residual / _OUTLIER_SIGMAS) ** 2), 3) / overlapping
+        weighted = A.multiply(weights[:, None]).T.tocsr()
+        correction = np.atleast_1d(spsolve((weighted @ A + prior).tocsc(), weighted @ target))
+    small = Rotation.from_rotvec(correction.reshape(-1, 3)).as_matrix()
+    return table.replaced(
+        {ends: motion.with_rotation(R @ _rotation(motion)) for R, (ends, motion) in zip(small, motions.items())}
+    )
+
+
+def _equations(
+    motions: Mapping[Ends, Motion], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
+) -> tuple[csr_array, FloatArray]:
+    """Whitened rows of all relative rotations over the steps' corrections, and what they should come to."""
+    place = {ends: 3 * n for n, ends in enumerate(motions)}
+    rows, columns, entries, target = [], [], [], []
+    for n, (rotation, path) in enumerate(usable):
+        R_last_step = np.eye(3)
+        for ends in reversed(path):
+            rows.append(3 * n + _BLOCK // 3)
+            columns.append(place[ends] + _BLOCK % 3)
+            entries.append((R_last_step / rotation.sigmas[:, None]).ravel())
+            R_last_step = R_last_step @ _rotation(motions[ends])
+        target.append(Rotation.from_matrix(rotation.R_to_from @ R_last_step.T).as_rotvec() / rotation.sigmas)
+    shape = 3 * len(usable), 3 * len(motions)
+    A = coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+    return A.tocsr(), np.concatenate(target)
+
+
+def _rotation(motion: Motion) -> FloatArray:
+    """``R_current_previous`` of a step."""
+    R: FloatArray = invert(motion.relative_pose.T_from_to)[:3, :3]
+    return R

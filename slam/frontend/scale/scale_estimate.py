@@ -1,0 +1,95 @@
+"""The scale of learned depth: from ground planes at a known camera height, or from a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.config import ScaleConfig, ScaleMode
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.robust import mad_sigma
+from slam.se3 import FloatArray
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """``value`` times an unscaled length is a length in the mode's unit.
+
+    ``spread`` is the relative sigma of the single frames' values.
+    """
+
+    value: float
+    spread: float
+    frames_used: int
+
+
+def resolve_mode(config: ScaleConfig, camera_height_m: float | None) -> ScaleMode:
+    """The mode that ``auto`` stands for: camera-height where the height is known, else none."""
+    if config.mode != "auto":
+        return config.mode
+    return "none" if camera_height_m is None else "camera-height"
+
+
+def scale_from_road(
+    roads: Sequence[GroundPlane | MeasurementFailure], camera_height_m: float | None, config: ScaleConfig
+) -> ScaleEstimate | MeasurementFailure:
+    """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
+    height = 1.0 if camera_height_m is None else camera_height_m
+    ratios = [height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
+    return estimate_scale(np.array(ratios), config)
+
+
+def scale_from_reference(
+    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray, config: ScaleConfig
+) -> ScaleEstimate | MeasurementFailure:
+    """True path length over estimated path length of the first ``reference_frames`` frames."""
+    estimated, true = (
+        np.linalg.norm(np.diff(T[: config.reference_frames, :3, 3], axis=0), axis=1)
+        for T in (T_world_camera_unscaled, T_world_camera_true)
+    )
+    if estimated.sum() <= 0 or true.sum() <= 0:
+        return MeasurementFailure(f"the camera does not move within the first {config.reference_frames} frames")
+    value = float(true.sum() / estimated.sum())
+    moving = estimated > 0.1 * estimated.mean()
+    spread = float(np.std(true[moving] / estimated[moving] / value))
+    return ScaleEstimate(value, spread, len(estimated) + 1)
+
+
+def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
+    """One scale from a ratio per frame ``(K,)``: their median, frames many MADs away left out."""
+    ratios = np.asarray(ratios, dtype=np.float64)
+    ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
+    if len(ratios) < config.min_frames:
+        return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {config.min_frames} are needed")
+    logarithms = np.log(ratios)
+    deviations = np.abs(logarithms - np.median(logarithms))
+    kept = logarithms[deviations <= config.rejection_mads * mad_sigma(deviations) + 1e-12]
+    spread = mad_sigma(kept - np.median(kept))
+    return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
+
+
+def scale_track(
+    roads: Sequence[GroundPlane | MeasurementFailure],
+    camera_height_m: float | None,
+    estimate: ScaleEstimate,
+    config: ScaleConfig,
+) -> FloatArray:
+    """The scale near each frame ``(N,)``: a running median of the road's ratios.
+
+    Learned depth breathes: its unit wanders along a drive. Where ``smoothing_frames`` around a frame hold
+    too few usable roads, the estimate of the whole drive stands in.
+    """
+    height = 1.0 if camera_height_m is None else camera_height_m
+    ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
+    bound = config.rejection_mads * max(estimate.spread, 0.02)
+    ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
+    half = config.smoothing_frames // 2
+    track = np.full(len(ratios), estimate.value)
+    for k in range(len(ratios)):
+        near = ratios[max(k - half, 0) : k + half + 1]
+        if np.isfinite(near).sum() >= config.min_frames:
+            track[k] = np.nanmedian(near)
+    return track

@@ -1,0 +1,93 @@
+"""A motion measured by optical flow: a relative pose whose length may come from elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam.frames import Ends, RelativePose
+from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.step_noise import StepNoise
+from slam.se3 import FloatArray, invert, make
+
+_LEAST_RELATIVE_SIGMA = 1e-3
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A measured ``relative_pose``, its length by learned depth, unscaled.
+
+    Where corners alone gave rotation and direction, ``triangulated`` holds the points that they triangulated and
+    ``direction_sigmas`` ``(3,)`` the noise of the direction in the later camera, radians; else both are None.
+    """
+
+    relative_pose: RelativePose
+    triangulated: TriangulatedPoints | None = None
+    direction_sigmas: FloatArray | None = None
+
+    @property
+    def ends(self) -> Ends:
+        """Both frames."""
+        return self.relative_pose.ends
+
+    @property
+    def length_unscaled(self) -> float:
+        """Length of the translation, in the unit of learned depth."""
+        return float(np.linalg.norm(self.relative_pose.T_from_to[:3, 3]))
+
+    @property
+    def own_noise(self) -> StepNoise:
+        """Sigmas of rotation and direction by the corners' own covariance.
+
+        Raises:
+            ValueError: it has no direction apart from its length.
+        """
+        if self.direction_sigmas is None:
+            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
+        return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
+
+    def with_rotation(self, R_current_previous: FloatArray) -> Motion:
+        """The same translation seen from the current camera, with another rotation ``(3, 3)``."""
+        T_current_previous = make(R_current_previous, invert(self.relative_pose.T_from_to)[:3, 3])
+        return replace(self, relative_pose=replace(self.relative_pose, T_from_to=invert(T_current_previous)))
+
+    def with_length(
+        self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise
+    ) -> RelativePose:
+        """The same rotation and direction with another length, and noise beside the corners' own.
+
+        Args:
+            length: in the unit wanted.
+            relative_sigma: of the length.
+            relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
+            noise: of rotation and direction, added in squares to the corners' own.
+        """
+        own = self.own_noise
+        T_previous_current = self.relative_pose.T_from_to.copy()
+        T_previous_current[:3, 3] *= length / self.length_unscaled
+        rotation, direction = np.hypot(own.rotation, noise.rotation), np.hypot(own.direction, noise.direction)
+        sigmas, correlated_sigmas = (
+            pose_sigmas(T_previous_current, rotation, direction, sigma)
+            for sigma in (relative_sigma, relative_correlated_sigma)
+        )
+        return replace(
+            self.relative_pose, T_from_to=T_previous_current, sigmas=sigmas, correlated_sigmas=correlated_sigmas
+        )
+
+
+def pose_sigmas(
+    T_previous_current: FloatArray, rotation: FloatArray, direction: FloatArray, length_relative_sigma: float
+) -> FloatArray:
+    """Sigmas ``(6,)`` of a pose in the current camera, where GTSAM perturbs.
+
+    Args:
+        T_previous_current: the pose ``(4, 4)``.
+        rotation: sigmas ``(3,)``, radians.
+        direction: sigmas of the direction ``(3,)``, radians.
+        length_relative_sigma: of the length.
+    """
+    along = np.abs(invert(T_previous_current)[:3, 3])
+    length = float(np.linalg.norm(along))
+    translation = np.hypot(length * direction, length_relative_sigma * along)
+    return np.concatenate([rotation, np.maximum(translation, _LEAST_RELATIVE_SIGMA * length)])

@@ -1,0 +1,116 @@
+"""What one pass over the frames of a sequence measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from slam.config import MappingConfig
+from slam.frames import DepthMap, Ends, Frame, Image, SnippetPoses
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.gap_interpolation import InterpolatedGaps
+from slam.frontend.scale.road_homography import RoadStep
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.loops.descriptors import View
+from slam.storage.spill import SpilledArray, SpillFile
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What fusion needs of a frame, thinned, on disk until then."""
+
+    index: int
+    spilled_image: SpilledArray
+    spilled_depth: SpilledArray
+
+    @classmethod
+    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile, config: MappingConfig) -> Keyframe:
+        """Thin a frame and its depth ``(H, W)`` to about ``width_px`` and spill both."""
+        height, width = depth_unscaled.shape
+        ratio = min(config.width_px / width, 1.0)
+        image, depth = frame.image, depth_unscaled
+        if ratio < 1.0:
+            size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
+            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return cls(frame.index, spill_file.put(image), spill_file.put(depth))
+
+    @property
+    def image(self) -> Image:
+        """``(h, w, 3)``."""
+        return self.spilled_image.read()
+
+    @property
+    def depth_unscaled(self) -> DepthMap:
+        """``(h, w)``."""
+        return self.spilled_depth.read()
+
+
+@dataclass
+class Observations:
+    """Measurements in the networks' unit of length, collected frame by frame.
+
+    ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
+    ``relative_rotations`` the rotations across several steps; ``failures`` says of which steps there is nothing and
+    why. ``unusable`` are frames that measured nothing and why, ``repeated`` those with the image of the one before.
+    """
+
+    snippets: list[SnippetPoses] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
+    relative_rotations: list[RelativeRotation] = field(default_factory=list)
+    failures: list[tuple[int, int, str]] = field(default_factory=list)
+    roads: list[GroundPlane | MeasurementFailure] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
+    examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
+    unusable: dict[int, str] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ClosedObservations:
+    """The observations of a pass with its gaps interpolated; nothing of interpolated frames is left but their steps."""
+
+    roads: list[GroundPlane | MeasurementFailure]
+    road_steps: dict[Ends, RoadStep]
+    relative_rotations: list[RelativeRotation]
+    views: list[View]
+    keyframes: list[Keyframe]
+    examples: list[tuple[int, Image, DepthMap]]
+    failures: list[tuple[int, int, str]]
+    gaps: InterpolatedGaps
+
+    @classmethod
+    def of(cls, seen: Observations, gaps: InterpolatedGaps) -> ClosedObservations:
+        """Leave out what was seen on interpolated frames."""
+        return cls(
+            seen.roads,
+            seen.road_steps,
+            seen.relative_rotations,
+            [view for view in seen.views if view.index not in gaps.frames],
+            [keyframe for keyframe in seen.keyframes if keyframe.index not in gaps.frames],
+            seen.examples,
+            seen.failures,
+            gaps,
+        )
+
+    @property
+    def snippets(self) -> list[SnippetPoses]:
+        """One a target, in time order."""
+        return self.gaps.snippets
+
+    @property
+    def steps(self) -> StepTable:
+        """Steps of image geometry."""
+        return self.gaps.steps
+
+    @property
+    def interpolated(self) -> dict[int, str]:
+        """Interpolated frames, and why."""
+        return self.gaps.frames

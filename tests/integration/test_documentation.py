@@ -8,6 +8,7 @@ the workspace or a line to one of the two tables.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shlex
@@ -69,9 +70,10 @@ SLOW = (
 NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^make ", "it sets up, lints or starts these very tests"),
     (r"^pip install ", "it downloads"),
-    (r"--rerun ", "it needs the extra 'rerun'; tests/slam/results/test_rerun.py has a stand-in"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
+if importlib.util.find_spec("rerun") is None:
+    NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
 
 
 @dataclass(frozen=True)

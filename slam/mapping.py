@@ -67,9 +67,8 @@ class TsdfMap:
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         self._config = config
         self._size = (intrinsics.height, intrinsics.width)
-        self._step = max(1, round(intrinsics.width / config.width_px))
-        self._intrinsics = _thinned(intrinsics, self._step)
-        self._rays = _rays(self._intrinsics)
+        self._intrinsics = intrinsics
+        self._rays = _rays(intrinsics)
         self._grid = self._new_grid()
         self._previous: _View | None = None
         self._first_is_fused = False
@@ -168,10 +167,8 @@ class TsdfMap:
         )
 
     def _view(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> _View:
-        start, step = self._step // 2, self._step
-        depth = np.ascontiguousarray(depth[start::step, start::step], dtype=np.float32)
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-        return _View(depth, image[start::step, start::step], T_world_camera)
+        known = np.isfinite(depth) & (depth > 0)
+        return _View(np.where(known, depth, np.float32(0)).astype(np.float32), image, T_world_camera)
 
     def _is_keyframe(self, view: _View, previous: _View) -> bool:
         T_previous_camera = invert(previous.T_world_camera) @ view.T_world_camera
@@ -251,20 +248,11 @@ class TsdfMap:
 
 @dataclass(frozen=True)
 class _View:
-    """A thinned frame: depth ``(H, W)`` with 0 where unknown, its image and pose."""
+    """A frame: depth ``(H, W)`` with 0 where unknown, its image and pose."""
 
     depth: DepthMap
     image: Image
     T_world_camera: FloatArray
-
-
-def _thinned(intrinsics: Intrinsics, step: int) -> Intrinsics:
-    """The camera of every ``step``-th row and column, from ``step // 2`` on."""
-    start = step // 2
-    width = len(range(start, intrinsics.width, step))
-    height = len(range(start, intrinsics.height, step))
-    cx, cy = (intrinsics.cx - start) / step, (intrinsics.cy - start) / step
-    return Intrinsics(width, height, intrinsics.fx / step, intrinsics.fy / step, cx, cy)
 
 
 def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:

@@ -49,7 +49,7 @@ CORNER_CORRELATION = 2.0
 class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
-    ``weights`` ``(M,)`` in (0, 1] say how far each is to be believed.
+    ``weights`` ``(M,)`` in (0, 1] are lower where objects move by themselves.
     """
 
     rays_previous: FloatArray

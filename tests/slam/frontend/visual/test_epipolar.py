@@ -93,7 +93,7 @@ def test_parallax_is_what_the_rotation_leaves() -> None:
     turned = previous @ UNIT_POSE.R_current_previous.T
     turned /= turned[:, 2:]
     assert parallax_px(previous, turned, UNIT_POSE.R_current_previous, camera).max() < 1e-9
-    shifted = turned + [3.0 / FOCAL_PX, 4.0 / FOCAL_PX, 0.0]
+    shifted = turned + np.array([3.0, 4.0, 0.0]) / FOCAL_PX
     np.testing.assert_allclose(parallax_px(previous, shifted, UNIT_POSE.R_current_previous, camera), 5.0)
 
 

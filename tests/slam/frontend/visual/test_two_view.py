@@ -35,7 +35,7 @@ def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int =
 def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> tuple[Matches, np.ndarray]:
     """``Matches`` of a camera that turns behind a car that turns with it, and the true ``T_current_previous``.
 
-    The first ``CAR`` corners are the car's and stand still in the image; the relative error of learned depth is ``error``.
+    The first ``CAR`` corners are the car's and stand still in the image; ``error`` is that of learned depth, relative.
     """
     rng = np.random.default_rng(seed)
     T_current_previous = se3.from_rotation_vector(np.deg2rad([0.0, -turn_deg, 0.0]), np.array([0.05, 0.0, -0.7]))

@@ -58,7 +58,7 @@ def test_sigmas_are_how_far_refined_cameras_err() -> None:
         turned = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
         whitened.append(np.concatenate([turned, shift]) / resection.sigmas)
     rms = np.sqrt(np.square(whitened).mean(axis=0))
-    assert ((0.7 < rms) & (rms < 1.4)).all(), rms
+    assert (rms > 0.7).all() and (rms < 1.4).all(), rms
 
 
 def test_perfect_pixels_keep_positive_sigmas() -> None:

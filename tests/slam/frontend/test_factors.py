@@ -88,7 +88,7 @@ def test_everything_measured_becomes_a_factor_in_the_unit_of_the_scale() -> None
 
 
 def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
-    """Learned depth makes every step three times too long; steps of one frame and of three have lengths of their own."""
+    """Learned depth makes every step three times too long; a step of one frame and one of three have own lengths."""
     wrong = drive(3.0 / METRES)
     lengths = {(0, 1): np.linalg.norm(pose(0, 1).T_from_to[:3, 3]), (2, 5): np.linalg.norm(pose(2, 5).T_from_to[:3, 3])}
     unscaled = {ends: float(length) / METRES for ends, length in lengths.items()}

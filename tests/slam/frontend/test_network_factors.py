@@ -264,7 +264,7 @@ def test_correlated_errors_get_larger_sigmas_in_the_graph():
         )
         for distance in (1, 2)
     }
-    # pairs of both distances measure the same twice; equal errors of a hundred steps add up to ten times independent ones
+    # pairs of both distances measure the same twice; a hundred equal errors add up to ten times independent ones
     assert longer[1][0] == pytest.approx(np.sqrt(2), rel=0.3)
     assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
     assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,6 +114,17 @@ def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
     assert scale.estimate.frames_used == len(steps)
     unscaled = find("camera-height", measured(road=False, planes=False, steps=steps))
     assert_lengths(unscaled, {ends: UNIT * metres(ends) for ends in steps}, rtol=1e-6)
+
+
+def test_lengths_are_unscaled_by_the_unit_at_their_first_frames():
+    """The unit of learned depth drifts by a tenth; lengths by it alone are those of the motions."""
+    steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
+    drifting = np.linspace(1.0, 1.1, FRAMES)
+    planes = [GroundPlane(HEIGHT_M * UNIT / unit, DOWN, 1.0) for unit in drifting]
+    scale = find("camera-height", replace(measured(road=False, steps=steps), planes=planes))
+    assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
+    for ends in steps:
+        assert scale.lengths[ends].value == pytest.approx(UNIT * metres(ends), rel=1e-4)
 
 
 def test_a_step_inside_of_a_longer_one_is_no_link_and_has_no_length():

@@ -137,11 +137,41 @@ def test_the_history_of_a_drive_chooses_between_motions():
     assert (with_history < 0.3).sum() > (without < 0.3).sum() and (with_history < 0.3).mean() > 0.9
 
 
+def test_a_step_is_learned_as_measured_and_returned_as_fused():
+    """The heading prior must not learn from its own predictions."""
+    history = NO_HISTORY
+    for k in range(30):
+        ahead = UnitRelativePose(np.eye(3), np.array([0.07 + 0.01 * (-1) ** k, 0.0, -1.0]) / np.hypot(0.07, 1.0))
+        history = history.with_step(ahead, 1e-4 * np.eye(6), ahead, 0.15)
+    found = TwoViewEstimator(CONFIG, FOCAL_PX).estimate(corner_with_a_car(0, error=0.05)[0], history)
+    assert found is not None
+    estimate, after = found
+    assert after.last is estimate.unit_pose
+    assert np.abs(after.directions[-1] - estimate.unit_pose.direction).max() > 1e-5
+    np.testing.assert_array_equal(after.directions[-1], after.heading_prior.directions[-1])
+
+
 def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
+    """In both consensus methods; a seed is part of what their cached answers depend on."""
     matches, _ = corner_with_a_car(3)
-    rotations = [estimated(matches, seed=seed).unit_pose.R_current_previous.tobytes() for seed in (1, 1, 2, 3)]
-    assert rotations[0] == rotations[1]
-    assert len(set(rotations)) > 1
+
+    def drawn(seed: int) -> dict[str, tuple[bytes, str]]:
+        answers = {}
+
+        def record(kind, given, compute):
+            answer = compute()
+            if kind.startswith("motion by"):
+                answers[kind] = b"".join(each.tobytes() for each in answer), given[-1]
+            return answer
+
+        assert TwoViewEstimator(CONFIG, FOCAL_PX, record, seed).estimate(matches, NO_HISTORY) is not None
+        return answers
+
+    assert drawn(1) == drawn(1)
+    draws = [drawn(seed) for seed in range(4)]
+    for kind in ("motion by essential matrix", "motion by PnP"):
+        poses, settings = zip(*(draw[kind] for draw in draws), strict=True)
+        assert len(set(poses)) > 1 and len(set(settings)) == 4
 
 
 def test_nothing_in_common_is_no_motion():

@@ -117,7 +117,7 @@ def test_noise_measured_beside_the_weights_keeps_every_pair() -> None:
 
 
 def network_trajectory() -> FloatArray:
-    """Unscaled, and turned the wrong way, so that its steps can be told."""
+    """Unscaled, and turned the wrong way, so that its steps can be recognised."""
     turns = np.tile([0.0, -0.1, 0.0], (FRAMES - 1, 1))
     return chain(from_rotation_vector(turns, np.tile([0.0, 0.0, 0.5], (FRAMES - 1, 1))))
 

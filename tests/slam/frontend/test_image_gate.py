@@ -1,4 +1,4 @@
-"""Images of a street pass whatever their light; blank, noisy, frozen and upside-down ones are told."""
+"""Images of a street pass whatever their light; blank, noisy, frozen and upside-down ones are detected."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
     almost[0, 0, 0] ^= 1
     assert verdicts([first, second, second.copy(), second]) == ["new", "new", "repeated", "repeated"]
     assert verdicts([first, almost, second]) == ["new", "new", "repeated"]  # a bit is no motion
-    assert verdicts([second, almost]) == ["new", "new"]  # nothing tells yet that the camera moved
+    assert verdicts([second, almost]) == ["new", "new"]  # the camera has not moved yet
 
 
 @pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
@@ -105,14 +105,14 @@ def test_ten_copies_encoded_again_are_repetitions_and_the_drive_goes_on(hazards:
     assert found == ["new"] * (first + 1) + ["repeated"] * 10 + ["new"] * (len(images) - first - 11)
 
 
-def test_copies_are_told_where_every_image_is_compressed() -> None:
+def test_copies_are_detected_where_every_image_is_compressed() -> None:
     images = [jpeg(image, 75) for image in street()]
     frozen = [jpeg(street()[9], quality) for quality in QUALITIES]
     assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 10
     assert set(verdicts(images)) == {"new"}
 
 
-def test_a_freeze_of_a_slow_camera_is_told() -> None:
+def test_a_freeze_of_a_slow_camera_is_detected() -> None:
     """At two pixels a frame; the drive goes on where the camera is by then."""
     images = panned(2.0 * np.arange(40))
     frozen = [jpeg(images[9], quality) for quality in QUALITIES]
@@ -157,7 +157,7 @@ def test_a_gate_goes_on_from_its_state() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["00", "02", "05"])
-def test_freezes_and_flips_are_told_on_real_frames(data_root, name: str) -> None:
+def test_freezes_and_flips_are_detected_on_real_frames(data_root, name: str) -> None:
     folder = data_root / "kitti_odometry" / "sequences" / name / "image_0"
     images = [cv2.imread(str(path)) for path in sorted(folder.iterdir())[:60]]
     assert set(verdicts(images)) == {"new"}

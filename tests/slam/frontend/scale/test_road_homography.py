@@ -122,7 +122,7 @@ def test_the_answer_is_the_same_every_time(texture):
 
 
 def test_directions_of_motion_are_kept_by_a_state(texture):
-    """A camera that looks down by 3 degrees learns its pitch; one that goes on from its state knows it."""
+    """A camera that looks down by 3 degrees learns its pitch, and its state keeps it."""
     T_body_camera = pitched(-3.0)
     T_step = se3.invert(T_body_camera) @ se3.make(np.eye(3), np.array([0.0, 0.0, 1.0])) @ T_body_camera
     frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])) @ T_body_camera, texture, k) for k in range(3)]

@@ -148,7 +148,7 @@ def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
 
 
 def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same motion ``(..., 4, 4)`` seen in a mirror, x turned round."""
+    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
     mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
     return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)
 

@@ -46,7 +46,7 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
     Args:
         disparity: inverse depth ``(B, 1, H, W)``, positive.
         bounds: of the same size.
-        log_scale: by which the disparity is larger than the measured unit says, ``(B, 1, 1, 1)``.
+        log_scale: logarithm of the disparity's scale over the measured one, ``(B, 1, 1, 1)``.
     """
     has_most = torch.isfinite(bounds.most)
     said = disparity.log() - log_scale

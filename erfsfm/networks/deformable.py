@@ -192,7 +192,7 @@ def _sampling_grid(offset: Tensor, rows: Tensor, columns: Tensor, size: tuple[in
 
 
 def _suits_kernel(input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | None) -> bool:
-    """Whether the compiled path knows the case and gains by it; anything that traces must see PyTorch alone."""
+    """Whether the compiled path supports the case and is faster; tracing needs the PyTorch path."""
     if torch.jit.is_tracing() or torch.compiler.is_compiling():  # type: ignore[attr-defined]
         return False
     taps = weight.shape[2] * weight.shape[3]
@@ -208,7 +208,7 @@ def _suits_kernel(input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | 
 
 @functools.cache
 def _compiled_kernel() -> ModuleType | None:
-    """The compiled path, or None where Numba cannot be used; says once which it is."""
+    """The compiled path, or None where Numba cannot be used; logs once which it is."""
     try:
         from erfsfm.networks import deformable_kernel
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""How much of the image a network's encoder sees, and what a forward pass costs.
+"""Receptive fields of networks' encoders, and the cost of a forward pass.
 
 The paper compares its networks by the field of one pixel of the last encoder layer (its figure 4).
 """

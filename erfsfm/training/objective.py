@@ -23,7 +23,7 @@ from erfsfm.losses.regularisation import (
 )
 from erfsfm.losses.structure import Bounds, outside, translation_disagreement
 
-HEIGHTS = 10.0  # unit of depth under a teacher, in camera heights: steps are then hundredths, like a fresh pose network's outputs
+HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are hundredths, like fresh outputs
 
 
 @dataclass(frozen=True)

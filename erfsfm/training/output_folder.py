@@ -73,7 +73,7 @@ class OutputFolder:
         write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
 
     def _has_our_config(self) -> bool:
-        """Whether ``config.yaml`` is what `write_config` writes: all keys in its order, unlike a file written by hand."""
+        """Whether ``config.yaml`` is what `write_config` writes: all keys, in its order."""
         try:
             return dump_yaml(load_experiment(self.path / CONFIG)) == (self.path / CONFIG).read_text()
         except ConfigError:

@@ -205,6 +205,10 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
             "or train without validation by data.validation=[]"
         )
+    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
+    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
+    if absent:
+        logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training, config), _without_stops(validation, config)
 
 

@@ -149,7 +149,7 @@ def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
 
 
 def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same motion ``(..., 4, 4)`` seen in a mirror, x turned round."""
+    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
     mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
     return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)
 
@@ -207,6 +207,10 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
             "or train without validation by data.validation=[]"
         )
+    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
+    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
+    if absent:
+        logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training, config), _without_stops(validation, config)
 
 

@@ -55,6 +55,28 @@ def coded(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["folder/b"], []),
+        (["folder/b", "folder/c"], ["data.validation names folder/c, which is not among the data"]),
+    ],
+)
+def test_a_validation_that_is_partly_absent_is_said(
+    coded: Path, names: list[str], said: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    _, validation = split_recordings(DataConfig(roots=[coded / "a", coded / "b"], validation=names))
+    assert [recording.name for recording in validation] == ["folder/b"]
+    assert [record.message for record in caplog.records] == said
+
+
+def test_only_the_default_may_name_nothing_to_validate_on(coded: Path) -> None:
+    assert split_recordings(DataConfig(roots=[coded / "a"]))[1] == []
+    assert split_recordings(DataConfig(roots=[coded / "a"], validation=[]))[1] == []
+    with pytest.raises(DataError, match=r"nothing to validate on: .* name folder/c; found folder/a; name one"):
+        split_recordings(DataConfig(roots=[coded / "a"], validation=["folder/c"]))
+
+
 def frames_of(sample: dict[str, Tensor]) -> list[int]:
     """Frame numbers in time order of a sample of ``coded``."""
     colours = [*sample["sources"][:, 0].mean(dim=(1, 2))]

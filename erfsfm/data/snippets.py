@@ -192,7 +192,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     for recording in found:
         validation += _parts(recording, held_out)
         forbidden = [*never, *scenes] if recording.name.startswith("kitti_raw/") else never
-        for part in _parts(recording, ranges) or (_parts(recording, listed) if listed else [recording]):
+        for part in _chosen(recording, ranges, listed):
             if not overlapping([part.frames_name], forbidden):
                 training.append(part)
     if not training:
@@ -218,6 +218,14 @@ def _some(names: Sequence[str]) -> str:
     """Names for an error: each once, and the first few of many."""
     distinct = list(dict.fromkeys(names))
     return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
+
+
+def _chosen(recording: Recording, ranges: Sequence[FrameRange], listed: Sequence[FrameRange]) -> list[Recording]:
+    """What to train on of a recording: its ranges, else what the split lists of it, else all where there is no list."""
+    for spans in (ranges, listed):
+        if any(span.counted_in(recording.name) is not None for span in spans):
+            return _parts(recording, spans)
+    return [] if listed else [recording]
 
 
 def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:

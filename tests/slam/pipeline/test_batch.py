@@ -1,4 +1,4 @@
-"""The system on a drive whose truth is known, driven by an oracle: no networks, and mostly no pictures."""
+"""The whole system on sequences with known poses, driven by an oracle in place of networks, mostly without images."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ NO_NOISE = OracleNoise()
 NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false")
 
 
-class SessionCheckpoint:
-    """A camera on a level road: poses and depth are exact, the images show nothing."""
+class LevelRoad:
+    """A sequence of a camera on a level road: poses and depth are exact, the images show nothing."""
 
     def __init__(self, T_world_camera: FloatArray, image: Image | None = None) -> None:
         self.name = "drive"
@@ -42,14 +42,14 @@ class SessionCheckpoint:
         self.reference: FloatArray | None = T_world_camera
         self.camera_height_m: float | None = HEIGHT_M
         self.T_camera_lidar: FloatArray | None = None
-        self.read = 0
+        self.frames_read = 0
         self._image = np.full((32, 104, 3), 90, np.uint8) if image is None else image
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        self.read += 1
+        self.frames_read += 1
         return Frame(index, float(self.stamps[index]), self._image)
 
     def scan_path(self, index: int) -> Path | None:
@@ -75,7 +75,7 @@ def road(index: int) -> FloatArray:
     return np.repeat(depth[:, None], 104, axis=1)
 
 
-def run(drive: SessionCheckpoint, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
+def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
     assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
@@ -86,7 +86,7 @@ def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
 
 
 def test_exact_answers_give_the_truth() -> None:
-    drive = SessionCheckpoint(turning(60))
+    drive = LevelRoad(turning(60))
     result = run(drive)
     for each in (result.network, result.odometry, result.optimised, result.reference):
         assert each is not None and len(each) == 60
@@ -97,7 +97,7 @@ def test_exact_answers_give_the_truth() -> None:
     np.testing.assert_allclose(result.network.positions, FACTOR * turning(60)[:, :3, 3], atol=1e-9)
     for each in (result.odometry, result.optimised):
         np.testing.assert_allclose(each.T_world_camera, turning(60), atol=1e-3)
-    assert result.map is None and result.observations.geometric == []
+    assert result.map is None and len(result.observations.steps) == 0
     assert len(result.observations.snippets) == 56 and len(result.factors) == 4 * 56
 
 
@@ -105,7 +105,7 @@ def test_noise_is_cut_by_the_graph() -> None:
     before, after = [], []
     for seed in range(5):
         noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=seed)
-        result = run(SessionCheckpoint(turning(100)), noise=noise)
+        result = run(LevelRoad(turning(100)), noise=noise)
         before.append(ate(result.network, result.reference))
         after.append(ate(result.optimised, result.reference))
     assert np.mean(after) < 0.7 * np.mean(before)
@@ -113,7 +113,7 @@ def test_noise_is_cut_by_the_graph() -> None:
 
 def test_a_unit_that_wanders_is_brought_back_by_the_road() -> None:
     noise = OracleNoise(scale_drift_sigma=0.03)
-    result = run(SessionCheckpoint(turning(200)), "scale.smoothing_frames=11", noise=noise)
+    result = run(LevelRoad(turning(200)), "scale.smoothing_frames=11", noise=noise)
     wandered = result.network.length_m / FACTOR / turning_length(200)
     assert abs(np.log(wandered)) > 0.1
     assert result.optimised.length_m == pytest.approx(turning_length(200), rel=0.03)
@@ -129,7 +129,7 @@ def turning_length(frames: int) -> float:
 )
 def test_scale_modes(mode: str, unit_m: float) -> None:
     """``none`` measures in camera heights, the others in metres."""
-    result = run(SessionCheckpoint(turning(30)), f"scale.mode={mode}")
+    result = run(LevelRoad(turning(30)), f"scale.mode={mode}")
     assert result.scale.mode == ("camera-height" if mode == "auto" else mode)
     assert result.optimised.length_m * unit_m == pytest.approx(turning_length(30), rel=1e-4)
     assert not isinstance(result.scale.estimate, MeasurementFailure)
@@ -137,7 +137,7 @@ def test_scale_modes(mode: str, unit_m: float) -> None:
 
 
 def test_auto_without_a_height_is_none() -> None:
-    drive = SessionCheckpoint(turning(30))
+    drive = LevelRoad(turning(30))
     drive.camera_height_m = None
     assert run(drive).scale.mode == "none"
 
@@ -152,23 +152,23 @@ def test_auto_without_a_height_is_none() -> None:
     ],
 )
 def test_what_cannot_work_is_refused_before_any_work(frames: int, mode: str, words: str) -> None:
-    drive = SessionCheckpoint(turning(frames))
+    drive = LevelRoad(turning(frames))
     oracle = OraclePredictor(turning(frames), road)
     drive.reference = drive.camera_height_m = None
     pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, f"scale.mode={mode}"]))
     with pytest.raises(SlamError, match=words) as refused:
         pipeline.run()
     assert "\n" not in str(refused.value)
-    assert drive.read == 0
+    assert drive.frames_read == 0
 
 
 def test_one_snippet_is_enough() -> None:
-    result = run(SessionCheckpoint(turning(5)))
+    result = run(LevelRoad(turning(5)))
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(5), atol=1e-3)
 
 
 def test_without_a_road_lengths_stay_unscaled_and_say_why() -> None:
-    result = run(SessionCheckpoint(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
+    result = run(LevelRoad(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
     assert isinstance(result.scale.estimate, MeasurementFailure) and "0 frames" in result.scale.estimate.reason
     np.testing.assert_array_equal(result.scale.per_frame, 1.0)
     assert result.optimised.length_m == pytest.approx(FACTOR * turning_length(20), rel=1e-3)
@@ -181,7 +181,7 @@ def speckled() -> Image:
 
 @pytest.mark.parametrize("mode", ["camera-height", "reference"])
 def test_standing_still(mode: str) -> None:
-    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+    still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
     metrics = trajectory_metrics(result.optimised, result.reference)
@@ -191,19 +191,19 @@ def test_standing_still(mode: str) -> None:
 
 
 def test_images_that_do_not_change_hold_a_restless_network() -> None:
-    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+    still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
     result = run(still, *options, noise=noise)
-    assert {factor.source for factor in result.observations.geometric} == {STILL_SOURCE}
+    assert {factor.source for factor in result.observations.steps.relative_poses} == {STILL_SOURCE}
     turned = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
     assert turned[1] < 0.3 * turned[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
 def test_images_without_corners_refuse_the_geometry_and_the_network_goes_on() -> None:
-    result = run(SessionCheckpoint(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
-    assert result.observations.geometric == []
+    result = run(LevelRoad(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
+    assert len(result.observations.steps) == 0
     pairs = [(first, second) for first, second, _ in result.observations.failures]
     assert sorted(pairs) == sorted([(k, k + 1) for k in range(19)] + [(k, k + 3) for k in range(17)])
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
@@ -252,18 +252,18 @@ def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
     result = drive_street(street, lambda *words: told.append(words))
     assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
     seen = result.observations
-    assert len(seen.geometric) > 15 and len(seen.geometric) + len(seen.failures) == 24
-    measured = {g.from_index for g in seen.geometric}
+    assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
+    measured = {first for first, _ in seen.steps.motions}
     by_network = [f for f in result.factors if f.source == "network"]
     assert all(set(range(*sorted((f.from_index, f.to_index)))) - measured for f in by_network)
-    assert len(seen.road_steps) > 10 and np.isfinite(result.scale.lengths).sum() == len(seen.motions)
+    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == seen.steps.triangulated.keys()
     assert [index for index, _, _ in seen.examples] == [4, 8, 12, 16, 20]
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
 
-def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt) -> None:
+def test_calibrated_network_factors_are_used_at_every_step(street: Excerpt) -> None:
     six = (0.002, 0.002, 0.002, 0.02, 0.02, 0.02)
     none = (0.0,) * 6
     noise = PoseNoise(
@@ -276,7 +276,7 @@ def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt)
         measured_on=["simulated/600"],
         pairs=99,
     )
-    every, gaps = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "bridge"))
+    every, gaps = (drive_street(street, noise=noise, use=use) for use in ("calibrated", "gaps"))
     pairs = {(f.from_index, f.to_index) for f in every.factors if f.source == "network"}
     assert pairs == {(k, k + 1) for k in range(1, 23)} | {(k, k + 2) for k in range(23)}
     assert len(gaps.factors) < len(every.factors)

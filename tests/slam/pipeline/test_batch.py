@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
 from slam import se3
 from slam.config import load_config
@@ -18,6 +22,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.prediction.networks import NetworkPredictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
@@ -143,22 +148,32 @@ def test_auto_without_a_height_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "mode", "words"),
+    ("frames", "setting", "words"),
     [
-        (4, "auto", "drive has 4 frames, .* snippet .* has 5"),
-        (30, "lidar", "wants LiDAR scans of neighbouring frames"),
-        (30, "reference", "drive has none"),
-        (30, "camera-height", "add camera_height_m to camera.yaml"),
+        (4, "scale.mode=auto", "drive has 4 frames, .* snippet .* has 5"),
+        (30, "scale.mode=lidar", "scale.mode=lidar needs LiDAR scans of neighbouring frames"),
+        (30, "lidar.factors=true", "lidar.factors=true needs LiDAR scans of neighbouring frames"),
+        (30, "scale.mode=reference", "drive has none"),
+        (30, "scale.mode=camera-height", "add camera_height_m to camera.yaml"),
     ],
 )
-def test_what_cannot_work_is_refused_before_any_work(frames: int, mode: str, words: str) -> None:
+def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setting: str, words: str) -> None:
     drive = LevelRoad(turning(frames))
     oracle = OraclePredictor(turning(frames), road)
     drive.reference = drive.camera_height_m = None
-    pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, f"scale.mode={mode}"]))
-    with pytest.raises(SlamError, match=words) as refused:
-        pipeline.run()
-    assert "\n" not in str(refused.value)
+    pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, setting]))
+    for begin in (pipeline.require_possible, pipeline.run):
+        with pytest.raises(SlamError, match=words) as refused:
+            begin()
+        assert "\n" not in str(refused.value)
+    assert drive.frames_read == 0
+
+
+def test_what_can_work_is_not_refused() -> None:
+    drive = LevelRoad(turning(30))
+    for setting, mode in (("auto", "camera-height"), ("reference", "reference"), ("none", "none")):
+        config = load_config(None, [*NO_IMAGES, f"scale.mode={setting}"])
+        assert SlamPipeline(drive, OraclePredictor(turning(30), road), config).require_possible() == mode
     assert drive.frames_read == 0
 
 
@@ -172,6 +187,43 @@ def test_without_a_road_lengths_stay_unscaled_and_say_why() -> None:
     assert isinstance(result.scale.estimate, MeasurementFailure) and "0 frames" in result.scale.estimate.reason
     np.testing.assert_array_equal(result.scale.per_frame, 1.0)
     assert result.optimised.length_m == pytest.approx(FACTOR * turning_length(20), rel=1e-3)
+
+
+def threads() -> set[str]:
+    """Names of the threads that a run starts and must end, of those that are alive."""
+    prefixes = ("networks", "oracle", "beside", "ahead", "side")
+    return {thread.name for thread in threading.enumerate() if thread.name.startswith(prefixes)}
+
+
+def test_a_result_that_is_kept_keeps_neither_threads_nor_networks(tiny_weights: Path) -> None:
+    street = SimulatedSequence(SimulationOptions("straight", 9, 1002, 208, 64))
+    networks = DepthPosePredictor.from_weights(tiny_weights)
+    predictor = NetworkPredictor(networks, street.intrinsics)
+    during: set[str] = set()
+    pipeline = SlamPipeline(
+        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads())
+    )
+    result = pipeline.run()
+    assert {"networks_0", "beside_0"} <= during and threads() == set()
+    alive = weakref.ref(predictor), weakref.ref(networks)
+    del pipeline, predictor, networks
+    gc.collect()
+    assert [each() for each in alive] == [None, None]
+    assert len(result.optimised) == 9 and len(result.state.window) == 5
+
+
+def test_threads_end_where_a_run_fails() -> None:
+    """The depth of one frame cannot be computed: the error is the run's, and nothing goes on in the background."""
+
+    def fails(index: int) -> FloatArray:
+        if index == 12:
+            raise RuntimeError("out of memory")
+        return road(index)
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        run(LevelRoad(turning(30)), depth_of=fails)
+    gc.collect()
+    assert threads() == set()
 
 
 def speckled() -> Image:

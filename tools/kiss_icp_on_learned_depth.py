@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -27,13 +26,13 @@ from slam.errors import SlamError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import DepthMap, Intrinsics
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.observer import Keyframe
-from slam.prediction.cached import CachedNetworks
+from slam.pipeline.observations import Keyframe
 from slam.prediction.networks import NetworkPredictor
 from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
+from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
 from slam.trajectory import Trajectory
 
 SEED = 0
@@ -45,11 +44,10 @@ def main(words: Sequence[str] | None = None) -> None:
     options = _parser().parse_args(words)
     try:
         recording = open_sequence(options.dataset, options.sequence, None, options.frames)
-        networks: Any = DepthPosePredictor.from_weights(options.weights, "cpu")
-        if options.cache is not None:
-            networks = CachedNetworks(networks, networks.sha256, options.cache)
-        settings = load_config(None, options.set)
-        result = SlamPipeline(recording, NetworkPredictor(networks, recording.intrinsics), settings).estimate()
+        networks = DepthPosePredictor.from_weights(options.weights, "cpu")
+        answers = without_cache if options.cache is None else cached_answers(networks, options.cache)
+        predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
+        result = SlamPipeline(recording, predictor, load_config(None, options.set)).estimate()
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error
     if result.reference is None or not result.observations.keyframes:
@@ -78,6 +76,11 @@ def main(words: Sequence[str] | None = None) -> None:
         measured[name] = trajectory_metrics(Trajectory(truth.stamps, T_first_camera), truth)
     title = f"{recording.name}, {len(rows)} of {len(recording)} frames, scale mode {result.scale.mode}"
     Console(width=options.columns).print(metrics_table(measured, title))
+
+
+def cached_answers(networks: DepthPosePredictor, folder: Path) -> GetOrCompute:
+    """Answers of these networks, kept in a folder; a run's own are of frozen graphs and differ in rounding."""
+    return CacheNamespace(DiskCache(folder), f"{networks.sha256} not frozen").get_or_compute
 
 
 def in_metres(keyframes: Sequence[Keyframe], unit: FloatArray) -> list[DepthMap]:

@@ -75,7 +75,9 @@ class FeatureExtractor:
     def _features(self, grey: Grey) -> Answer:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         found = self._orb.detect(grey, None)
-        chosen: Sequence[cv2.KeyPoint] = [found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)]
+        chosen: Sequence[cv2.KeyPoint] = [
+            found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)
+        ]
         chosen, descriptors = self._orb.compute(grey, chosen)
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)

@@ -12,9 +12,9 @@ import pytest
 
 from slam import Slam, run_slam
 from slam.config import load_config
-from slam.errors import SlamError
+from slam.errors import RunError, SlamError
 from slam.frames import Frame
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES
+from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence
@@ -178,6 +178,25 @@ def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun
         go_on(continues=damaged)
 
 
+def test_damage_anywhere_in_the_keyframes_is_one_error_or_none(begun: RunFolder, tmp_path: Path) -> None:
+    """Compressed archives fail in several ways, in zlib among them."""
+    folder = Path(shutil.copytree(begun.path, tmp_path / "damaged"))
+    path, intact = folder / KEYFRAMES, SessionCheckpoint.open(folder).state.seen.keyframes
+    whole = path.read_bytes()
+    refused = 0
+    for start in range(0, len(whole), len(whole) // 60):
+        path.write_bytes(whole[:start] + bytes(255 - byte for byte in whole[start : start + 8]) + whole[start + 8 :])
+        try:
+            keyframes = SessionCheckpoint.open(folder).state.seen.keyframes
+        except RunError as error:
+            assert "keyframes.npz is damaged" in str(error)
+            refused += 1
+        else:
+            assert [k.index for k in keyframes] == [k.index for k in intact]
+            assert all(np.array_equal(k.image, i.image) for k, i in zip(keyframes, intact, strict=True))
+    assert refused > 40
+
+
 def live(root: Path, **options: Any) -> Slam:
     sequence = open_sequence(root, "sim")
     street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64))
@@ -198,12 +217,13 @@ def feed(slam: Slam, root: Path, frames: range) -> None:
         slam.add_frame(frame.image, frame.stamp)
 
 
-def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [str, Path])
+def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path, kind: type[str | Path]) -> None:
     first = live(kitti_root)
     feed(first, kitti_root, range(8))
-    first.save(tmp_path / "drive.zip")
+    first.save(kind(tmp_path / "drive.zip"))
     second = live(kitti_root)
-    second.resume(tmp_path / "drive.zip")
+    second.resume(kind(tmp_path / "drive.zip"))
     assert len(second) == 8
     np.testing.assert_allclose(second.trajectory().positions, first.trajectory().positions, atol=1e-9)
     for slam in (first, second):

@@ -65,6 +65,8 @@ class Slam:
         self._mode = resolve_mode(config.scale, camera_height_m)
         if self._mode in ("reference", "lidar"):
             raise SlamError(f"scale mode {self._mode} wants a whole sequence: choose camera-height or none")
+        if config.lidar.factors:
+            raise SlamError("lidar.factors=true wants a whole sequence with LiDAR scans: leave the setting out")
         if self._mode == "camera-height" and camera_height_m is None:
             raise SlamError("scale mode camera-height wants camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})

@@ -90,7 +90,7 @@ def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
     return float(trajectory_metrics(estimate, reference)["align"]["7dof"]["ate_rmse_m"])
 
 
-def test_exact_answers_give_the_truth() -> None:
+def test_exact_predictions_give_the_true_trajectory() -> None:
     drive = LevelRoad(turning(60))
     result = run(drive)
     for each in (result.network, result.odometry, result.optimised, result.reference):
@@ -106,7 +106,7 @@ def test_exact_answers_give_the_truth() -> None:
     assert len(result.observations.snippets) == 56 and len(result.factors) == 4 * 56
 
 
-def test_noise_is_cut_by_the_graph() -> None:
+def test_the_graph_reduces_the_noise_of_the_pose_network() -> None:
     before, after = [], []
     for seed in range(5):
         noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=seed)
@@ -116,11 +116,11 @@ def test_noise_is_cut_by_the_graph() -> None:
     assert np.mean(after) < 0.7 * np.mean(before)
 
 
-def test_a_unit_that_wanders_is_brought_back_by_the_road() -> None:
+def test_scale_drift_is_corrected_by_the_ground_plane() -> None:
     noise = OracleNoise(scale_drift_sigma=0.03)
     result = run(LevelRoad(turning(200)), "scale.smoothing_frames=11", noise=noise)
-    wandered = result.network.length_m / FACTOR / turning_length(200)
-    assert abs(np.log(wandered)) > 0.1
+    drifted = result.network.length_m / FACTOR / turning_length(200)
+    assert abs(np.log(drifted)) > 0.1
     assert result.optimised.length_m == pytest.approx(turning_length(200), rel=0.03)
     assert ate(result.optimised, result.reference) < 0.3 * ate(result.network, result.reference)
 
@@ -182,7 +182,7 @@ def test_one_snippet_is_enough() -> None:
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(5), atol=1e-3)
 
 
-def test_without_a_road_lengths_stay_unscaled_and_say_why() -> None:
+def test_without_a_ground_plane_lengths_stay_unscaled_with_a_reason() -> None:
     result = run(LevelRoad(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
     assert isinstance(result.scale.estimate, MeasurementFailure) and "0 frames" in result.scale.estimate.reason
     np.testing.assert_array_equal(result.scale.per_frame, 1.0)
@@ -232,7 +232,7 @@ def speckled() -> Image:
 
 
 @pytest.mark.parametrize("mode", ["camera-height", "reference"])
-def test_standing_still(mode: str) -> None:
+def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
@@ -242,7 +242,7 @@ def test_standing_still(mode: str) -> None:
         assert isinstance(result.scale.estimate, MeasurementFailure) and "does not move" in result.scale.estimate.reason
 
 
-def test_images_that_do_not_change_hold_a_restless_network() -> None:
+def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
@@ -253,7 +253,7 @@ def test_images_that_do_not_change_hold_a_restless_network() -> None:
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
-def test_images_without_corners_refuse_the_geometry_and_the_network_goes_on() -> None:
+def test_images_without_corners_leave_the_pose_network_alone() -> None:
     result = run(LevelRoad(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
     assert len(result.observations.steps) == 0
     pairs = [(first, second) for first, second, _ in result.observations.failures]
@@ -283,7 +283,7 @@ def drive_street(
 
 
 def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
-    """Corners, RANSAC, the graph's threads and Open3D's: none of them may leave a trace."""
+    """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
     for name in ("first", "second"):
         result = drive_street(street)
         folder = tmp_path / name
@@ -299,7 +299,7 @@ def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 
 
-def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
+def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     told: list[tuple[str, int, int]] = []
     result = drive_street(street, lambda *words: told.append(words))
     assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]

@@ -1,4 +1,4 @@
-"""Frames as they come: the same measurements, the same loops, the same trajectory as in one batch."""
+"""Incremental SLAM: the same measurements, loops and trajectory as the batch pipeline."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from slam.config import SlamConfig, load_config
 from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulation.sequence import SimulatedSequence
 from slam.sequences.simulation.street import SimulationOptions
@@ -79,7 +80,7 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         assert way == 0.0 if count < 5 else 0.5 * count < way < 1.5 * count
 
 
-def test_blank_frames_are_bridged() -> None:
+def test_blank_frames_are_interpolated() -> None:
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 12)
     for k in range(12, 17):
@@ -103,6 +104,8 @@ def test_wrong_frames_and_modes_are_refused() -> None:
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
     with pytest.raises(SlamError, match="reference wants a whole sequence"):
         started(load_config(None, ["scale.mode=reference"]))
+    with pytest.raises(SlamError, match=r"lidar\.factors=true wants a whole sequence"):
+        started(load_config(None, ["lidar.factors=true"]))
     with pytest.raises(SlamError, match="wants camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
 
@@ -138,7 +141,9 @@ class FailsOnce(OraclePredictor):
 
 @pytest.mark.parametrize("following", ["new", "black"])
 @pytest.mark.parametrize("question", ["depth", "snippet"])
-def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(question: str, following: str) -> None:
+def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
+    question: str, following: str, tmp_path: Path
+) -> None:
     """Whoever catches the error goes on: one row a frame, whether the next image is usable or not."""
     predictor = FailsOnce(8, question)
     config = load_config(None, [*SETTINGS, "geometry.enabled=true", "loops.enabled=false"])
@@ -155,6 +160,11 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(questi
             assert len(slam) == k + 1
         assert len(failed) == 1 and 8 < failed[0] <= 11
         trajectory = slam.trajectory()
+        slam.save(tmp_path / "drive.zip")
+    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.seen.unusable
+    if question == "depth":
+        assert unusable.pop(8) == "it could not be measured (out of memory at frame 8)"
+    assert set(unusable) <= {9, 10}, "the black frame, or the one that was measured when the snippet failed"
     np.testing.assert_array_equal(trajectory.stamps, drive().stamps[:20])
     assert trajectory.T_world_camera.shape == (20, 4, 4) and np.isfinite(trajectory.T_world_camera).all()
     reference = drive().reference
@@ -188,8 +198,8 @@ def test_a_closed_session_has_no_threads_and_still_answers(tmp_path: Path) -> No
     slam.close()
 
 
-def test_a_buffer_that_is_filled_anew_is_a_new_frame() -> None:
-    """As of a camera's driver, which writes every image to the same place."""
+def test_a_buffer_that_is_reused_is_a_new_frame() -> None:
+    """A camera driver may write every image to the same memory."""
     config = load_config(None, ["mapping.enabled=false", "loops.enabled=false"])
     slam, buffered = (started(config, sweep_frames=0) for _ in range(2))
     feed(slam, 0, 9)

@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import yaml
-from pydantic import Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from erfsfm.config import NetworkConfig, Section, dump_yaml
+from erfsfm.config import NetworkConfig
+from erfsfm.config_tree import Section, dump_yaml, first_problem
 from erfsfm.errors import CheckpointError, ConfigError
 from erfsfm.files import write_atomically
 from erfsfm.networks.presets import PRESETS, NetworkKind, build
+from erfsfm.yaml_file import YamlError, read_yaml
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"
@@ -33,6 +34,8 @@ FILES = ("depth.safetensors", "pose.safetensors")
 
 class ModelRecord(Section):
     """Everything about a pair of networks but their weights."""
+
+    model_config = ConfigDict(allow_inf_nan=True)  # a metric may be undefined
 
     format: Literal[1] = FORMAT
     network: NetworkConfig
@@ -56,7 +59,7 @@ class Model:
 
 
 class Absent(nn.Module):
-    """Stands where a folder holds only one of the two networks; using it is an error of one line."""
+    """Placeholder where a folder holds only one of the two networks; using it is an error of one line."""
 
     def __init__(self, kind: NetworkKind, folder: Path) -> None:
         super().__init__()
@@ -98,7 +101,7 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
 
 
 def _require_kind(kind: NetworkKind, name: str) -> None:
-    """Refuse a pose network where depth is wanted, and the reverse; unknown names are the builder's to refuse."""
+    """Refuse a pose network where depth is wanted, and the reverse; `build` refuses unknown names."""
     if name in PRESETS and PRESETS[name].kind != kind:
         known = ", ".join(other for other, preset in PRESETS.items() if preset.kind == kind)
         raise ConfigError(f"network.{kind} must be a {kind} network ({known}); got '{name}'")
@@ -125,7 +128,7 @@ def load_model(name_or_folder: str | Path) -> Model:
     """Read a shipped model by name, or a folder that training wrote.
 
     Raises:
-        CheckpointError: missing, damaged or of another architecture; one line.
+        CheckpointError: missing, damaged, of another architecture, or not finite; one line.
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
@@ -187,12 +190,11 @@ def read_record(path: Path) -> ModelRecord:
         CheckpointError: damaged, or of another format.
     """
     try:
-        return ModelRecord.model_validate(yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        where = ".".join(map(str, first["loc"])) if first else ""
-        detail = f"{where or 'all of it'}: {first['msg']}" if first else "it is not YAML"
-        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {detail}") from error
+        return ModelRecord.model_validate(read_yaml(path))
+    except YamlError as error:
+        raise CheckpointError(str(error)) from error
+    except ValidationError as error:
+        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {first_problem(error)}") from error
 
 
 def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:
@@ -202,10 +204,10 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
         net: of the architecture that the weights should have.
         tensors: weights by name.
         origin: file they came from, for the error.
-        wanted_by: who says what the architecture is, for the error.
+        wanted_by: source of the wanted architecture, for the error.
 
     Raises:
-        CheckpointError: of another architecture.
+        CheckpointError: of another architecture, or not numbers.
     """
     wanted = net.state_dict()
     missing, extra = wanted.keys() - tensors.keys(), tensors.keys() - wanted.keys()
@@ -220,6 +222,11 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
             raise CheckpointError(
                 f"{origin}: '{key}' must have shape {tuple(wanted[key].shape)}; got {tuple(value.shape)}: it is of "
                 f"another width or preset than {wanted_by}"
+            )
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise CheckpointError(
+                f"{origin}: '{key}' holds NaN or infinite values: the training diverged or the file is damaged; use "
+                "other weights"
             )
     net.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})
 

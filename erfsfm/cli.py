@@ -1,4 +1,4 @@
-"""The command line ``erfsfm``: train the networks, look at what they learned."""
+"""The command line ``erfsfm``: train, evaluate, inspect and convert the networks."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -26,12 +26,26 @@ evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of 
 app.add_typer(evaluate_app, name="evaluate")
 
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(help="seed of everything random")]
+Seed = Annotated[int, typer.Option(help="seed of the random numbers")]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
 Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-Fidelity = Annotated[
-    Literal["default", "paper"], typer.Option(help="paper: as the reference code does it, with its quirks")
-]
+Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"erfsfm {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """Options before a verb."""
 
 
 @app.command()
@@ -71,17 +85,17 @@ def predict(
     weights: Weights = "default",
     output: Annotated[Path, typer.Option(help="receives one .npy and one .png a frame")] = Path("depth"),
     device: Device = "auto",
-    seed: Seed = 0,
+    seed: UnusedSeed = 0,
 ) -> None:
     """Depth of images: unscaled z-depth as .npy, and a coloured picture of disparity.
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.data.images import image_files
     from erfsfm.errors import DataError
     from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
+    from erfsfm.readers.images import list_images
 
-    files = image_files(images) if images.is_dir() else (images,)
+    files = list_images(images) if images.is_dir() else [images]
     if not files:
         raise DataError(f"{images} holds no png or jpg to predict from")
     if output.resolve() in {file.parent.resolve() for file in files}:
@@ -123,30 +137,30 @@ def receptive_field(
     network: Annotated[list[str] | None, typer.Option(help="preset; repeat; all if left out")] = None,
     output: Annotated[Path, typer.Option(help="the picture: png, pdf or svg")] = Path("receptive-field.png"),
     images: Annotated[
-        Path | None, typer.Option(help="a folder whose first five images are looked at; else a drawn street")
+        Path | None, typer.Option(help="a folder, whose first five images are used; else a drawn street")
     ] = None,
     weights: Annotated[str, typer.Option(help="learned weights for their own presets; none: all untrained")] = "none",
     fidelity: Fidelity = "default",
-    offsets_px: Annotated[float, typer.Option(min=0, help="how far deformable taps are pushed outwards")] = 1.0,
+    offsets_px: Annotated[float, typer.Option(min=0, help="outward offset of deformable taps, pixels")] = 1.0,
     height: Annotated[int, typer.Option(min=32, help="of the image, pixels")] = 128,
     width: Annotated[int, typer.Option(min=32, help="of the image, pixels")] = 416,
     device: Device = "auto",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """What the networks see: theoretical box, pixels that count, and how much (the paper's figure 4).
+    """Receptive fields: theoretical, and effective by gradients (the paper's figure 4).
 
     Example: erfsfm receptive-field --network posenet --network erf-posenet-dfc --weights default --output field.png
     """
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.data.images import image_files, resize_image
     from erfsfm.errors import ConfigError, DataError
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
+    from erfsfm.readers.images import list_images, resize_image
     from erfsfm.receptive_field.figure import draw_fields
-    from erfsfm.receptive_field.measure import measure_fields
+    from erfsfm.receptive_field.measure import field_table, measure_fields
     from erfsfm.receptive_field.street import street_snippet
 
     if output.suffix not in (".png", ".pdf", ".svg"):
@@ -154,7 +168,7 @@ def receptive_field(
     if images is None:
         snippet = street_snippet(5, height, width)
     else:
-        files = image_files(images)[:5] if images.is_dir() else ()
+        files = list_images(images)[:5] if images.is_dir() else []
         if len(files) < 5:
             raise DataError(f"--images wants a folder of five consecutive images; {images} has {len(files)}")
         snippet = [resize_image(read_image(file), height, width) for file in files]
@@ -163,18 +177,10 @@ def receptive_field(
     rows = measure_fields(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
-    summaries = [row.summary() for row in rows]
     if as_json:
-        typer.echo(json.dumps(summaries, indent=2))
+        typer.echo(json.dumps([row.summary() for row in rows], indent=2))
         return
-    typer.echo(
-        f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"
-    )
-    for row in summaries:
-        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
-        box = f"{row['columns']} x {row['rows']}"
-        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
-        typer.echo(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+    typer.echo(field_table(rows))
     typer.echo(f"picture in {output}")
 
 
@@ -183,7 +189,7 @@ def convert(
     files: Annotated[list[Path], typer.Argument(help="a depth checkpoint, a pose checkpoint, or both: .pth.tar")],
     output: Annotated[Path, typer.Option(help="receives the weights; then what --weights takes")],
     dilated: Annotated[
-        bool, typer.Option("--dilated", help="the pose network was ERF's dilated one: the file cannot tell")
+        bool, typer.Option("--dilated", help="the pose network is ERF's dilated one, which the file does not say")
     ] = False,
     width: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 416,
     height: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 128,
@@ -238,12 +244,12 @@ def calibrate_noise(
     sequence: Annotated[list[str] | None, typer.Option(help="only these sequences; repeat")] = None,
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="also measure on frames seen in training")] = False,
     device: Device = "auto",
-    seed: Seed = 0,
+    seed: UnusedSeed = 0,
     as_json: Json = False,
 ) -> None:
-    """Measure the pose network's noise on held-out recordings; noise.yaml beside the weights keeps it for SLAM.
+    """Measure the pose network's noise on held-out recordings; writes noise.yaml beside the weights, for SLAM.
 
-    Prints, for each recording, how much of it the noise measured on the others covers.
+    Prints the coverage of each recording by the noise measured on the others.
 
     Example: erfsfm calibrate-noise --weights sim --dataset worlds/600 --dataset KITTI
     """
@@ -273,7 +279,7 @@ def evaluate_depth(
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
     device: Device = "auto",
-    seed: Seed = 0,
+    seed: UnusedSeed = 0,
     as_json: Json = False,
 ) -> None:
     """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame beside a median depth map.
@@ -302,7 +308,7 @@ def evaluate_pose(
     fidelity: Fidelity = "default",
     allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
     device: Device = "auto",
-    seed: Seed = 0,
+    seed: UnusedSeed = 0,
     as_json: Json = False,
 ) -> None:
     """Five-frame snippet ATE and RE, beside a straight constant motion as a baseline.

@@ -2,125 +2,142 @@
 
 from __future__ import annotations
 
-import difflib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from erfsfm.errors import ConfigError
+from erfsfm import config_tree
+from erfsfm.config_tree import Section, dump_yaml
+
+__all__ = ["ExperimentConfig", "Section", "config_folders", "dump_yaml", "load_experiment"]
 
 Fidelity = Literal["default", "paper"]
-
-
-class Section(BaseModel):
-    """A part of the configuration: unknown keys are refused, values never change."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class NetworkConfig(Section):
     """Which networks, how wide, how faithful."""
 
-    depth: str = Field(default="depthnet", description="preset of the depth network")
-    pose: str = Field(default="posenet", description="preset of the pose network")
-    fidelity: Fidelity = Field(default="default", description="'paper' keeps every quirk of the reference code")
-    depth_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the depth network's channels")
-    pose_width: float = Field(default=1.0, gt=0, le=4, description="multiplies the pose network's channels")
-    normalisation: Literal["none", "batch"] = Field(default="none", description="layer after each convolution")
-    activation: Literal["relu", "leaky"] = Field(
-        default="relu", description="'leaky' lets a narrow decoder learn where all its channels are at rest"
+    depth: str = Field(default="depthnet", description="preset of the depth network, see erfsfm networks")
+    pose: str = Field(default="posenet", description="preset of the pose network, see erfsfm networks")
+    fidelity: Fidelity = Field(default="default", description="paper: the layers of the reference code, exactly")
+    depth_width: float = Field(default=1.0, gt=0, le=4, description="factor on the depth network's channels")
+    pose_width: float = Field(default=1.0, gt=0, le=4, description="factor on the pose network's channels")
+    normalisation: Literal["none", "batch"] = Field(
+        default="none", description="normalisation layer after each convolution"
     )
-    sources: Literal[2, 4] = Field(default=4, description="frames around the target: snippets have one more")
-    masks: bool = Field(default=False, description="explainability masks, the pose network's second head")
-    height: int = Field(default=128, ge=32, description="network input, pixels")
-    width: int = Field(default=416, ge=32, description="network input, pixels")
+    activation: Literal["relu", "leaky"] = Field(
+        default="relu", description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die"
+    )
+    sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
+    masks: bool = Field(default=False, description="explainability masks from a second head of the pose network")
+    height: int = Field(default=128, ge=32, description="height of the network input, pixels")
+    width: int = Field(default=416, ge=32, description="width of the network input, pixels")
 
 
 class DataConfig(Section):
-    """Which recordings, which frames of them, and how samples are varied."""
+    """Data sets, the frames of them to use, and data augmentation."""
 
     roots: list[Path] = Field(default_factory=list, description="data sets; --dataset adds to them")
     ranges: dict[str, str] = Field(
-        default_factory=dict, description="frames to train on, e.g. {kitti_odometry/00: '0:250'}; else all"
+        default_factory=dict,
+        description="frames to train on by recording, e.g. {kitti_odometry/00: '0:250'}; empty: all",
     )
     exclude: list[str] = Field(
         default_factory=lambda: ["kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"],
-        description="recordings never trained on, also through the odometry-raw table",
+        description="recordings never trained on, also where a KITTI raw drive holds the same frames",
     )
     validation: list[str] = Field(
-        default_factory=lambda: ["simulated/500-599"], description="recordings that only validate"
+        default_factory=lambda: ["simulated/500-599"],
+        description="recordings used for validation alone; named ones must be among the data",
     )
     split: str | None = Field(
         default=None,
-        description="file of recordings to train, validate and test on, or its shipped name: configs/splits",
+        description="file of the recordings to train, validate and test on, or the name of one in configs/splits",
     )
     leave_out: Literal["eigen", "none"] = Field(
         default="eigen", description="KITTI raw drives never trained on: the 28 test scenes of Eigen et al."
     )
     static_frames: Literal["remove", "keep"] = Field(
-        default="remove", description="frames of KITTI raw in which the car stands, by GPS/IMU, else by their images"
+        default="remove",
+        description="frames of KITTI raw in which the car stands still, found by GPS/IMU, else by image differences",
     )
     weights: dict[str, Annotated[float, Field(gt=0)]] = Field(
         default_factory=dict,
-        description="share of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "
+        description="relative number of samples by prefix of the recording, e.g. {simulated: 1, kitti: 1}; "
         "empty: by number of frames",
     )
-    validation_snippets: int = Field(default=60, ge=1, description="snippets looked at in each validation")
-    flip: float = Field(default=0.5, ge=0, le=1, description="probability of a mirrored snippet")
-    zoom: float = Field(default=1.15, ge=1, le=2, description="largest scale-crop of a snippet, per axis")
-    colour_jitter: float = Field(default=0.0, ge=0, le=0.5, description="largest change of brightness, contrast, gamma")
-    weather: float = Field(
-        default=0.0, ge=0, le=1, description="share of snippets shown blurred, rained on, under other exposures"
+    validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
+    flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
+    zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
+    colour_jitter: float = Field(
+        default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )
-    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images")
-    workers: int = Field(default=1, ge=0, description="processes that prepare samples")
+    weather: float = Field(
+        default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
+    )
+    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images, MB a process")
+    workers: int = Field(default=1, ge=0, description="data loader processes; 0: in the training process")
 
 
 class LossConfig(Section):
-    """The objective: which terms, with which weights. The defaults are the paper's."""
+    """Terms of the objective and their weights; the defaults are the paper's."""
 
-    photometric_weight: float = Field(default=1.0, ge=0, description="of the photometric error; 0 saves its work")
-    ssim_weight: float = Field(default=0.0, ge=0, le=1, description="share of structural dissimilarity; 0 is L1")
-    reduction: Literal["mean", "minimum"] = Field(
-        default="mean", description="over sources: 'minimum' forgives occlusion (Godard et al. 2019)"
+    photometric_weight: float = Field(default=1.0, ge=0, description="weight of the photometric error; 0: not computed")
+    ssim_weight: float = Field(
+        default=0.0, ge=0, le=1, description="weight of SSIM in the photometric error; 0: L1 alone"
     )
-    auto_mask: bool = Field(default=False, description="ignore pixels that a still camera explains better")
+    reduction: Literal["mean", "minimum"] = Field(
+        default="mean", description="over source frames; minimum tolerates occlusion (Godard et al. 2019)"
+    )
+    auto_mask: bool = Field(
+        default=False, description="mask pixels whose error is smaller without warping (Godard et al. 2019)"
+    )
     warm_up_steps: int = Field(
         default=0,
         ge=0,
-        description="first steps under the paper's plain L1 mean: structure finds no large rotation, and a minimum "
-        "teaches the pose network only the source that fits best already",
+        description="first steps with the plain L1 mean: SSIM has no gradient for large rotations, and the minimum "
+        "gives one only to the source that fits best already",
     )
     scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
     smoothness: Literal["depth-second-order", "disparity-second-order", "disparity-edge-aware"] = Field(
-        default="depth-second-order", description="what is kept smooth, and how"
+        default="depth-second-order", description="smoothed quantity and order of its derivative"
     )
-    smoothness_weight: float = Field(default=0.2, ge=0)
-    mask_weight: float = Field(default=0.0, ge=0, description="explainability regularisation; needs network.masks")
-    consistency_weight: float = Field(default=0.0, ge=0, description="depth agreement of adjacent frames")
+    smoothness_weight: float = Field(default=0.2, ge=0, description="weight of the smoothness term")
+    mask_weight: float = Field(
+        default=0.0, ge=0, description="weight of the explainability regularisation; needs network.masks"
+    )
+    consistency_weight: float = Field(
+        default=0.0, ge=0, description="weight of the depth consistency of adjacent frames (Bian et al. 2019)"
+    )
 
 
 class TeacherConfig(Section):
-    """Pull towards what classical two-view geometry measures in the same images, without labels; off by default."""
+    """Pseudo-labels from classical two-view geometry of the same images; off by default."""
 
     rotation_weight: float = Field(
-        default=0.0, ge=0, description="of the rotations; measured ones then also warp the images"
+        default=0.0, ge=0, description="weight of the rotation error; measured rotations then also warp the images"
     )
-    translation_weight: float = Field(default=0.0, ge=0, description="of the translations, in the depth's unit")
-    structure_weight: float = Field(default=0.0, ge=0, description="of depth up to a scale per image")
+    translation_weight: float = Field(
+        default=0.0, ge=0, description="weight of the translation error, in the depth's unit"
+    )
+    structure_weight: float = Field(default=0.0, ge=0, description="weight of the depth error up to a scale per image")
     unit_weight: float = Field(
-        default=0.0, ge=0, description="of the depth's unit: heights of the camera over the road"
+        default=0.0,
+        ge=0,
+        description="weight of the scale error: the depth's unit in heights of the camera above the road",
     )
     alone_steps: int = Field(
-        default=0, ge=0, description="first steps without photometric error, half as long: it pulls best from near by"
+        default=0,
+        ge=0,
+        description="first steps without photometric error, which converges only from close by; 0: none",
     )
-    cache: Path | None = Field(default=None, description="folder that keeps measurements between runs")
+    cache: Path | None = Field(default=None, description="folder that keeps the measurements between runs")
 
     @property
     def weights(self) -> dict[str, float]:
-        """Weight of each term that is wanted."""
+        """Weight of each term that is switched on."""
         every = {
             "rotation": self.rotation_weight,
             "translation": self.translation_weight,
@@ -133,34 +150,38 @@ class TeacherConfig(Section):
 class TrainingConfig(Section):
     """The optimiser and the loop."""
 
-    steps: int = Field(default=200_000, ge=1)
-    batch: int = Field(default=4, ge=1, description="snippets a step and device")
+    steps: int = Field(default=200_000, ge=1, description="optimisation steps")
+    batch: int = Field(default=4, ge=1, description="snippets per step and device")
     devices: int = Field(
-        default=1, ge=1, description="GPUs, or processes on a CPU; batch norm is common to them on GPUs alone"
+        default=1, ge=1, description="GPUs, or processes on a CPU; batch normalisation is synchronised on GPUs alone"
     )
     networks: Literal["both", "depth"] = Field(
-        default="both", description="which of them learn; a pose network that does not keeps its weights"
+        default="both", description="trained networks; depth: the pose network keeps its weights"
     )
     optimiser: Literal["adam", "muon"] = Field(
-        default="adam", description="muon: orthogonal steps for the kernels, Adam for the rest"
+        default="adam", description="muon: orthogonalised steps for convolution kernels, Adam for the rest"
     )
-    learning_rate: float = Field(default=2e-4, gt=0)
-    kernel_rate: float = Field(default=1.0, gt=0, description="multiple of it for the kernels under muon")
+    learning_rate: float = Field(default=2e-4, gt=0, description="of Adam, and of Muon times kernel_rate")
+    kernel_rate: float = Field(
+        default=1.0, gt=0, description="factor on the learning rate of convolution kernels under muon"
+    )
     offset_rate: float = Field(
-        default=1.0, gt=0, le=1, description="share of it for what predicts deformable offsets: fast ones run away"
+        default=1.0, gt=0, le=1, description="factor on the learning rate of deformable offsets, which may diverge"
     )
     schedule: Literal["constant", "cosine", "step"] = Field(
-        default="constant", description="of the learning rate; step: a tenth in the last quarter"
+        default="constant", description="of the learning rate; step: divided by ten in the last quarter"
     )
-    gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: not clipped")
-    validate_every: int = Field(default=1000, ge=1, description="steps")
-    patience: int = Field(default=0, ge=0, description="validations without a better one that end the run; 0: none do")
-    checkpoint_every: int = Field(default=500, ge=1, description="steps")
-    log_every: int = Field(default=50, ge=1, description="steps")
+    gradient_clip: float = Field(default=0.0, ge=0, description="largest gradient norm; 0: no clipping")
+    validate_every: int = Field(default=1000, ge=1, description="steps between validations")
+    patience: int = Field(
+        default=0, ge=0, description="validations without improvement after which training stops; 0: never"
+    )
+    checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
+    log_every: int = Field(default=50, ge=1, description="steps between log entries")
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = Field(
-        default="32-true", description="of the networks; a CPU takes bf16-mixed for 16-mixed, and says so"
+        default="32-true", description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, with a warning"
     )
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, description="of initial weights, draws of snippets and augmentation")
 
 
 class ExperimentConfig(Section):
@@ -172,7 +193,7 @@ class ExperimentConfig(Section):
     teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
     initial_weights: str | None = Field(
-        default=None, description="weights to start from: the same networks, other presets of them, or half as wide"
+        default=None, description="weights to start from; presets may differ, and widths by a factor of two"
     )
 
     @model_validator(mode="after")
@@ -184,96 +205,14 @@ class ExperimentConfig(Section):
 
 def config_folders() -> list[Path]:
     """Where named configurations lie: in the wheel, or in the source tree."""
-    package = Path(__file__).parent
+    package = Path(__file__).resolve().parent
     return [package / "_configs", package.parent / "configs" / "erfsfm"]
 
 
-def find_config(name_or_path: str) -> Path:
-    """The YAML file of a path or a shipped name.
-
-    Raises:
-        ConfigError: neither a file nor a known name.
-    """
-    path = Path(name_or_path)
-    if path.is_file():
-        return path
-    known: dict[str, Path] = {}
-    for folder in config_folders():
-        known |= {file.stem: file for file in sorted(folder.glob("*.yaml"))}
-    if name_or_path in known:
-        return known[name_or_path]
-    near = difflib.get_close_matches(name_or_path, known, n=3)
-    short = [name for name in sorted(known) if "-" not in name]  # not the rows of the paper's tables
-    offered = ", ".join(dict.fromkeys([*near, *short]))
-    raise ConfigError(
-        f"no configuration '{name_or_path}': it is neither a file nor one of {offered} "
-        f"({len(known)} in all, see configs/erfsfm)"
-    )
-
-
-Override = Annotated[str, "section.key=value"]
-
-
-def load_experiment(name_or_path: str | Path | None, overrides: list[Override] | None = None) -> ExperimentConfig:
-    """Read an experiment and apply ``section.key=value`` overrides.
+def load_experiment(file_or_name: str | Path | None, overrides: Sequence[str] = ()) -> ExperimentConfig:
+    """Read an experiment and apply ``section.key=value`` overrides; None for the defaults.
 
     Raises:
         ConfigError: missing file, bad YAML, unknown key or a value out of bounds; one line.
     """
-    tree: dict[str, Any] = {}
-    origin = "the defaults"
-    if name_or_path is not None:
-        path = find_config(str(name_or_path))
-        origin = str(path)
-        try:
-            tree = yaml.safe_load(path.read_text()) or {}
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-        if not isinstance(tree, dict):
-            raise ConfigError(f"{path} must hold sections with keys; got {type(tree).__name__}")
-    for override in overrides or []:
-        _apply_override(tree, override)
-    try:
-        return ExperimentConfig.model_validate(tree)
-    except ValidationError as error:
-        raise ConfigError(_explain(error, origin)) from error
-
-
-def _apply_override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition("=")
-    if not separator or not key:
-        raise ConfigError(f"--set wants section.key=value; got '{override}'")
-    *sections, leaf = key.split(".")
-    node = tree
-    for section in sections:
-        node = node.setdefault(section, {})
-        if not isinstance(node, dict):
-            raise ConfigError(f"--set {override}: '{section}' is not a section")
-    try:
-        node[leaf] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override}: '{text}' is not a YAML value") from error
-
-
-def _explain(error: ValidationError, origin: str) -> str:
-    """The first problem of a validation error in one line, with the nearest known key."""
-    first = error.errors()[0]
-    location = [str(part) for part in first["loc"]]
-    where = ".".join(location)
-    if not location:
-        return f"{origin}: {first['msg'].removeprefix('Value error, ')}"
-    if first["type"] == "extra_forbidden":
-        model: Any = ExperimentConfig
-        for part in location[:-1]:
-            model = model.model_fields[part].annotation
-        known = list(model.model_fields)
-        close = difflib.get_close_matches(location[-1], known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
-        return f"unknown key '{where}' in {origin}; {hint}"
-    return f"'{where}' in {origin}: {first['msg'].lower()}; got {first['input']!r}"
-
-
-def dump_yaml(config: BaseModel) -> str:
-    """The configuration as YAML that reads back to an equal configuration."""
-    text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-    return text
+    return config_tree.load_config(ExperimentConfig, file_or_name, overrides, config_folders())

@@ -1,8 +1,8 @@
-"""Old checkpoints into ours: SfMLearner-PyTorch's and ERF-SfMLearner's ``.pth.tar`` files.
+"""Conversion of SfMLearner-PyTorch's and ERF-SfMLearner's ``.pth.tar`` checkpoints into our weights.
 
 One file holds one network: DispNetS or PoseExpNet. Nothing in it is executed. The names of plain layers are
-those of the published code; deformable layers are known by their structure, so that names do not matter there.
-Plain and dilated networks have the same weights: whoever converts must say which it was.
+those of the published code; deformable layers are recognised by their structure, whatever their names.
+Plain and dilated networks have the same weights: the user must say which it was.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _DAMAGED = (RuntimeError, EOFError, ValueError, TypeError, KeyError, AttributeEr
 
 @dataclass(frozen=True)
 class OldNetwork:
-    """One converted network: its preset, its tensors under our names, and what they tell of its shape."""
+    """One converted network: its preset, its tensors under our names, and the options that follow from their shapes."""
 
     path: Path
     kind: NetworkKind

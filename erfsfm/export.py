@@ -30,7 +30,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Exported:
-    """One written file, and how far onnxruntime's answers are from PyTorch's, as a share of the largest."""
+    """One written file, and the largest difference of its outputs from PyTorch's, relative to the largest output."""
 
     path: Path
     kind: NetworkKind
@@ -82,10 +82,10 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
     Args:
         model: of which a network that is absent is left out.
         path: must end in ``.onnx``.
-        seed: of the images that both are compared on.
+        seed: of the random images on which both are compared.
 
     Raises:
-        ExportError: onnx or onnxruntime is not installed, another ending, or answers that differ.
+        ExportError: onnx or onnxruntime is not installed, another ending, or outputs that differ.
         ConfigError: the paper's dilated depth network, which cannot run.
     """
     if path.suffix != ".onnx":
@@ -147,7 +147,7 @@ def _images(config: NetworkConfig, generator: torch.Generator, lead: tuple[int, 
 def _traced(graph: DepthGraph | PoseGraph, example: tuple[Tensor, ...]) -> bytes:
     with tempfile.TemporaryDirectory() as folder, torch.no_grad(), warnings.catch_warnings():
         path = Path(folder) / "graph.onnx"
-        warnings.simplefilter("ignore")  # shapes become constants: that is meant
+        warnings.simplefilter("ignore")  # shapes become constants, as intended
         torch.onnx.export(
             graph,
             example,
@@ -161,7 +161,7 @@ def _traced(graph: DepthGraph | PoseGraph, example: tuple[Tensor, ...]) -> bytes
 
 
 def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model) -> bytes:
-    """The checked graph with what its user must know, written into it."""
+    """The checked graph with metadata: preset, fidelity, input range, licence and training data."""
     import onnx
 
     graph = onnx.load_model_from_string(content)
@@ -182,7 +182,7 @@ def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model)
 
 
 def _difference(graph: nn.Module, content: bytes, example: tuple[Tensor, ...]) -> float:
-    """Largest difference of the two answers, as a share of the largest output."""
+    """Largest difference of the two outputs, relative to the largest output."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])

@@ -3,22 +3,46 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+_PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
-def write_atomically(path: Path, fill: Callable[[Path], object]) -> None:
+
+def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
     """Let ``fill`` write a file beside ``path``, then put it in place at once; missing parent folders are made.
 
     The temporary name ends as ``path`` does, for writers that look at the suffix.
+
+    Args:
+        path: the file to write or replace.
+        fill: writes the file that it is given.
+        sync: wait until the disk holds the content before it gets its name; a disk that fills up late is found then.
+
+    Raises:
+        OSError: the file cannot be written; what was at ``path`` is unchanged.
     """
     partial = path.with_name(f".{os.getpid()}.{threading.get_ident()}.partial.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         fill(partial)
+        if sync:
+            _sync(partial)
         partial.replace(path)
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def unfinished_name(path: Path) -> str | None:
+    """The name of the file that a killed process was writing to ``path``; None where ``path`` is no such rest."""
+    match = _PARTIAL.fullmatch(path.name)
+    return match["name"] if match else None
+
+
+def _sync(path: Path) -> None:
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())

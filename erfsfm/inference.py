@@ -1,4 +1,4 @@
-"""The one door through which others use the networks: NumPy in, NumPy out."""
+"""Inference with trained networks, the interface for other packages: NumPy in, NumPy out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -15,23 +15,25 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which enters by this door
-from erfsfm.data.images import resize_image
+from erfsfm.checkpoint import commit as commit  # for slam, which imports this module alone
 from erfsfm.data.splits import overlapping as overlapping  # likewise
-from erfsfm.errors import ConfigError, DataError
+from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
+from erfsfm.readers.images import read_image as read_image  # images come in as they are read for training
+from erfsfm.readers.images import resize_image
 
 logger = logging.getLogger(__name__)
 
+F = TypeVar("F", np.float32, np.float64)
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 _THREADS = max(torch.get_num_threads() - 1, 1)
 
 
 def limit_torch_threads() -> None:
-    """Let networks asked in this thread compute on all cores but one, for whatever goes on beside them."""
+    """Let PyTorch in this thread use all cores but one, which stays free for other threads."""
     torch.set_num_threads(_THREADS)
 
 
@@ -58,11 +60,12 @@ class PreparedImage:
 class DepthPosePredictor:
     """Depth of single images and poses of snippets, in one unknown scale.
 
-    ``noise`` is that of the poses, where it was measured with these very weights; else None.
+    ``noise`` is the noise model of the poses if it was measured with these weights, else None.
     """
 
     noise: PoseNoise | None = None
     pose_sha256: str = ""
+    origin: str = "these weights"
 
     def __init__(self, model: Model, device: str = "cpu", sha256: str = "") -> None:
         self.device = choose_device(device)
@@ -71,7 +74,7 @@ class DepthPosePredictor:
         self.sources: int = model.record.network.sources
         self._depth_net = model.depth_net.eval().to(self.device)
         self._pose_net: nn.Module = _PoseMatrices(model.pose_net).eval().to(self.device)
-        if self.device.type == "cpu":  # images have the channels of a pixel together, and small kernels gain by it
+        if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
             for network in (self._depth_net, self._pose_net):
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -85,6 +88,7 @@ class DepthPosePredictor:
         """
         folder = find_weights(name_or_dir)
         predictor = cls(load_model(folder), device, weights_sha256(folder))
+        predictor.origin = str(folder)
         predictor.pose_sha256 = file_sha256(folder / FILES[1])
         noise = read_pose_noise(folder)
         if noise is not None and noise.pose_sha256 != predictor.pose_sha256:
@@ -97,13 +101,13 @@ class DepthPosePredictor:
         return predictor
 
     def freeze(self) -> Self:
-        """Answer by graphs of the networks from now on: the same up to rounding, and sooner on a CPU."""
+        """Trace the networks: the same outputs up to rounding, faster on a CPU."""
         if self.device.type == "cpu":
             self._depth_net, self._pose_net = Frozen(self._depth_net), Frozen(self._pose_net)
         return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
-        """Those of the given recordings (``kitti_odometry/00[0:300]``) that training saw."""
+        """Those of the given recordings (``kitti_odometry/00[0:300]``) that were trained on."""
         return overlapping(names, self.record.trained_on)
 
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -124,9 +128,13 @@ class DepthPosePredictor:
 
     @torch.inference_mode()
     def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
-        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size."""
+        """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size.
+
+        Raises:
+            CheckpointError: the network's output is not finite.
+        """
         disparity: NDArray[np.float32] = self._depth_net(self._tensor(image))[0, 0].float().cpu().numpy()
-        return disparity
+        return self._finite(disparity, "depth")
 
     @torch.inference_mode()
     def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
@@ -141,6 +149,7 @@ class DepthPosePredictor:
 
         Raises:
             ValueError: another number of images than the networks were trained for.
+            CheckpointError: the network's output is not finite.
         """
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
@@ -148,7 +157,16 @@ class DepthPosePredictor:
         inputs = [self._tensor(image) for image in images]
         target = inputs.pop(middle)
         T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
-        return T_source_target
+        return self._finite(T_source_target, "pose")
+
+    def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
+        """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
+        if not np.isfinite(output).all():
+            raise CheckpointError(
+                f"the {kind} network of {self.origin} gives NaN or infinite values: its training diverged; use other "
+                "weights"
+            )
+        return output
 
     def _input(self, image: NDArray[np.uint8]) -> Tensor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
@@ -163,7 +181,7 @@ class DepthPosePredictor:
 
 
 class _PoseMatrices(nn.Module):
-    """A pose network that answers for one snippet in transforms, double precision."""
+    """A pose network whose output for one snippet are transforms in double precision."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -180,18 +198,6 @@ def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray
     if disparity.shape != (height, width):
         disparity = np.asarray(cv2.resize(disparity, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     return np.asarray(1 / disparity, dtype=np.float32)
-
-
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """An image file as ``(H, W, 3)`` uint8 RGB.
-
-    Raises:
-        DataError: missing or not an image.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DataError(f"{path} is missing or not a readable image")
-    return np.ascontiguousarray(image[..., ::-1])
 
 
 def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

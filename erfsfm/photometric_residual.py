@@ -1,7 +1,7 @@
-"""How much of the difference between images is left when depth and poses have explained what they can.
+"""Photometric residual of warping by depth and poses, relative to the difference without warping.
 
-What is left is one of the signs of a pose that errs (``erfsfm.pose_noise``). NumPy and OpenCV alone, on small images:
-a sign need not be sharp, and it is asked of every snippet.
+It predicts the error of a pose (``erfsfm.pose_noise``). NumPy and OpenCV alone, on small images, for it is computed
+for every snippet.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LEAST_DIFFERENCE = 1e-3  # grey levels
 
 
 class PhotometricResidual:
-    """Judges the snippets of one camera, one after the other."""
+    """Residuals of the snippets of one camera."""
 
     def __init__(self, K: NDArray[np.float64], width: int, height: int) -> None:
         """Prepare for images of a size.
@@ -52,7 +52,7 @@ class PhotometricResidual:
             T_source_target: ``(N, 4, 4)``, target camera to source camera, row k for the k-th source in time order.
 
         Returns:
-            ``(N,)``: 0 where all is explained, 1 where nothing is, or where hardly a pixel is seen in both.
+            ``(N,)``: 0 if warping explains the whole difference, 1 if none of it, or if too few pixels overlap.
         """
         sources = np.stack([self._small(image) for image in images])
         target = sources[len(images) // 2]

@@ -1,4 +1,4 @@
-"""The noise of a pose network: a law that was fitted on held-out recordings and lies beside its weights.
+"""The noise model of a pose network, fitted on held-out recordings and stored beside its weights.
 
 Only the direct poses of a snippet are measurements. Overlapping snippets measure a pair of frames twice, once in each
 direction, from nearly the same images: both errors are correlated, and a pair is one measurement, their mean. NumPy
@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from erfsfm.config import Section, dump_yaml
+from erfsfm.config_tree import Section, dump_yaml, first_problem
 from erfsfm.errors import CheckpointError
 from erfsfm.files import write_atomically
+from erfsfm.yaml_file import YamlError, read_yaml
 
 FloatArray = NDArray[np.float64]
 # target, sources, T_source_target (N, 4, 4), photometric residuals (N,); without these, nothing counts as explained
@@ -74,10 +74,15 @@ class PoseNoise(Section):
 
 @dataclass(frozen=True)
 class PairPose:
-    """What snippets measured between two frames: ``T_first_last`` ``(4, 4)``, the mean of both directions, unscaled.
+    """Relative pose of two frames measured by snippets.
 
-    ``directions`` ``(M, 4, 4)`` are the single measurements, one or two, each as ``T_first_last``. With ``features``
-    ``(5, 6)`` the noise grows: frames, turn, length, disagreement of both directions, photometric residual.
+    Attributes:
+        first: number of the earlier frame.
+        last: number of the later frame.
+        T_first_last: ``(4, 4)``, the mean of both directions, unscaled.
+        directions: ``(M, 4, 4)``, the single measurements, one or two, each as ``T_first_last``.
+        features: ``(5, 6)``, the regressors of the noise: frames, turn, length, disagreement of both directions,
+            photometric residual.
     """
 
     first: int
@@ -98,7 +103,7 @@ class PairPose:
 
 
 def pair_poses(snippets: Sequence[Snippet]) -> list[PairPose]:
-    """Every pair of frames that snippets measured, once."""
+    """Every measured pair of frames, once."""
     measured: dict[tuple[int, int], list[tuple[FloatArray, float]]] = {}
     for target, sources, T_source_target, residuals in snippets:
         left = np.ones(len(sources)) if residuals is None else residuals
@@ -157,12 +162,13 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
     if not path.is_file():
         return None
     try:
-        return PoseNoise.model_validate(yaml.safe_load(path.read_text()))
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        detail = f"{'.'.join(map(str, first['loc'])) or 'all of it'}: {first['msg']}" if first else "it is not YAML"
+        return PoseNoise.model_validate(read_yaml(path))
+    except YamlError as error:
+        raise CheckpointError(f"{error}; remove it, and measure anew with erfsfm calibrate-noise") from error
+    except ValidationError as error:
         raise CheckpointError(
-            f"{path} is not a noise record: {detail}; remove it, and measure anew with erfsfm calibrate-noise"
+            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure anew with erfsfm "
+            "calibrate-noise"
         ) from error
 
 
@@ -178,7 +184,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _middle(T_a_b: FloatArray, T_a_b_other: FloatArray) -> FloatArray:
-    """Half-way between transforms ``(P, 4, 4)`` that lie close together."""
+    """Midpoint of transforms ``(P, 4, 4)`` that are close together."""
     middle: FloatArray = 0.5 * (T_a_b + T_a_b_other)
     between = Rotation.from_matrix(np.swapaxes(T_a_b[:, :3, :3], 1, 2) @ T_a_b_other[:, :3, :3])
     half = Rotation.from_rotvec(0.5 * between.as_rotvec())

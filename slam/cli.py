@@ -1,4 +1,4 @@
-"""The command line ``erfsfm-slam``: run, evaluate, export, simulate."""
+"""The command line ``erfsfm-slam``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
 from slam.runtime.progress import progress_bar
+from slam.runtime.signals import Terminated
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,18 +24,36 @@ if TYPE_CHECKING:
     from slam.results.folder import RunFolder
 
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,  # a markup would swallow <...> or [...] of the help
     pretty_exceptions_enable=False,
     help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
 )
 
-_INTERRUPTED = 130  # what typer makes of ctrl-C
+_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 
-Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of everything random")]
+DeviceName = Literal["auto", "cpu", "cuda"]
+Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+# Verbs that once offered these two without using them still accept them, unseen.
+UnusedDevice = Annotated[DeviceName, typer.Option("--device", hidden=True)]
+UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"erfsfm-slam {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options_of_all_verbs(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    pass
 
 
 @app.command()
@@ -43,23 +63,23 @@ def run(
     ] = None,
     sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
     camera: Annotated[Path | None, typer.Option(help="camera.yaml of a folder or video")] = None,
-    weights: Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output")] = "default",
+    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
     output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="keep the networks' answers there: a second run skips the networks")
+        Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder: these frames follow on its last one")
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:
-    """The whole system on one sequence; with nothing given, on the embedded simulated street.
+    """Trajectory, map and report of a sequence. Without options: of the embedded simulated street.
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
@@ -67,17 +87,17 @@ def run(
 
     with progress_bar() as progress:
         folder = run_slam(
-            dataset,
-            sequence,
-            camera,
-            weights,
-            config,
-            overrides or [],
-            frames,
-            output,
-            seed,
-            device,
-            progress,
+            dataset=dataset,
+            sequence=sequence,
+            camera=camera,
+            weights=weights,
+            config=config,
+            overrides=overrides or [],
+            frames=frames,
+            output=output,
+            seed=seed,
+            device=device,
+            progress=progress,
             command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
             cache=cache,
             rerun=rerun,
@@ -92,28 +112,30 @@ def run(
 
 @app.command()
 def evaluate(
-    paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or one or more run folders")],
+    paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders")],
     format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the two files")] = "auto",
-    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 where it is larger; repeat")] = None,
+    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
     as_json: Json = False,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
 ) -> None:
-    """Every metric of two trajectory files under every alignment, or the tables of runs side by side.
+    """Errors of trajectories or of whole runs.
+
+    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side.
 
     Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
     """
     if all(path.is_dir() for path in paths):
         if fail_over:
             raise typer.BadParameter(
-                "limits are for two trajectory files, not for run folders", param_hint="--fail-over"
+                "a limit applies to two trajectory files, not to run folders", param_hint="--fail-over"
             )
         _evaluate_runs(paths, as_json)
     elif len(paths) == 2:
         _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)
     else:
         what = ", ".join(map(str, paths))
-        raise typer.BadParameter(f"two trajectory files or run folders that exist are wanted; got {what}")
+        raise typer.BadParameter(f"give two trajectory files, or run folders that exist; got {what}")
 
 
 @app.command()
@@ -122,18 +144,19 @@ def export(
     what: Annotated[str, typer.Option(help="mesh, cloud, trajectory, graph or colmap")],
     output: Annotated[Path, typer.Option(help="the file to write; for colmap a folder")],
     up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
 ) -> None:
-    """The map as PLY, the trajectory as KITTI or TUM, the graph as g2o, all of it as a COLMAP model.
+    """Parts of a run as files for other programs.
+
+    The map as PLY, the trajectory as KITTI or TUM, the graph as g2o, or the whole run as a COLMAP model.
 
     Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
     """
-    from slam.mapping import rotate_ply
     from slam.results.export import export as export_run
     from slam.results.folder import RunFolder
 
-    written = export_run(RunFolder.open(run), what, output, up, rotate_ply)
+    written = export_run(RunFolder.open(run), what, output, up)
     typer.echo(f"{what} of {run} in {written}")
 
 
@@ -141,13 +164,13 @@ def export(
 def localize(
     images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
     map: Annotated[Path, typer.Option("--map", help="a run folder")],
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the images, where not that of the run")] = None,
-    output: Annotated[Path | None, typer.Option(help="TUM file of the poses found; stamps are image numbers")] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the images; default: that of the run")] = None,
+    output: Annotated[Path | None, typer.Option(help="TUM file for the poses found; image numbers as stamps")] = None,
     as_json: Json = False,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
 ) -> None:
-    """Poses of new images in an old run's map, in its frame and unit.
+    """Poses of new images in an earlier run's map. They are in its frame and unit.
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
@@ -173,16 +196,16 @@ def localize(
 def simulate(
     output: Annotated[Path, typer.Argument(help="the root to write")],
     route: Annotated[str, typer.Option(help="loop, grid or straight")] = "loop",
-    frames: Annotated[int, typer.Option(help="10 a second, about 1 m each; a loop wants 250 or more")] = 300,
+    frames: Annotated[int, typer.Option(help="10 frames a second, about 1 m apart; a loop needs 250 or more")] = 300,
     seed: Seed = 0,
     width: Annotated[int, typer.Option(help="pixels")] = 416,
     height: Annotated[int, typer.Option(help="pixels")] = 128,
     lidar: Annotated[bool, typer.Option("--lidar", help="write 64-beam scans")] = False,
     depth: Annotated[bool, typer.Option("--depth", help="write exact depth maps")] = False,
     hazards: Annotated[str, typer.Option(help="comma list of moving-cars, exposure, blur, stop, rain")] = "",
-    device: Device = "auto",
+    device: UnusedDevice = "auto",
 ) -> None:
-    """A simulated street as a KITTI odometry root, its truth exact.
+    """A simulated street as a KITTI odometry root. Its ground truth is exact.
 
     Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
     """
@@ -199,8 +222,8 @@ def plot(
     runs: Annotated[list[Path], typer.Argument(help="run folders")],
     what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
     output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
 ) -> None:
     """Figures of runs for a paper.
 
@@ -226,9 +249,9 @@ def config() -> None:
 
 @app.command()
 def doctor(
-    dataset: Annotated[Path | None, typer.Option(help="a data set to look at")] = None,
+    dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
 ) -> None:
-    """What is installed, what is found, what is missing and what to do.
+    """What is installed, found or missing. What is missing comes with what to do.
 
     Example: erfsfm-slam doctor --dataset /data/kitti
     """
@@ -239,8 +262,6 @@ def doctor(
 
 
 def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
-    from rich.console import Console
-
     from slam.results.comparison import comparison_json, comparison_table
     from slam.results.folder import RunFolder
 
@@ -248,12 +269,10 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(comparison_json(runs), indent=2))
     else:
-        Console(width=_table_width()).print(comparison_table(runs))
+        _print_table(comparison_table(runs))
 
 
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
-    from rich.console import Console
-
     from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
     from slam.results.tables import metrics_table
     from slam.trajectory import associate, read_trajectory
@@ -263,7 +282,7 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
     if as_json:
         typer.echo(json.dumps(metrics, indent=2))
     else:
-        Console(width=_table_width()).print(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        _print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
         for line in evo_commands(estimate, reference, format):
             typer.echo(line)
     broken = exceeded(metrics, limits)
@@ -272,57 +291,59 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
 
 
 def _print_run(path: Path, metrics: dict[str, Any]) -> None:
-    from rich.console import Console
-
     from slam.results.comparison import unit_notes
     from slam.results.tables import metrics_table
 
-    provenance, scale, timing = metrics["provenance"], metrics["scale"], metrics["timing"]
-    known = {k: v for k, v in metrics["trajectories"].items() if isinstance(v, dict)}
-    Console(width=_table_width()).print(metrics_table(known, f"{metrics['sequence']['name']}, scale {scale['mode']}"))
+    sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
+    known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
+    _print_table(metrics_table(known, f"{sequence['name']}, scale {metrics['scale']['mode']}"))
     for note in unit_notes(metrics):
         typer.echo(note)
-    for gap in metrics["sequence"]["bridged"]:
+    for gap in sequence["bridged"]:
         typer.echo(f"BRIDGED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
     typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
-    frames, before = metrics["sequence"]["frames"], metrics["sequence"].get("continued_at", 0)
-    looked_at = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
+    frames, before = sequence["frames"], sequence.get("continued_at", 0)
+    processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
+    seconds, per_second = timing["seconds_total"], timing["frames_per_second"]
+    report = path / "report.html"
     typer.echo(
-        f"{looked_at} in {timing['seconds_total']:.1f} s "
-        f"({timing['frames_per_second']:.1f} a second); everything in {path}"
-        + (f", read {path / 'report.html'}" if (path / "report.html").is_file() else "")
+        f"{processed} in {seconds:.1f} s ({per_second:.1f} a second); everything in {path}"
+        + (f", read {report}" if report.is_file() else "")
     )
 
 
 def _print_localisations(run_folder: RunFolder, table: Table) -> None:
-    from rich.console import Console
-
     from slam.results.comparison import unit_notes
 
-    Console(width=_table_width()).print(table)
+    _print_table(table)
     for note in unit_notes(run_folder.metrics()):
         typer.echo(note)
 
 
-def _table_width() -> int | None:
-    """The terminal's width, or one that wraps nothing in a pipe."""
-    return None if sys.stdout.isatty() else 200
+def _print_table(table: Table) -> None:
+    """As wide as the terminal; in a pipe wide enough that no cell wraps."""
+    from rich.console import Console
+
+    on_terminal = sys.stdout is not None and sys.stdout.isatty()
+    Console(width=None if on_terminal else 200).print(table)
 
 
 def main() -> None:
-    """Run the command line: known errors become one line and exit code 1."""
+    """Run the command line: a known error becomes one line and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     terminal = logging.StreamHandler(sys.stderr)
     terminal.setLevel(logging.WARNING)  # run.log has the rest
     logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
     try:
-        app()
+        app(prog_name="erfsfm-slam")
     except (SlamError, ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm-slam: {error}", err=True)
+        typer.echo(f"erfsfm-slam: {' '.join(str(error).splitlines())}", err=True)
         sys.exit(1)
     except SystemExit as end:
         if end.code == _INTERRUPTED:
             typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
+        elif isinstance(end, Terminated):
+            typer.echo(f"erfsfm-slam: {end}; what was written stays", err=True)
         raise

@@ -16,23 +16,23 @@ from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_nam
 
 PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
-WEIGHTS = ("default", "sim")
+WEIGHTS = ("default", "sim", "erf-dfc")
 
 
 def examine(dataset: Path | None) -> list[str]:
-    """One line a finding, each beginning with ``ok`` or ``missing``.
+    """Check the installation; one line for each finding, each starting with ``ok`` or ``missing``.
 
     Args:
-        dataset: a data set to look at; else ``$KITTI_ODOMETRY`` where it is set.
+        dataset: a data set to check; None for ``$KITTI_ODOMETRY``, if it is set.
     """
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
     lines += [_package(name) for name in PACKAGES]
     lines.append(_open3d())
     lines += [_weights(name) for name in WEIGHTS]
-    told = os.environ.get(KITTI_VARIABLE)
-    root = dataset or (Path(told) if told else None)
+    variable = os.environ.get(KITTI_VARIABLE)
+    root = dataset or (Path(variable) if variable else None)
     if root is None:
-        lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset; the simulated street needs none")
+        lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)")
     else:
         lines += _dataset(root)
     return lines
@@ -68,7 +68,7 @@ def _dataset(root: Path) -> list[str]:
     except SlamError as error:
         return [f"missing  {error}"]
     if not names:
-        return [f"missing  {root} is of no kind that 'erfsfm-slam run --help' names"]
+        return [f"missing  {root} is not a data set of a kind that 'erfsfm-slam run --help' lists"]
     return [_sequence(root, name) for name in names]
 
 

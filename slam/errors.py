@@ -1,5 +1,12 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from erfsfm.errors import DataError
+
 
 class SlamError(Exception):
     """Base of every known error of the SLAM package."""
@@ -14,7 +21,7 @@ class SequenceError(SlamError):
 
 
 class MissingFrameError(SequenceError):
-    """A frame of a sequence has no image: a gap in time, which is interpolated."""
+    """A frame whose number is missing from the files of a sequence: a gap in time, which is interpolated."""
 
 
 class TrajectoryError(SlamError):
@@ -23,3 +30,12 @@ class TrajectoryError(SlamError):
 
 class RunError(SlamError):
     """A run folder is missing or incomplete."""
+
+
+@contextmanager
+def sequence_errors() -> Iterator[None]:
+    """Raise what the readers of `erfsfm.readers` refuse as a `SequenceError`; also a decorator."""
+    try:
+        yield
+    except DataError as error:
+        raise SequenceError(str(error)) from error

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.readers.pinhole import Pinhole
 from slam.se3 import FloatArray, invert
 
 T = TypeVar("T")
@@ -29,15 +30,8 @@ LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the 
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class Intrinsics(Pinhole):
     """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
     @property
     def K(self) -> FloatArray:
@@ -54,18 +48,6 @@ class Intrinsics:
         """Every pixel ``(H, W, 2)`` as (u, v)."""
         v, u = np.mgrid[: self.height, : self.width]
         return np.stack([u, v], axis=-1).astype(np.float64)
-
-    def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera after its image is resized, half-pixel exact."""
-        sx, sy = width / self.width, height / self.height
-        return Intrinsics(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-        )
 
 
 @dataclass(frozen=True, eq=False)

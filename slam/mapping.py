@@ -1,7 +1,7 @@
-"""The dense map: learned depth, filtered honestly, fused into a truncated signed distance field.
+"""The dense map: learned depth fused into a truncated signed distance field (TSDF).
 
-Curless and Levoy 1996 on Open3D's sparse ``VoxelBlockGrid``. Learned depth is wrong far away, at depth
-edges and where two views disagree; what is left after those three filters is fused.
+Curless and Levoy 1996 on Open3D's sparse ``VoxelBlockGrid``. Learned depth is wrong far away, at depth edges and where
+two views disagree; these three are filtered out before fusion.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config import MappingConfig
 from slam.errors import SlamError
+from slam.formats.ply import coloured_ply, write_ply
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray, invert, rotation_angle
-from slam.storage.files import write_atomically
 
 _BLOCK_SIDE = 16
-_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street: each time that there are more costs Open3D a second
-_SEED_STRIDE = 4  # Open3D looks for blocks at these pixels alone, and raises where none of them has depth
+_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street; growing costs Open3D a second
+_SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
 _ATTRIBUTES = ("tsdf", "weight", "color")
 
 logger = logging.getLogger(__name__)
@@ -62,14 +62,13 @@ class MapStatistics:
 
 
 class TsdfMap:
-    """Fuses depth maps of one camera along its trajectory; lengths are in the trajectory's unit."""
+    """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
 
     def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
         self._config = config
         self._size = (intrinsics.height, intrinsics.width)
-        self._step = max(1, round(intrinsics.width / config.width_px))
-        self._intrinsics = _thinned(intrinsics, self._step)
-        self._rays = _rays(self._intrinsics)
+        self._intrinsics = intrinsics
+        self._rays = _rays(intrinsics)
         self._grid = self._new_grid()
         self._previous: _View | None = None
         self._first_is_fused = False
@@ -79,7 +78,7 @@ class TsdfMap:
         self._cloud: MapCloud | None = None
 
     def integrate(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> None:
-        """Filter a depth map against the keyframe before it and fuse it; skip it where that is too near.
+        """Filter a depth map by the previous keyframe and fuse it; skip it where the camera hardly moved.
 
         Args:
             depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
@@ -106,7 +105,7 @@ class TsdfMap:
             SlamError: if nothing was fused or seen often enough.
         """
         if self._mesh is None:
-            self._fuse_lonely_frame()
+            self._fuse_single_keyframe()
             extracted = self._extract(self._grid.extract_triangle_mesh)
             mesh = MapMesh(
                 _array(extracted.vertex.positions),
@@ -121,9 +120,9 @@ class TsdfMap:
     def cloud(self) -> MapCloud:
         """The surface as points; ``SlamError`` as for the mesh."""
         if self._cloud is None:
-            self._fuse_lonely_frame()
+            self._fuse_single_keyframe()
             point = self._extract(self._grid.extract_point_cloud).point
-            # Open3D's threads finish in any order: sorted, two runs give one file
+            # Open3D's threads finish in any order; sorted, two runs write the same file
             order = np.lexsort(_array(point.positions).T)
             positions, normals, colours = (
                 _array(part)[order] for part in (point.positions, point.normals, point.colors)
@@ -141,24 +140,18 @@ class TsdfMap:
         return MapStatistics(triangles, points, blocks, self._fused, self._left_out)
 
     def write_mesh(self, path: Path) -> None:
-        """Write the mesh as binary PLY, atomically; ``SlamError`` if the map is empty."""
-        o3d = import_open3d()
+        """Write the mesh as binary PLY, atomically.
+
+        Raises:
+            SlamError: the map is empty, or (`RunError`) the file cannot be written.
+        """
         mesh = self.mesh()
-        written = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
-        )
-        written.vertex_colors = o3d.utility.Vector3dVector(np.clip(mesh.colours, 0, 1))
-        written.compute_vertex_normals()
-        _write_ply(path, lambda name: o3d.io.write_triangle_mesh(name, written))
+        write_ply(path, coloured_ply(mesh.vertices_world, _vertex_normals(mesh), mesh.colours, mesh.triangles))
 
     def write_cloud(self, path: Path) -> None:
-        """Write the cloud as binary PLY, atomically; ``SlamError`` if the map is empty."""
-        o3d = import_open3d()
+        """Write the cloud as binary PLY, atomically; raises as ``write_mesh``."""
         cloud = self.cloud()
-        written = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points_world))
-        written.normals = o3d.utility.Vector3dVector(cloud.normals_world)
-        written.colors = o3d.utility.Vector3dVector(np.clip(cloud.colours, 0, 1))
-        _write_ply(path, lambda name: o3d.io.write_point_cloud(name, written))
+        write_ply(path, coloured_ply(cloud.points_world, cloud.normals_world, cloud.colours))
 
     def _new_grid(self) -> Any:
         o3d = import_open3d()
@@ -174,10 +167,8 @@ class TsdfMap:
         )
 
     def _view(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> _View:
-        start, step = self._step // 2, self._step
-        depth = np.ascontiguousarray(depth[start::step, start::step], dtype=np.float32)
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-        return _View(depth, image[start::step, start::step], T_world_camera)
+        known = np.isfinite(depth) & (depth > 0)
+        return _View(np.where(known, depth, np.float32(0)).astype(np.float32), image, T_world_camera)
 
     def _is_keyframe(self, view: _View, previous: _View) -> bool:
         T_previous_camera = invert(previous.T_world_camera) @ view.T_world_camera
@@ -187,7 +178,7 @@ class TsdfMap:
         return moved >= config.keyframe_distance_m or turned >= np.deg2rad(config.keyframe_rotation_deg)
 
     def _agrees(self, view: _View, other: _View) -> NDArray[np.bool_]:
-        """Pixels ``(H, W)`` whose depth the other view's depth confirms."""
+        """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         camera = self._intrinsics
         T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
         points = self._rays * view.depth.ravel()  # (3, H*W)
@@ -234,8 +225,8 @@ class TsdfMap:
             blocks, depth_image, colour_image, intrinsic, extrinsic, depth_scale, depth_max, truncation
         )
 
-    def _fuse_lonely_frame(self) -> None:
-        """A map of a single keyframe has no second view to ask."""
+    def _fuse_single_keyframe(self) -> None:
+        """Fuse the only keyframe without a check: there is no second view to compare it with."""
         if self._previous is not None and not self._first_is_fused:
             self._fuse(self._previous, np.ones(self._previous.depth.shape, dtype=bool))
             self._first_is_fused = True
@@ -243,7 +234,7 @@ class TsdfMap:
     def _extract(self, extract: Callable[[float], Any]) -> Any:
         if self._fused == 0:
             raise SlamError("the map is empty: no depth passed the filters")
-        # one frame alone weighs 1: a short sequence must not ask for more than it has
+        # a frame weighs 1: with fewer frames than min_weight nothing would be extracted
         weight = min(self._config.min_weight, self._fused) - 0.5
         unseen = SlamError(f"the map is empty: no surface was seen {self._config.min_weight:g} times")
         try:
@@ -257,20 +248,11 @@ class TsdfMap:
 
 @dataclass(frozen=True)
 class _View:
-    """A thinned frame: depth ``(H, W)`` with 0 where unknown, its image and pose."""
+    """A frame: depth ``(H, W)`` with 0 where unknown, its image and pose."""
 
     depth: DepthMap
     image: Image
     T_world_camera: FloatArray
-
-
-def _thinned(intrinsics: Intrinsics, step: int) -> Intrinsics:
-    """The camera of every ``step``-th row and column, from ``step // 2`` on."""
-    start = step // 2
-    width = len(range(start, intrinsics.width, step))
-    height = len(range(start, intrinsics.height, step))
-    cx, cy = (intrinsics.cx - start) / step, (intrinsics.cy - start) / step
-    return Intrinsics(width, height, intrinsics.fx / step, intrinsics.fy / step, cx, cy)
 
 
 def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
@@ -280,7 +262,7 @@ def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
-    """Pixels on either side of a relative depth step: networks smear surfaces across it."""
+    """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
     for near, far in (
         ((slice(None), slice(1, None)), (slice(None), slice(-1))),
@@ -294,12 +276,12 @@ def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
 
 
 def _sorted(mesh: MapMesh) -> MapMesh:
-    """The same mesh in an order that does not depend on how Open3D's threads finished."""
+    """The same mesh in an order that does not depend on Open3D's threads."""
     order = np.lexsort(mesh.vertices_world.T)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     triangles = rank[mesh.triangles]
-    first = triangles.argmin(axis=1)[:, None]  # turning a triangle keeps the side it faces
+    first = triangles.argmin(axis=1)[:, None]  # cyclic rotation keeps the orientation of a triangle
     triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]
     return MapMesh(mesh.vertices_world[order], triangles, mesh.colours[order])
@@ -316,31 +298,12 @@ def _without_small_components(mesh: MapMesh, min_triangles: int) -> MapMesh:
     return MapMesh(mesh.vertices_world[used], renumbered.reshape(-1, 3), mesh.colours[used])
 
 
+def _vertex_normals(mesh: MapMesh) -> FloatArray:
+    """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
+    o3d = import_open3d()
+    vertices, triangles = o3d.utility.Vector3dVector(mesh.vertices_world), o3d.utility.Vector3iVector(mesh.triangles)
+    return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
+
+
 def _array(tensor: Any) -> FloatArray:
     return np.asarray(tensor.numpy(), dtype=np.float64)
-
-
-def rotate_ply(source: Path, target: Path, R_up_world: FloatArray) -> None:
-    """Write the mesh or cloud of one PLY file with vertices and normals turned by ``R_up_world`` ``(3, 3)``.
-
-    Raises:
-        SlamError: the source is no PLY, or the target cannot be written.
-    """
-    o3d = import_open3d()
-    kind = o3d.io.read_file_geometry_type(str(source))
-    is_mesh = bool(int(kind) & int(o3d.io.CONTAINS_TRIANGLES))
-    read = o3d.io.read_triangle_mesh if is_mesh else o3d.io.read_point_cloud
-    geometry = read(str(source))
-    if geometry.is_empty():
-        raise SlamError(f"{source} holds no points: it is damaged or not a PLY; run the sequence again")
-    geometry.rotate(R_up_world, center=np.zeros(3))
-    write = o3d.io.write_triangle_mesh if is_mesh else o3d.io.write_point_cloud
-    _write_ply(target, lambda name: write(name, geometry))
-
-
-def _write_ply(path: Path, write: Callable[[str], bool]) -> None:
-    def fill(partial: Path) -> None:
-        if not write(str(partial)):
-            raise SlamError(f"{path} cannot be written: check the folder and the space on the disk")
-
-    write_atomically(path, fill)

@@ -1,8 +1,8 @@
-"""The pose graph: relative poses in, the trajectory that explains them best out.
+"""The pose graph: relative poses in, the most likely trajectory out. The only module that imports gtsam.
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
-that order. Gross outliers are met by a Huber kernel: redescending kernels do not come back from a drifted
-start, so Cauchy is only offered as a polish of the Huber result.
+that order. A Huber kernel limits outliers. Redescending kernels do not recover from a drifted start, so Cauchy is only
+offered as a second stage after Huber.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from slam.se3 import FloatArray, invert, is_se3
 
 _ANCHOR_SIGMA = 1e-6
 _OUTLYING = 3.0
-# iSAM2: a pose that moved by more is linearised anew; it has settled where none moves by more
+# iSAM2: threshold of relinearisation, and of convergence
 _RELINEARISE = 1e-3
 _SETTLED = 1e-4
 _MOST_UPDATES = 20
@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 
 class PoseGraph:
-    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 holds the world."""
+    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame."""
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._config = config
@@ -51,7 +51,7 @@ class PoseGraph:
 
     @property
     def dropped(self) -> tuple[RelativePose, ...]:
-        """Loop edges given up: the system could not be solved with them, or they contradict the rest."""
+        """Loop factors dropped: the system was singular with them, or they contradict the rest."""
         return tuple(self._dropped)
 
     @property
@@ -70,7 +70,7 @@ class PoseGraph:
         self._relative_poses += relative_poses
 
     def optimise(self, T_world_camera_initial: FloatArray) -> FloatArray:
-        """Solve for all poses from an initial trajectory; the first pose stays where it is.
+        """Solve for all poses from an initial trajectory; the first pose is fixed.
 
         Args:
             T_world_camera_initial: start ``(N, 4, 4)``, in the unit of the factors.
@@ -95,13 +95,13 @@ class PoseGraph:
         raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
 
     def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
-        """Give up the loops that the optimised trajectory could not meet while it met most others.
+        """Drop the loops with a large residual at the optimised trajectory while most others have a small one.
 
-        Where all loops pull together against an overconfident odometry none is to blame: a loop must also lie
-        far outside what the middle one shows.
+        Where the odometry is overconfident all loops have large residuals. So a loop must also lie far above the
+        median residual of all loops.
 
         Returns:
-            The loops given up; where there are any, optimise again.
+            The loops dropped; where there are any, optimise again.
         """
         squared = self.errors
         is_loop = np.array([edge.source == LOOP_SOURCE for edge in self._relative_poses], dtype=bool)
@@ -169,10 +169,10 @@ class PoseGraph:
 
 
 class IncrementalPoseGraph:
-    """The same factors solved as they arrive, by iSAM2 (Kaess et al. 2012).
+    """The same factors solved incrementally by iSAM2 (Kaess et al. 2012).
 
-    iSAM2 weighs a robust factor anew only where it linearises anew, so it does that often; measurements that later
-    frames taught to read differently are exchanged.
+    iSAM2 updates the weight of a robust factor only where it relinearises, so it does that often. Measurements that
+    later frames changed are exchanged.
     """
 
     def __init__(self, config: PoseGraphConfig) -> None:
@@ -181,7 +181,7 @@ class IncrementalPoseGraph:
         self._start()
 
     def update(self, relative_poses: Sequence[RelativePose], T_world_camera_initial: FloatArray) -> FloatArray:
-        """Make the graph hold these factors and no others.
+        """Exchange the graph's factors for these and solve.
 
         Args:
             relative_poses: all factors, at most one of a source between two frames in one direction.
@@ -275,7 +275,7 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
 
 
 def _differ(old: RelativePose, new: RelativePose) -> bool:
-    """Whether a measurement has changed by more than nothing to speak of."""
+    """Whether a measurement or its sigmas changed by more than ``_SAME_RATIO``."""
     moved = np.abs(old.T_from_to - new.T_from_to).max()
     widened = np.abs(old.graph_sigmas / new.graph_sigmas - 1.0).max()
     return bool(moved > _SAME_RATIO * new.sigmas.min() or widened > _SAME_RATIO)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict, Unpack
 
-import cv2
 import numpy as np
-import scipy
 
-from erfsfm import __version__, photometric_residual
+from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit, overlapping
-from slam import frontend, loops, se3
-from slam.config import OutputConfig, SlamConfig, dump_yaml, load_config
+from erfsfm.threads import limit_library_threads
+from slam.config import SlamConfig, dump_yaml, load_config
 from slam.errors import ConfigError, RunError, SlamError
 from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
@@ -26,45 +24,45 @@ from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_
 from slam.prediction.networks import NetworkPredictor
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
-from slam.results.metrics import lidar_trajectory, run_metrics
+from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
+from slam.results.output import UNFINISHED, check_output
 from slam.results.report import DepthExample, write_report
 from slam.results.rerun import write_rerun
-from slam.results.summary import (
-    Provenance,
-    as_json,
-    describe_failure,
-)
+from slam.results.run_log import LOG, RunLog, run_log
+from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.imports import import_rerun
-from slam.runtime.threads import limit_library_threads
+from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
-from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, fingerprint, without_cache
+from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
+from slam.storage.fingerprint import code_fingerprint
 
-logger = logging.getLogger(__name__)
-
-# what a pass over the frames depends on
+# what the pass over the frames depends on: `run --continue` cannot change it
 _SETTLED = ("geometry", "gaps", "road", "scale", "loops")
 
 
-def run_slam(
-    dataset: str | Path | None = None,
-    sequence: str | None = None,
-    camera: Path | None = None,
-    weights: str | Path = "default",
-    config: str | Path | None = None,
-    overrides: Sequence[str] = (),
-    frames: str | None = None,
-    output: Path | None = None,
-    seed: int = 0,
-    device: str = "auto",
-    progress: Progress | None = None,
-    command: str = "slam.run_slam",
-    cache: Path | None = None,
-    rerun: Path | None = None,
-    continues: Path | None = None,
-) -> RunFolder:
-    """Run the whole system on one sequence.
+class RunOptions(TypedDict, total=False):
+    """What `run_slam` takes by name; defaults and meanings as in `RunRequest`."""
 
-    Args:
+    camera: Path | None
+    weights: str | Path
+    config: str | Path | None
+    overrides: Sequence[str]
+    frames: str | None
+    output: Path | None
+    seed: int
+    device: str
+    progress: Progress | None
+    command: str
+    cache: Path | None
+    rerun: Path | None
+    continues: Path | None
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """Everything that a run is asked for.
+
+    Attributes:
         dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
             ``sequence`` is the embedded simulated street.
         sequence: name inside the data set.
@@ -78,129 +76,181 @@ def run_slam(
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: told of (stage, done, total).
         command: recorded in the metrics.
-        cache: folder that keeps the networks' answers and what images alone determine; None asks anew.
+        cache: folder that keeps the networks' answers and what is measured in images; None computes all of it.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, taken by the same camera; its
             configuration holds, and the new folder has the whole drive.
+    """
+
+    dataset: str | Path | None = None
+    sequence: str | None = None
+    camera: Path | None = None
+    weights: str | Path = "default"
+    config: str | Path | None = None
+    overrides: Sequence[str] = ()
+    frames: str | None = None
+    output: Path | None = None
+    seed: int = 0
+    device: str = "auto"
+    progress: Progress | None = None
+    command: str = "slam.run_slam"
+    cache: Path | None = None
+    rerun: Path | None = None
+    continues: Path | None = None
+
+
+def run_slam(
+    dataset: str | Path | None = None, sequence: str | None = None, **options: Unpack[RunOptions]
+) -> RunFolder:
+    """Run the whole system on one sequence.
+
+    Everything that can be checked is checked before a folder is made. An earlier run in ``output`` stays until the
+    trajectories of this one are whole.
+
+    Args:
+        dataset: as in `RunRequest`.
+        sequence: as in `RunRequest`.
+        options: the others of `RunRequest`, by name.
 
     Returns:
         The run folder.
 
     Raises:
-        SlamError, ErfsfmError: one line; whatever ends a run, a folder already made holds what there is and says why.
+        SlamError, ErfsfmError: one line. Whatever ends a run, its folder holds what there is and says why.
     """
-    if rerun is not None:
-        import_rerun()  # better missed before the run than after it
-    settings = load_config(config, overrides) if continues is None else _continued(continues, config, overrides, output)
-    recording = open_sequence(Path(dataset) if dataset is not None else None, sequence, camera, frames)
-    networks = DepthPosePredictor.from_weights(weights, device).freeze()
-    drive = None if continues is None else _drive(continues, networks.sha256, recording)
-    if drive is not None:
-        recording = drive.continued(recording)
-    memory = None if cache is None else DiskCache(cache)
-    get_or_compute = without_cache if memory is None else CacheNamespace(memory, _code()).get_or_compute
-    answers = without_cache if memory is None else _answers(networks, memory)
-    predictor = NetworkPredictor(networks, recording.intrinsics, get_or_compute, answers)
-    provenance = Provenance(
-        version=__version__,
-        commit=commit(),
-        command=command,
-        seed=seed,
-        device=str(networks.device),
-        weights=str(weights),
-        weights_sha256=networks.sha256,
-        weights_licence=networks.record.licence,
-        trained_on=networks.record.trained_on,
-        leak=bool(networks.leaks(recording.provenance())),
-    )
-    folder = RunFolder.create(output, Path(settings.output.root), recording.name)
-    folder.write_text("config.yaml", dump_yaml(settings))
-    with _logging_to(folder.path / "run.log"):
+    request = RunRequest(dataset, sequence, **options)
+    with run_log() as log, raising_on_termination() as ignore_signals:
+        job = _prepare(request)
+        folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
+        folder.write_metrics(describe_start(job.provenance))
         try:
-            pipeline = SlamPipeline(
-                recording, predictor, settings, progress, networks.noise, get_or_compute, drive, seed
-            )
+            log.begin(folder.path / LOG)
             with limit_library_threads():
-                result = _run(folder, pipeline, recording, provenance, settings.output)
-            if rerun is not None:
-                write_rerun(rerun, result, recording.intrinsics, settings.mapping.voxel_size_m)
-            return folder
+                _run(job, folder)
         except BaseException as error:
-            _leave_failure(folder, provenance, settings.output.report, error)
+            ignore_signals()
+            _leave_failure(folder, log, job.settings.output.report, error)
+            if folder.replaces is not None and isinstance(error, SlamError):
+                kept = f"{folder.replaces} keeps its earlier run, this one is in {folder.path}"
+                raise RunError(f"{error}; {kept}") from error
             raise
+        return folder
 
 
-def _continued(continues: Path, config: str | Path | None, overrides: Sequence[str], output: Path | None) -> SlamConfig:
-    """The configuration of a run to continue, with changes to what is not settled by the frames seen."""
-    if config is not None:
+@dataclass(frozen=True)
+class _Job:
+    """A run that was found possible."""
+
+    request: RunRequest
+    settings: SlamConfig
+    recording: FrameSequence
+    pipeline: SlamPipeline
+    provenance: Provenance
+
+
+def _prepare(request: RunRequest) -> _Job:
+    """Everything that a run needs, opened and checked; writes nothing but the cache's folder."""
+    if request.output is not None:
+        check_output(request.output)
+    if request.rerun is not None:
+        import_rerun()
+    settings = _settings(request)
+    dataset = None if request.dataset is None else Path(request.dataset)
+    recording = open_sequence(dataset, request.sequence, request.camera, request.frames)
+    networks = DepthPosePredictor.from_weights(request.weights, request.device).freeze()
+    checkpoint = None
+    if request.continues is not None:
+        checkpoint = _checkpoint(request.continues, networks.sha256, recording)
+        recording = checkpoint.continued(recording)
+    predictor, get_or_compute = _predictor(networks, recording.intrinsics, request.cache)
+    pipeline = SlamPipeline(
+        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
+    )
+    pipeline.require_possible()
+    return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording))
+
+
+def _settings(request: RunRequest) -> SlamConfig:
+    """The configuration; that of a run to continue, with changes to what the frames it has seen do not settle."""
+    continues = request.continues
+    if continues is None:
+        return load_config(request.config, request.overrides)
+    if request.config is not None:
         raise ConfigError(f"the configuration of {continues} holds for what continues it: leave out --config")
-    if output is not None and output.resolve() == continues.resolve():
-        raise RunError(f"{output} is the run to continue, and would be lost with this one: choose another --output")
+    output = request.output
+    if output is not None and continues.resolve() in (output.resolve(), (output / UNFINISHED).resolve()):
+        raise RunError(
+            f"{continues} is the run to continue, and would be lost with --output {output}: choose another --output"
+        )
     own = load_config(RunFolder.open(continues).require("config.yaml"))
-    settings = load_config(continues / "config.yaml", overrides)
+    settings = load_config(continues / "config.yaml", request.overrides)
     for name in _SETTLED:
         if getattr(settings, name) != getattr(own, name):
             raise ConfigError(f"{name} is settled by the frames of {continues}: leave out --set {name}..., or run anew")
     return settings
 
 
-def _drive(continues: Path, weights_sha256: str, following: FrameSequence) -> SessionCheckpoint:
-    """What is kept of a run to continue, if these networks and frames can go on with it."""
-    drive = SessionCheckpoint.open(continues)
-    if drive.weights_sha256 != weights_sha256:
+def _checkpoint(continues: Path, weights_sha256: str, following: FrameSequence) -> SessionCheckpoint:
+    """What a run to continue kept, if these networks and frames can go on with it."""
+    checkpoint = SessionCheckpoint.open(continues)
+    if checkpoint.weights_sha256 != weights_sha256:
         raise RunError(f"{continues} was run with other weights: continue it with the same --weights")
     ranges = [name for name in following.provenance() if name.endswith("]")]  # a simulated world has none
-    twice = overlapping(ranges, drive.sources)
+    twice = overlapping(ranges, checkpoint.sources)
     if twice:
         raise RunError(f"{', '.join(twice)} holds frames of {continues}: give those that follow, with --frames A:B")
-    return drive
+    return checkpoint
 
 
-def _leave_failure(folder: RunFolder, provenance: Provenance, report: bool, error: BaseException) -> None:
-    """Say in the folder why the run ended; where even that fails, the first error is the one to hear about."""
-    known = isinstance(error, SlamError | ErfsfmError)
-    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
-    logger.error("the run failed: %s", reason)
-    with suppress(SlamError):
-        folder.write_metrics(describe_failure(provenance, reason))
-        if report:
-            write_report(folder, [], None, None)
+def _predictor(
+    networks: DepthPosePredictor, intrinsics: Intrinsics, cache: Path | None
+) -> tuple[NetworkPredictor, GetOrCompute]:
+    """The networks behind the cache, and the cache of what is measured in images."""
+    if cache is None:
+        return NetworkPredictor(networks, intrinsics), without_cache
+    disk, code = DiskCache(cache), code_fingerprint()
+    # GPU and CPU answer a little differently and share no entries
+    identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
+    get_or_compute = CacheNamespace(disk, code).get_or_compute
+    answers = CacheNamespace(disk, identity).get_or_compute
+    return NetworkPredictor(networks, intrinsics, get_or_compute, answers), get_or_compute
 
 
-def _answers(networks: DepthPosePredictor, cache: DiskCache) -> GetOrCompute:
-    """The cache of the networks' answers; GPU and CPU answer a little differently and share none."""
-    network = networks.record.network.model_dump_json()
-    return CacheNamespace(cache, f"{networks.sha256} {network} {networks.device.type}").get_or_compute
+def _provenance(request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence) -> Provenance:
+    return Provenance(
+        version=__version__,
+        commit=commit(),
+        command=request.command,
+        seed=request.seed,
+        device=str(networks.device),
+        weights=str(request.weights),
+        weights_sha256=networks.sha256,
+        weights_licence=networks.record.licence,
+        trained_on=networks.record.trained_on,
+        leak=bool(networks.leaks(recording.provenance())),
+    )
 
 
-def _code() -> str:
-    """Whatever measures images: an entry names it, so that there is no version to forget."""
-    folders = (Path(package.__path__[0]) for package in (frontend, loops))
-    sources = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
-    versions = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
-    return " ".join((fingerprint(*sources, Path(se3.__file__), Path(photometric_residual.__file__)), *versions))
-
-
-def _run(
-    folder: RunFolder, pipeline: SlamPipeline, sequence: FrameSequence, provenance: Provenance, output: OutputConfig
-) -> SlamResult:
-    estimate = pipeline.estimate()
-    _write_estimate(folder, estimate, sequence.intrinsics)
-    if output.keep != "nothing":
-        folder.write(DRIVE, SessionCheckpoint.of(sequence, estimate.state, provenance.weights_sha256).write)
-    if output.keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, estimate.state.seen.keyframes))
-    result = replace(estimate, map=pipeline.fuse(estimate))
-    surface = write_map(folder, result, sequence)
-    folder.write_metrics(run_metrics(result, sequence, provenance, surface.summary))
-    if output.report:
+def _run(job: _Job, folder: RunFolder) -> None:
+    """Estimate, then map, then report; each is on disk before the next begins."""
+    folder.write_text("config.yaml", dump_yaml(job.settings))
+    estimate = job.pipeline.estimate()
+    _write_estimate(folder, estimate, job)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance)
+    folder.write_metrics(metrics)
+    folder.publish()
+    result = replace(estimate, map=job.pipeline.fuse(estimate))
+    surface = write_map(folder, result, job.recording)
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary))
+    if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, surface.points, surface.colours)
-    return result
+    if job.request.rerun is not None:
+        write_rerun(job.request.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
 
 
-def _write_estimate(folder: RunFolder, result: SlamResult, intrinsics: Intrinsics) -> None:
-    """Trajectories, graph, loops and places: kept even where the map fails."""
+def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
+    """Trajectories, graph, loops and places, and what ``run --continue`` needs."""
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
@@ -208,9 +258,15 @@ def _write_estimate(folder: RunFolder, result: SlamResult, intrinsics: Intrinsic
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("trajectory_lidar", lidar)
-    folder.write("graph.g2o", result.graph.write_g2o)
+    result.graph.write_g2o(folder.path / "graph.g2o")
     folder.write_text("loops.json", as_json(result.loops.details()))
-    folder.write(PLACES, _places(result, intrinsics).write)
+    folder.write(PLACES, _places(result, job.recording.intrinsics).write)
+    keep = job.settings.output.keep
+    if keep != "nothing":
+        checkpoint = SessionCheckpoint.of(job.recording, result.state, job.provenance.weights_sha256)
+        folder.write(DRIVE, checkpoint.write)
+    if keep == "keyframes":
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
 
 
 def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
@@ -220,18 +276,12 @@ def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
     return Places(intrinsics, views, T_world_camera)
 
 
-@contextmanager
-def _logging_to(path: Path) -> Iterator[None]:
-    """Send the package's log to a file, line by line, beside wherever it goes already."""
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    root = logging.getLogger("slam")
-    level = root.level
-    root.addHandler(handler)
-    root.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        root.removeHandler(handler)
-        root.setLevel(level)
-        handler.close()
+def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseException) -> None:
+    """Say in the folder why the run ended; where even that fails, the first error is the one to hear about."""
+    known = isinstance(error, SlamError | ErfsfmError | Terminated)
+    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    log.failed(reason)
+    with suppress(SlamError, OSError):
+        folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
+        if report:
+            write_report(folder, [], None, None)

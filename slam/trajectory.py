@@ -1,4 +1,4 @@
-"""Trajectories: timed camera poses, their KITTI and TUM files, and the matching of two of them.
+"""Trajectories: camera poses with time stamps, their KITTI and TUM files, and association by time stamp.
 
 Conventions: ``docs/conventions.md``. This is the only file where quaternions appear.
 """
@@ -31,7 +31,7 @@ class Trajectory:
     """Camera poses in time order.
 
     ``stamps`` ``(N,)`` in seconds, ``T_world_camera`` ``(N, 4, 4)``, metres or the trajectory's own unit.
-    ``timed`` is False where the stamps are mere row numbers, as in a KITTI file.
+    ``timed`` is False where the stamps are row numbers, as in a KITTI file.
     """
 
     stamps: FloatArray
@@ -75,13 +75,13 @@ class Trajectory:
 
 
 def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
-    """Read a KITTI file (12 numbers a row) or a TUM file (8), or with ``auto`` whichever it holds.
+    """Read a KITTI file (12 numbers a row) or a TUM file (8); ``auto`` decides by the first row.
 
-    Blank lines and lines that start with ``#`` are skipped. Rotations off by rounding are replaced by the
-    nearest rotation.
+    Blank lines and lines that start with ``#`` are skipped. Rotations that are not orthonormal by rounding
+    are replaced by the nearest rotation.
 
     Raises:
-        TrajectoryError: if the file cannot be read as such; one line that names file and line number.
+        TrajectoryError: if the file cannot be read as such; the message names file and line.
     """
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
@@ -95,7 +95,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
         if backwards.size:
             raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: time stamps must increase")
     R = T_world_camera[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers end as NaN, which fits nothing
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check below
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
         wrong = np.flatnonzero(~((deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)))
     if wrong.size:
@@ -115,7 +115,7 @@ def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps keep every digit they have.
+    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits.
 
     Raises:
         TrajectoryError: if the file cannot be written.
@@ -128,13 +128,13 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
-    """The rows of both that belong together, equally many.
+    """The rows of both that belong to the same frames, equally many.
 
-    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. As soon
-    as one has no stamps of its own, row k belongs to row k and the lengths must agree.
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. If one of
+    them is not timed, row k belongs to row k and the lengths must agree.
 
     Raises:
-        TrajectoryError: if the lengths differ and stamps are missing, or no stamp has a partner.
+        TrajectoryError: if the lengths differ and stamps are missing, or no stamps match.
     """
     if not (estimate.timed and reference.timed):
         if len(estimate) != len(reference):
@@ -152,7 +152,7 @@ def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, 
         )
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
-        logger.warning("only %d of %d poses have a partner in time", rows_estimate.size, expected)
+        logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
     return estimate.select(rows_estimate), reference.select(rows_reference)
 
 
@@ -167,7 +167,7 @@ def _match_stamps(a: Trajectory, b: Trajectory) -> tuple[NDArray[np.intp], NDArr
     nearest_b, nearest_a = _nearest(a.stamps, b.stamps), _nearest(b.stamps, a.stamps)
     rows_a = np.arange(len(a))
     mutual = nearest_a[nearest_b] == rows_a
-    # A hair of slack: the tolerance itself is a difference of rounded stamps.
+    # Slack, because the tolerance itself is a difference of rounded stamps.
     close = np.abs(b.stamps[nearest_b] - a.stamps) <= matching_tolerance_s(a, b) * (1.0 + 1e-6)
     chosen = mutual & close
     return rows_a[chosen], nearest_b[chosen]
@@ -188,7 +188,7 @@ def _time_span(trajectory: Trajectory) -> str:
 
 
 def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
-    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; 0 columns: as many as the first row."""
+    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; with 0 columns, those of the first row."""
     lines: list[int] = []
     rows: list[list[float]] = []
     for line, words in _read_words(path):
@@ -237,7 +237,7 @@ def _check_columns(where: str, found: int, wanted: int) -> None:
 
 
 def _reason(error: ValueError) -> str:
-    """Python's message about a word that is no number, in ours."""
+    """Python's message about a word that is not a number, reworded."""
     return str(error).replace("could not convert string to float:", "not a number:")
 
 

@@ -28,8 +28,11 @@ LOADERS: dict[str, Callable[[str], object]] = {
     "splits": read_split_file,
 }
 MOST_LINES = 350
+MOST_FUNCTION_LINES = 60
+MOST_PARAMETERS = 9
 
-Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+Definition = Function | ast.ClassDef
 
 
 def name_of(path: Path) -> str:
@@ -75,6 +78,42 @@ def test_a_file_is_short_enough_to_be_read(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= MOST_LINES
 
 
+def functions(tree: ast.AST, within: str = "") -> Iterator[tuple[str, Function]]:
+    """Every function of a module with its qualified name, methods and nested functions too."""
+    for node in ast.iter_child_nodes(tree):
+        name = within
+        if isinstance(node, Definition):
+            name = f"{within}.{node.name}".lstrip(".")
+            if isinstance(node, Function):
+                yield name, node
+        yield from functions(node, name)
+
+
+def parameters(function: Function) -> int:
+    """How many parameters a caller may give: all but the ``self`` or ``cls`` of a method."""
+    given = function.args
+    names = [
+        each.arg for each in (*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg) if each
+    ]
+    return len(names) - (names[:1] in (["self"], ["cls"]))
+
+
+def is_verb(function: Function) -> bool:
+    """Whether typer calls it: the parameters of a command-line verb are its options."""
+    return any("command(" in ast.unparse(decorator) for decorator in function.decorator_list)
+
+
+def test_functions_are_short_and_take_few_parameters() -> None:
+    over = {}
+    for path in SOURCES:
+        for name, function in functions(ast.parse(path.read_text())):
+            lines = (function.end_lineno or 0) - function.lineno + 1
+            given = 0 if is_verb(function) else parameters(function)
+            if lines > MOST_FUNCTION_LINES or given > MOST_PARAMETERS:
+                over[f"{name_of(path)}:{name}"] = f"{lines} lines, {given} parameters"
+    assert not over, f"split them: at most {MOST_FUNCTION_LINES} lines and {MOST_PARAMETERS} parameters; {over}"
+
+
 def test_only_command_lines_and_tools_print() -> None:
     calls = {
         name_of(path)
@@ -104,6 +143,21 @@ def test_both_packages_are_of_one_distribution_and_one_place() -> None:
     assert erfsfm.DISTRIBUTION == slam.DISTRIBUTION == "erfsfm-slam"
     assert erfsfm.__file__ is not None and slam.__file__ is not None
     assert Path(erfsfm.__file__).parents[1] == Path(slam.__file__).parents[1]
+
+
+def test_every_folder_of_modules_is_a_package() -> None:
+    """Without ``__init__.py`` a folder imports well enough, but import contracts do not see it."""
+    assert not [name_of(path.parent) for path in MODULES if not (path.parent / "__init__.py").is_file()]
+
+
+def test_git_ignores_no_source() -> None:
+    """A pattern such as ``results/`` would also keep ``slam/results/`` out of commits and out of the wheel."""
+    names = "\n".join(map(name_of, SOURCES))
+    command = ["git", "check-ignore", "--no-index", "--stdin"]
+    listed = subprocess.run(command, cwd=ROOT, input=names, capture_output=True, text=True, check=False)
+    if listed.returncode == 128:
+        pytest.skip("not a git checkout")
+    assert listed.stdout == ""
 
 
 def test_tests_shadow_no_package() -> None:

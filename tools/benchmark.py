@@ -22,7 +22,7 @@ from benchmarking.metric_definitions import rows
 from benchmarking.page import PICTURE, section, with_section
 from benchmarking.picture import draw, drawable
 from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Condition, Job, excerpts, plan, recordings, worlds
-from benchmarking.summary import marks
+from benchmarking.summary import summary_table
 from benchmarking.work import ROOT, measured, workers
 
 from slam.errors import SlamError
@@ -30,7 +30,7 @@ from slam.storage.files import write_atomically
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Plan, run what is missing, write tables."""
+    """Plan the runs, perform those that are missing, write tables."""
     options = _parser().parse_args(words)
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)
@@ -41,23 +41,23 @@ def main(words: Sequence[str] | None = None) -> None:
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or --kitti")
     with workers(at_a_time, scheduler) as spread:
-        outcomes = measured(jobs, spread)
-    table_of_runs = rows(outcomes)
+        results = measured(jobs, spread)
+    table_of_runs = rows(results)
     with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table_of_runs[0])
         writer.writeheader()
         writer.writerows(table_of_runs)
-    text = section(options.mode, _command(options), outcomes, "several" if scheduler else str(at_a_time))
+    text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
     known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), (options.kitti, "KITTI"), (ROOT, ".")
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
     write_atomically(options.report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
     if options.mode == "accuracy":
-        print(marks(outcomes))
-        if drawable(outcomes):
-            draw(outcomes, options.report.parent / PICTURE)
-    print(f"{options.report}: {len(outcomes)} runs, {sum(bool(o.reason) for o in outcomes)} failed")
+        print(summary_table(results))
+        if drawable(results):
+            draw(results, options.report.parent / PICTURE)
+    print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
@@ -119,7 +119,9 @@ def _parser() -> argparse.ArgumentParser:
         add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
         add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
         add("--weights", nargs="+", default=["default"] if fast else ["default", "sim"], help="names or folders")
-        add("--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the runs")
+        add(
+            "--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the RANSAC draws"
+        )
         add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")

@@ -1,8 +1,8 @@
 """An experiment: can kiss-icp, a LiDAR odometry, register the point clouds of learned depth?
 
-The system runs as ever; then the near part of every learned depth map becomes a cloud of points, and kiss-icp (Vizzo et
-al. 2023) registers cloud after cloud. Its trajectory stands in one table with those of the run. What was found is told
-in docs/design/0012-kiss-icp-on-learned-depth.md.
+The system runs with its usual settings; then the near part of every learned depth map becomes a point cloud, and
+kiss-icp (Vizzo et al. 2023) registers cloud after cloud. Its trajectory is printed in one table with those of the run.
+The result is described in docs/design/tried-without-success.md.
 
 Example: python tools/kiss_icp_on_learned_depth.py --dataset KITTI --sequence 05 --weights sim
 """
@@ -32,7 +32,7 @@ from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
-from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
+from slam.storage.cache import CacheNamespace, DiskCache, without_cache
 from slam.trajectory import Trajectory
 
 SEED = 0
@@ -45,7 +45,9 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         recording = open_sequence(options.dataset, options.sequence, None, options.frames)
         networks = DepthPosePredictor.from_weights(options.weights, "cpu")
-        answers = without_cache if options.cache is None else cached_answers(networks, options.cache)
+        answers = without_cache
+        if options.cache is not None:
+            answers = CacheNamespace(DiskCache(options.cache), networks.sha256).get_or_compute
         predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
         result = SlamPipeline(recording, predictor, load_config(None, options.set)).estimate()
     except (SlamError, ErfsfmError) as error:
@@ -78,11 +80,6 @@ def main(words: Sequence[str] | None = None) -> None:
     Console(width=options.columns).print(metrics_table(measured, title))
 
 
-def cached_answers(networks: DepthPosePredictor, folder: Path) -> GetOrCompute:
-    """Answers of these networks, kept in a folder; a run's own are of frozen graphs and differ in rounding."""
-    return CacheNamespace(DiskCache(folder), f"{networks.sha256} not frozen").get_or_compute
-
-
 def in_metres(keyframes: Sequence[Keyframe], unit: FloatArray) -> list[DepthMap]:
     """Depth ``(H, W)`` of keyframes; ``unit`` ``(N,)`` are the metres in an unscaled length at every frame."""
     return [keyframe.depth_unscaled * np.float32(unit[keyframe.index]) for keyframe in keyframes]
@@ -111,14 +108,14 @@ def registered(
     for depth in depths:
         odometry.register_frame(cloud(depth, intrinsics, far_m, share, rng), np.array([]))
         T_first_camera.append(odometry.last_pose.copy())
-    return invert(T_first_camera[0]) @ np.stack(T_first_camera)
+    return np.asarray(invert(T_first_camera[0]) @ np.stack(T_first_camera), dtype=np.float64)
 
 
 def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:
     """Points ``(P, 3)`` in the camera, metres, of some of the pixels that are near and not at an edge of depth.
 
-    Every frame sees other pixels in another order: with the same rays in each, the road is the same rings of points in
-    every cloud, and registration prefers not to move.
+    The pixels are drawn anew for every frame: with the same rays in each, the road would be the same rings of points in
+    every cloud, which biases registration towards no motion.
     """
     height, width = depth.shape
     camera = intrinsics.resized(width, height)

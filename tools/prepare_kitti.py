@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from erfsfm.data.images import image_files, image_size, resize_image
 from erfsfm.errors import DataError, ErfsfmError
 from erfsfm.files import write_atomically
+from erfsfm.readers.images import image_size, list_images, resize_image
 
 MARK = "prepared.json"
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")
@@ -143,7 +143,7 @@ def _jobs(drive: Path, target: Path, size: Size, odometry: bool, scans: bool, jp
     for camera in CAMERAS if odometry else RAW_CAMERAS:
         folder = Path(camera) if odometry else Path(camera) / "data"
         if (drive / folder).is_dir():
-            for image in image_files(drive / folder):
+            for image in list_images(drive / folder):
                 yield Job(image, target / folder / (f"{image.stem}.jpg" if jpg else image.name), size)
     patterns = ["times.txt"] if odometry else ["image_0?/timestamps.txt", "oxts/**/*.txt"]
     if scans:
@@ -171,7 +171,7 @@ def _write_calibration(drive: Path, target: Path, size: Size, odometry: bool) ->
         folders = [drive / camera for camera in CAMERAS if (drive / camera).is_dir()]
         if not folders:
             raise DataError(f"{drive} has no images: wanted {', '.join(CAMERAS)}")
-        height, width = image_size(image_files(folders[0])[0])
+        height, width = image_size(list_images(folders[0])[0])
         lines = _lines(drive / "calib.txt")
         moved = [_moved(key, text, Size(width, height), size) if key[:1] == "P" else text for key, text in lines]
         _write_lines(target / "calib.txt", lines, moved)

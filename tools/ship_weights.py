@@ -1,4 +1,4 @@
-"""StepRotation a training output into shipped weights: half precision, with a model card.
+"""Turn a training output into shipped weights: half precision, with a model card.
 
 Example: python tools/ship_weights.py runs/sim sim --data "60 simulated worlds, seeds 0-59"
 """

@@ -3,7 +3,7 @@
 Pose variants are trained beside the plain depth network, depth variants beside the plain pose network. Finished
 trainings are not repeated, broken ones go on where they stopped, so the same command may be given again.
 
-Example: python tools/study_receptive_field.py --worlds worlds --unseen unseen --report docs/receptive_field.md
+Example: python tools/study_receptive_field.py --worlds worlds --unseen unseen --report docs/receptive-field-study.md
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ seeds. CPU seconds are those of one training, with {threads} thread{plural}, dat
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StudyRow:
     """One training, measured on unseen worlds. Errors as in the paper's protocols; lengths in the snippet's unit."""
 
     depth: str
@@ -87,11 +87,11 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes to the configuration")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("runs/study"), help="keeps every training")
-    parser.add_argument("--report", type=Path, default=Path("docs/receptive_field.md"))
+    parser.add_argument("--report", type=Path, default=Path("docs/receptive-field-study.md"))
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
 
-    outcomes = []
+    rows = []
     for seed in range(arguments.seeds):  # seed by seed, so that an early look compares like with like
         for depth, pose in PAIRS:
             config = load_experiment(
@@ -105,17 +105,17 @@ def main() -> None:
                     *arguments.set,
                 ],
             )
-            outcome = measured(config, arguments.output / f"{depth}_{pose}_{seed}", arguments.unseen)
-            outcomes.append(outcome)
-            print(json.dumps(asdict(outcome)), file=sys.stderr)
-    write_page(arguments.report, outcomes, config, arguments.unseen)
+            row = measured(config, arguments.output / f"{depth}_{pose}_{seed}", arguments.unseen)
+            rows.append(row)
+            print(json.dumps(asdict(row)), file=sys.stderr)
+    write_page(arguments.report, rows, config, arguments.unseen)
 
 
-def measured(config: ExperimentConfig, folder: Path, unseen: Path) -> Outcome:
-    """The outcome of one training, from its folder if it is there already."""
+def measured(config: ExperimentConfig, folder: Path, unseen: Path) -> StudyRow:
+    """The row of one training, from its folder if it is there already."""
     kept = folder / "outcome.json"
     if kept.is_file():
-        return Outcome(**json.loads(kept.read_text()))
+        return StudyRow(**json.loads(kept.read_text()))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     train(config, folder, resume=(folder / "checkpoints" / "last.ckpt").is_file(), device="cpu")
     seconds = resource.getrusage(resource.RUSAGE_SELF).ru_utime - before
@@ -123,7 +123,7 @@ def measured(config: ExperimentConfig, folder: Path, unseen: Path) -> Outcome:
     names = [r.name for r in discover(unseen)]
     poses = [r for r in pose_protocol(networks, unseen, names, "default", False) if r["method"] == "networks"]
     depth = next(r for r in depth_protocol(networks, unseen, False) if r["method"] == "networks")
-    outcome = Outcome(
+    row = StudyRow(
         depth=config.network.depth,
         pose=config.network.pose,
         seed=config.training.seed,
@@ -132,15 +132,15 @@ def measured(config: ExperimentConfig, folder: Path, unseen: Path) -> Outcome:
         abs_rel=float(depth["abs_rel"]),
         cpu_seconds=seconds,
     )
-    write_atomically(kept, lambda path: path.write_text(json.dumps(asdict(outcome))))
-    return outcome
+    write_atomically(kept, lambda path: path.write_text(json.dumps(asdict(row))))
+    return row
 
 
-def write_page(report: Path, outcomes: Sequence[Outcome], config: ExperimentConfig, unseen: Path) -> None:
+def write_page(report: Path, rows: Sequence[StudyRow], config: ExperimentConfig, unseen: Path) -> None:
     """Tables, picture and what follows from them."""
     figure = report.parent / "images" / "receptive_field_study.png"
     figure.parent.mkdir(parents=True, exist_ok=True)
-    draw(figure, outcomes)
+    draw(figure, rows)
     threads = torch.get_num_threads()
     network, training = config.network, config.training
     page = PAGE.format(
@@ -151,35 +151,35 @@ def write_page(report: Path, outcomes: Sequence[Outcome], config: ExperimentConf
         height=network.height,
         depth_width=network.depth_width,
         pose_width=network.pose_width,
-        seeds=len({o.seed for o in outcomes}),
+        seeds=len({o.seed for o in rows}),
         training=len(split_recordings(config.data)[0]),
         unseen=len(discover(unseen)),
         commit=commit(),
         threads=threads,
         plural="" if threads == 1 else "s",
-        pose=table(outcomes, "pose", network.pose_width),
-        depth=table(outcomes, "depth", network.depth_width),
+        pose=table(rows, "pose", network.pose_width),
+        depth=table(rows, "depth", network.depth_width),
         figure=f"images/{figure.name}",
-        verdict=verdict(outcomes),
+        verdict=verdict(rows),
     )
     write_atomically(report, lambda path: path.write_text(page))
 
 
-def of_kind(outcomes: Sequence[Outcome], kind: str) -> dict[str, list[Outcome]]:
+def of_kind(rows: Sequence[StudyRow], kind: str) -> dict[str, list[StudyRow]]:
     """Trainings by the variant of one kind of network, the other kind plain."""
     names, plain = (POSE, DEPTH[0]) if kind == "pose" else (DEPTH, POSE[0])
     other = "depth" if kind == "pose" else "pose"
-    return {name: [o for o in outcomes if getattr(o, kind) == name and getattr(o, other) == plain] for name in names}
+    return {name: [o for o in rows if getattr(o, kind) == name and getattr(o, other) == plain] for name in names}
 
 
-def table(outcomes: Sequence[Outcome], kind: str, width: float) -> str:
+def table(rows: Sequence[StudyRow], kind: str, width: float) -> str:
     """Markdown rows: cost and errors of each variant."""
     cost = {summary.name: summary for summary in describe(width=width)}
     lines = [
         "| network | field (px) | parameters | multiply-adds | CPU s | snippet ATE | snippet RE (rad) | AbsRel |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name, runs in of_kind(outcomes, kind).items():
+    for name, runs in of_kind(rows, kind).items():
         summary = cost[name]
         work = f"{summary.multiply_adds / 1e6:.0f} M" if summary.multiply_adds else "-"
         figures = [spread([getattr(o, field) for o in runs], 4) for field in ("ate", "re", "abs_rel")]
@@ -197,11 +197,11 @@ def spread(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {deviation:.{digits}f}"
 
 
-def verdict(outcomes: Sequence[Outcome]) -> str:
+def verdict(rows: Sequence[StudyRow]) -> str:
     """Each variant against the plain one, by Welch's t-test."""
     lines = []
     for kind, fields in (("pose", ("ate", "re")), ("depth", ("abs_rel",))):
-        groups = of_kind(outcomes, kind)
+        groups = of_kind(rows, kind)
         plain_name, *wider = groups
         for name in wider:
             for field in fields:
@@ -221,14 +221,14 @@ def verdict(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def draw(path: Path, outcomes: Sequence[Outcome]) -> None:
+def draw(path: Path, rows: Sequence[StudyRow]) -> None:
     """One dot a training, a bar at each mean."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     panels = (("pose", "ate", "snippet ATE"), ("pose", "re", "snippet RE (rad)"), ("depth", "abs_rel", "depth AbsRel"))
     for axes, (kind, field, label) in zip(figure.subplots(1, 3), panels):
-        for place, runs in enumerate(of_kind(outcomes, kind).values()):
+        for place, runs in enumerate(of_kind(rows, kind).values()):
             values = [getattr(o, field) for o in runs]
             axes.plot([place] * len(values), values, "o", color="tab:blue", alpha=0.6)
             axes.plot([place - 0.25, place + 0.25], [np.mean(values)] * 2, "-", color="black")

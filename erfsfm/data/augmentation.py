@@ -1,4 +1,4 @@
-"""One random variation for a whole snippet; the camera moves with the images."""
+"""Random flip, scale-crop and colour of a whole snippet, with its camera."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def augment(
 
     Args:
         images: ``(H, W, 3)`` uint8 each.
-        maps: ``(H, W)`` each, about the pixels of the images: they are moved, never mixed or recoloured.
+        maps: ``(H, W)`` each, per-pixel data: moved by nearest neighbour, never recoloured.
         camera: of these images.
         config: probabilities and largest changes.
         fidelity: ``paper`` mirrors the principal point as the reference does.
-        rng: the only source of chance.
+        rng: of all random draws.
 
     Returns:
         Images and maps of the same size, their camera, and whether they are mirrored.

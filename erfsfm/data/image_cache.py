@@ -13,10 +13,10 @@ _BLOCK = 128  # images
 
 
 class ImageCache:
-    """The most recently decoded frames, up to a size in bytes.
+    """Least-recently-used cache of decoded frames, up to a size in bytes.
 
-    They lie in large blocks of their own. Kept one by one among the short-lived arrays of a sample they would hold
-    on to the heap around them: measured, three times their size.
+    Frames are stored in large blocks. Stored one by one among the short-lived arrays of a sample they fragment the
+    heap: three times their size was measured.
 
     Args:
         limit_mb: memory for images; 0 keeps none.

@@ -5,27 +5,32 @@ An image is decoded when a snippet asks for it.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
-from erfsfm.data.images import resize_image
 from erfsfm.data.video import Video
 from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
+from erfsfm.readers.images import read_image, read_values, resize_image
+from erfsfm.readers.numbering import NumberedFiles
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Recording:
     """Frames of one drive: ``images`` are their files, one and the same again and again where it is a ``video``.
 
-    ``camera`` belongs to the images as stored. ``depth`` and ``poses_file`` are truth, where it is known: poses
-    of camera 0, which this camera sees at ``t_camera_cam0``. ``sequence`` is the name of its folder in an odometry
-    root, ``oxts`` the folder of the GPS/IMU's packets, one a frame.
+    ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which files beside the
+    images count. ``depth`` and ``poses_file`` are truth, where it is known: poses of camera 0, which this camera sees
+    at ``t_camera_cam0``. ``sequence`` is the name of its folder in an odometry root, ``oxts`` the folder of the
+    GPS/IMU's packets, one a frame. A part of a recording with gaps knows how many images come before it (``skipped``)
+    and how many there are in all (``stored``), for pose files that have rows for these alone.
     """
 
     name: str
@@ -38,6 +43,8 @@ class Recording:
     start: int = 0
     sequence: str = ""
     oxts: Path | None = None
+    skipped: int = 0
+    stored: int = 0
 
     def __len__(self) -> int:
         return len(self.images)
@@ -48,36 +55,39 @@ class Recording:
         return f"{self.name}[{self.start}:{self.start + len(self)}]"
 
     def part(self, start: int, stop: int) -> Recording:
-        """Frames ``start`` to ``stop - 1``."""
-        depth = self.depth[start:stop] if self.depth else None
-        return replace(self, images=self.images[start:stop], depth=depth, start=self.start + start)
+        """Frames ``start`` to ``stop - 1`` of this recording, counted from its own first."""
+        return replace(
+            self,
+            images=self.images[start:stop],
+            depth=self.depth[start:stop] if self.depth else None,
+            start=self.start + start,
+            skipped=self.skipped + start,
+        )
+
+    def within(self, first: int, stop: int) -> Recording | None:
+        """Those of its frames whose numbers are ``first`` to ``stop - 1``; None where it has none of them."""
+        begin, end = max(first - self.start, 0), min(stop - self.start, len(self))
+        return self.part(begin, end) if begin < end else None
 
     def image(self, index: int, height: int, width: int) -> NDArray[np.uint8]:
         """Frame as ``(height, width, 3)`` uint8 RGB, resized without crop.
 
         Raises:
-            DataError: the file is missing or not an image.
+            DataError: the file is missing, incomplete, not an image, or of another size than the camera.
         """
         stored = self.images[index]
         if self.video is not None:
             self._require_size(stored, self.video.height, self.video.width)
-            image = self.video.image(self.start + index, height, width)
-        else:
-            decoded = cv2.imread(str(stored), cv2.IMREAD_COLOR)
-            if decoded is None:
-                raise DataError(f"{stored} is missing or not a readable image; restore it or leave it out")
-            self._require_size(stored, *decoded.shape[:2])
-            image = resize_image(np.asarray(decoded, dtype=np.uint8), height, width)
-        return np.ascontiguousarray(image[..., ::-1])
+            return self.video.image(self.start + index, height, width)
+        image = read_image(stored)
+        self._require_size(stored, *image.shape[:2])
+        return resize_image(image, height, width)
 
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the recording has no depth."""
         if self.depth is None:
             return None
-        encoded = cv2.imread(str(self.depth[index]), cv2.IMREAD_UNCHANGED)
-        if encoded is None:
-            raise DataError(f"{self.depth[index]} is missing or not a readable depth image")
-        return np.asarray(encoded, dtype=np.float32) / np.float32(256)
+        return read_values(self.depth[index]).astype(np.float32) / np.float32(256)
 
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.
@@ -94,7 +104,8 @@ class Recording:
             rows = np.loadtxt(self.poses_file, ndmin=2).reshape(-1, 3, 4)
         except ValueError as error:
             raise DataError(f"{self.poses_file} must hold 12 numbers a row: {error}") from error
-        rows = rows[self.start : self.start + len(self)]
+        first = self.skipped if len(rows) == self.stored else self.start
+        rows = rows[first : first + len(self)]
         if len(rows) < len(self):
             raise DataError(f"{self.poses_file} ends before frame {self.start + len(self)} of {self.name}")
         T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -110,3 +121,13 @@ class Recording:
                 f"{stored} is {width} x {height}; the camera of {self.name} is {self.camera.width} x "
                 f"{self.camera.height}; all images of a recording need one size"
             )
+
+
+def split_at_gaps(whole: Recording, files: NumberedFiles) -> list[Recording]:
+    """The parts of a recording between missing frame numbers, each with the numbers of its files."""
+    if files.gaps():
+        logger.warning(
+            "%s: %s; learnt from in %d parts", files.paths[0].parent, files.describe_gaps(), len(files.parts())
+        )
+    parts = [replace(whole.part(a, b), start=files.first + files.rows[a]) for a, b in files.parts()]
+    return [replace(part, stored=len(files.paths)) for part in parts]

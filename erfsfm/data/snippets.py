@@ -22,13 +22,16 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.image_cache import ImageCache
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import Split, read_split_file
-from erfsfm.data.splits import FrameRange, overlapping
+from erfsfm.data.splits import overlapping
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.weather import weathered
 from erfsfm.errors import DataError
+from erfsfm.readers.frame_range import FrameRange
 from erfsfm.teacher.structure import StructureCache
 
 logger = logging.getLogger(__name__)
+
+_DEFAULT_VALIDATION = DataConfig().validation  # may name nothing among the data: not everybody simulates
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def draw(self, number: int) -> dict[str, Tensor]:
         """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
 
-        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `Structure`. With
+        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With
         weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
         """
         rng = np.random.default_rng([self._config.training.seed, number])
@@ -183,6 +186,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         if all(span.counted_in(recording.name) is None for recording in found):
             names = _some([recording.name for recording in found])
             raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
+    _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
     for recording in found:
@@ -197,6 +201,12 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
             "data.exclude, data.validation, data.split and data.leave_out"
         )
+    if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
+        names, wanted = _some([recording.name for recording in found]), _some([*config.validation, *split.validation])
+        raise DataError(
+            f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
+            "or train without validation by data.validation=[]"
+        )
     return _without_stops(training, config), _without_stops(validation, config)
 
 
@@ -209,13 +219,18 @@ def _some(names: Sequence[str]) -> str:
 def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:
     """What spans name of a recording."""
     same = [span.counted_in(recording.name) for span in spans]
-    return [_part(recording, span) for span in same if span is not None]
+    parts = [recording.within(span.start, span.stop) for span in same if span is not None]
+    return [part for part in parts if part is not None]
 
 
-def _part(recording: Recording, span: FrameRange) -> Recording:
-    if span.start >= len(recording):
-        raise DataError(f"{span} begins after the {len(recording)} frames that there are")
-    return recording.part(span.start, span.stop)
+def _require_begun(found: Sequence[Recording], spans: Sequence[FrameRange]) -> None:
+    """Refuse spans that begin after the last frame of the recording they name."""
+    for span in spans:
+        same = [(recording, span.counted_in(recording.name)) for recording in found]
+        named = [(recording.start + len(recording), frames) for recording, frames in same if frames is not None]
+        if named and all(frames.start >= end for end, frames in named):
+            end, frames = max(named, key=lambda pair: pair[0])
+            raise DataError(f"{frames} begins after the {end} frames that there are")
 
 
 def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import yaml
 from pydantic import Field, ValidationError
 
 from erfsfm.config import Section, config_folders
+from erfsfm.config_tree import first_problem
 from erfsfm.errors import DataError
+from erfsfm.yaml_file import YamlError, read_yaml
 
-_FRAMES = re.compile(r"(?P<recording>[^\[\]]+)\[(?P<runs>[\d:, ]+)\]")
+_FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
 _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
 
 
@@ -29,7 +30,8 @@ class Split(Section):
     @property
     def test_recordings(self) -> list[str]:
         """Recordings with a frame to test on, without their frames."""
-        return [name.partition("[")[0] for name in self.test]
+        matches = [(name.strip(), _FRAMES.fullmatch(name.strip())) for name in self.test]
+        return [name if match is None else match["recording"] for name, match in matches]
 
     def test_frames(self) -> list[tuple[str, int]]:
         """Every single frame to test on: its recording and number.
@@ -53,14 +55,12 @@ def read_split_file(name_or_path: str) -> Split:
             raise DataError(f"no split '{name_or_path}': neither a file nor one of {', '.join(shipped)}")
         path = shipped[name_or_path]
     try:
-        return Split.model_validate(yaml.safe_load(path.read_text()) or {})
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+        return Split.model_validate(read_yaml(path) or {})
+    except YamlError as error:
+        raise DataError(str(error)) from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "all of it"
         raise DataError(
-            f"{path} is no split, a file of the lists train, validation and test: {where}: {first['msg']}"
+            f"{path} is no split, a file of the lists train, validation and test: {first_problem(error)}"
         ) from error
 
 

@@ -1,6 +1,6 @@
-"""Frames of a standing car: nothing moves but the traffic, which teaches a wrong depth.
+"""Detection of frames in which the car stands still; there only traffic moves, which gives a wrong depth.
 
-They are known by the speed of the GPS/IMU, or by the images where there is none.
+By the speed of the GPS/IMU, or by image differences where there is none.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.data.kitti_raw import velocity
 from erfsfm.data.recordings import Recording
+from erfsfm.readers.kitti_oxts import velocity
 
 STILL_M_S = 0.5  # 5 cm a frame
 STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2
@@ -28,7 +28,7 @@ def moving_parts(recording: Recording) -> list[Recording]:
 
 
 def _still(recording: Recording) -> NDArray[np.bool_]:
-    """``(N,)``, whether the car stands."""
+    """Whether the car stands, ``(N,)``."""
     if recording.oxts is None:
         return _unchanged(recording)
     return _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
@@ -41,10 +41,10 @@ def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
 
 
 def _unchanged(recording: Recording) -> NDArray[np.bool_]:
-    """``(N,)``, whether most of an image is that of the frame before, whatever passes through it.
+    """Whether an image hardly differs from the frame before, by its median absolute change of grey level, ``(N,)``.
 
-    Medians forgive the traffic: that of the changes is the exposure's, that of the rest tells. The first frame is
-    judged by the step to the second.
+    The median is robust to traffic. The median change itself is taken off first, as a change of exposure. The first
+    frame has the result of the second.
     """
     columns, rows = _SMALL
     changes = []

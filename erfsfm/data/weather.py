@@ -1,4 +1,4 @@
-"""Bad weather over a snippet, after it was measured: exposure that jumps, motion blur, rain."""
+"""Simulated weather on a snippet: exposure jumps, motion blur, rain; the geometry is unchanged."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from erfsfm.data.augmentation import Images
 Pictures = list[NDArray[np.float32]]  # colour in [0, 1]
 
 _EACH = 0.6  # chance of each of the three
-_BLUR_SAMPLES = 6  # pictures that make a blurred one
+_BLUR_SAMPLES = 6  # images averaged into a blurred one
 
 
 def weathered(images: Images, rng: np.random.Generator) -> Images:
-    """The same views, worse seen; the structure in them stays where it is.
+    """The same views under random weather; pixels keep their place.
 
     Args:
         images: ``(H, W, 3)`` uint8 each, in time order.
-        rng: the only source of chance.
+        rng: of all random draws.
     """
     exposure, blur, rain = rng.random(3) < _EACH
     seen: Pictures = [np.asarray(image / 255, dtype=np.float32) for image in images]
@@ -33,7 +33,7 @@ def weathered(images: Images, rng: np.random.Generator) -> Images:
 
 
 def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
-    """As a camera sees that drives and turns while its shutter is open."""
+    """Motion blur of a camera that translates and rotates during the exposure."""
     height, width = images[0].shape[:2]
     approach = float(rng.uniform(0, 0.08))
     turn = float(rng.normal(0, 0.01)) * width
@@ -53,7 +53,7 @@ def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
 
 
 def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
-    """Another gain and gamma, and from some frame on another again."""
+    """A random gain and gamma, with a jump at a random frame."""
     jump = int(rng.integers(len(images) + 1))
     before, after = ((float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.7, 1.4))) for _ in range(2))
     chosen = [before if k < jump else after for k in range(len(images))]
@@ -61,7 +61,7 @@ def _exposed(images: Pictures, rng: np.random.Generator) -> Pictures:
 
 
 def _rained_on(images: Pictures, rng: np.random.Generator) -> Pictures:
-    """A grey veil for the whole snippet, and streaks that no two frames share."""
+    """Reduced contrast for the whole snippet, and rain streaks of each frame."""
     height, width = images[0].shape[:2]
     veil, grey = float(rng.uniform(0, 0.35)), float(rng.uniform(0.3, 0.8))
     density, strength = float(rng.uniform(0.001, 0.01)), float(rng.uniform(0.1, 0.5))

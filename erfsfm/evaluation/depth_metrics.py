@@ -16,7 +16,7 @@ Clipping = Literal["after", "before"]
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Means over the compared pixels; ``scale`` is what the prediction was multiplied by."""
+    """Means over the compared pixels; ``scale`` is the factor on the prediction."""
 
     abs_rel: float
     sq_rel: float
@@ -59,8 +59,8 @@ def depth_errors(
         predicted: z-depth ``(H, W)``, positive.
         true_depth: z-depth in metres ``(H, W)``, 0 where unknown.
         cap_m: truth beyond is left out; the prediction is clipped to it.
-        crop: which part of the image counts.
-        scaling: ``median`` multiplies the prediction by the ratio of the medians, a number by itself.
+        crop: part of the image that is compared.
+        scaling: ``median`` multiplies the prediction by the ratio of the medians, a number by that number.
         clipping: ``after`` scaling is the field's rule; ``before``, and never after, is the paper's code.
 
     Returns:

@@ -6,26 +6,25 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from erfsfm.checkpoint import ModelRecord
 from erfsfm.config import Fidelity
-from erfsfm.data.images import resize_image
 from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
-from erfsfm.evaluation.protocols import CAP_M, Networks, refuse_leak
+from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
+from erfsfm.readers.images import read_image, resize_image
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0
 
 
-class RawNetworks(Networks, Protocol):
-    """What this protocol asks for beside the others: the size of the networks' images."""
+class RawNetworks(PoseDepthNetworks, Protocol):
+    """Networks with their record: this protocol needs the size of their images."""
 
     record: ModelRecord
 
@@ -73,7 +72,7 @@ def eigen_protocol(
 
     Returns:
         Rows ``gt-median`` and ``pose`` of the networks; ``pose`` multiplies depth by the mean over a window's sources
-        of true over predicted distance. Then ``gt-median`` of what knows nothing: a flat road, and 20 m above it.
+        of true over predicted distance. Then ``gt-median`` of a baseline that uses no image: a flat road, cut at 20 m.
 
     Raises:
         DataError: split, images, LiDAR or GPS/IMU missing or malformed, or a leak that was not allowed.
@@ -83,7 +82,7 @@ def eigen_protocol(
     errors: dict[str, list[DepthErrors]] = {"gt-median": [], "pose": []}
     flat: list[DepthErrors] = []
     for frame in frames:
-        image = _read(frame.image_path())
+        image = read_image(frame.image_path())
         truth = lidar_depth(frame, image.shape[:2], fidelity)
         guess = _depth(networks, image, fidelity)
         found = _compare(guess, truth, "median", fidelity)
@@ -130,12 +129,12 @@ def _compare(
 
 
 def _scale_of_motion(networks: RawNetworks, frame: RawFrame, fidelity: Fidelity) -> float | None:
-    """Mean of true over predicted distance to the sources; None where the car stands, but in paper fidelity."""
+    """Mean of true over predicted distance to the sources; None for a still car, except in paper fidelity."""
     window = frame.window(networks.sources)
     true = displacements(frame, window)
     if fidelity == "default" and true.max() < _STILL_M:
         return None
-    T_source_target = networks.poses([_read(frame.image_path(index)) for index in window])
+    T_source_target = networks.poses([read_image(frame.image_path(index)) for index in window])
     predicted = np.linalg.norm(T_source_target[:, :3, 3], axis=1)
     return float(np.mean(true / np.maximum(predicted, 1e-12)))
 
@@ -155,10 +154,3 @@ def _row(method: str, scaling: str, errors: Sequence[DepthErrors], wanted: int, 
     scales = np.array([error.scale for error in errors])
     row["scale_spread"] = float(scales.std() / scales.mean()) if scales.any() else None
     return row | {"images": len(errors), "left_out": wanted - len(errors), "leak": leak}
-
-
-def _read(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DataError(f"{path} is not a readable image; copy it again")
-    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

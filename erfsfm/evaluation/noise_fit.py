@@ -1,8 +1,8 @@
-"""The law of a pose network's noise, fitted to its errors on recordings that it was not trained on.
+"""The noise model of a pose network, fitted to its errors on held-out recordings.
 
-Each of the six components gets its own law by Student's t (4 degrees of freedom), which a few gross errors do not
-pull. One factor for all then makes the six together cover what a Gaussian of these sigmas promises, for that is what
-a graph takes them for. Every recording counts alike, however long.
+Each of the six components is fitted by Student's t (4 degrees of freedom), which is robust to a few gross errors. One
+common factor then makes the coverage of all six that of a Gaussian with these sigmas, as the pose graph assumes.
+Every recording has the same weight, whatever its length.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
-from erfsfm.evaluation.protocols import Networks, refuse_leak, windows
+from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak, windows
 from erfsfm.photometric_residual import PhotometricResidual
 from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses
 
@@ -49,15 +49,15 @@ class PairErrors:
 
 
 def calibrate(
-    networks: Networks, roots: Sequence[Path], sequences: Sequence[str], allow_leak: bool, pose_sha256: str
+    networks: PoseDepthNetworks, roots: Sequence[Path], sequences: Sequence[str], allow_leak: bool, pose_sha256: str
 ) -> tuple[PoseNoise, list[dict[str, Any]]]:
     """Measure the noise of a pose network.
 
     Args:
-        networks: whom to ask.
+        networks: trained networks.
         roots: KITTI odometry roots, real or simulated.
         sequences: names of sequences; none for all with true poses.
-        allow_leak: also look at recordings seen in training.
+        allow_leak: also use recordings seen in training.
         pose_sha256: fingerprint of the pose network's file.
 
     Returns:
@@ -85,8 +85,8 @@ def calibrate(
     return fit(errors, pose_sha256), rows
 
 
-def measure(networks: Networks, recording: Recording) -> PairErrors:
-    """Errors of all pairs, the truth brought to the networks' unit, which is followed along the drive."""
+def measure(networks: PoseDepthNetworks, recording: Recording) -> PairErrors:
+    """Errors of all pairs; the truth is scaled to the networks' unit, which is tracked along the drive."""
     T_world_camera = recording.true_poses()
     assert T_world_camera is not None
     half, camera = networks.sources // 2, recording.camera
@@ -123,7 +123,7 @@ def pair_errors(name: str, snippets: Sequence[Snippet], T_world_camera: FloatArr
 
 
 def fit(errors: Sequence[PairErrors], pose_sha256: str) -> PoseNoise:
-    """The noise that explains the errors of some recordings."""
+    """The noise model fitted to the errors of some recordings."""
     laws = np.array([_fit_component(errors, k) for k in range(6)]).T  # (5, 6)
     spread = [np.sqrt((laws**2 * e.features**2).sum(axis=1)) for e in errors]  # (P, 6) each
     correlation = [_correlation(errors, spread, k) for k in range(6)]

@@ -96,7 +96,7 @@ def snippets_from_trajectory(T_world_camera: FloatArray, length: int = 5) -> Flo
 
 
 def snippet_from_network(T_source_target: FloatArray) -> FloatArray:
-    """Poses of a snippet in its first camera, from a pose network's answer about its middle frame.
+    """Poses of a snippet in its first camera, from a pose network's output for its middle frame.
 
     T_first_k = T_first_target T_k_target^-1, with the target's own identity put in the middle
 

@@ -1,4 +1,4 @@
-"""Whole evaluations: trained networks on recordings with truth, beside a baseline that knows nothing."""
+"""Whole evaluations: trained networks on recordings with truth, beside a baseline that uses no image."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.data.splits import FrameRange
 from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
+from erfsfm.readers.frame_range import EVERYTHING, FrameRange
 
 CAP_M = 80.0
 
 
-class Networks(Protocol):
-    """What an evaluation asks of trained networks (``erfsfm.inference.DepthPosePredictor``)."""
+class PoseDepthNetworks(Protocol):
+    """Depth and pose networks as evaluations use them (``erfsfm.inference.DepthPosePredictor``)."""
 
     sources: int
 
@@ -35,16 +35,15 @@ class Networks(Protocol):
         ...
 
     def leaks(self, names: Sequence[str]) -> list[str]:
-        """Recordings that training saw."""
+        """Recordings that were trained on."""
         ...
 
 
-def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
+def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, every: int = 5) -> list[dict[str, Any]]:
     """Median-scaled depth errors under 80 m on every fifth frame with true depth.
 
     Returns:
-        One row for the networks and one for the data's own median depth map, which needs no image:
-        beating it is the least that a network must do.
+        One row for the networks and one for the median depth map of the data, a baseline that uses no image.
 
     Raises:
         DataError: no true depth under the root, or a leak that was not allowed.
@@ -75,7 +74,7 @@ def depth_protocol(networks: Networks, root: Path, allow_leak: bool, every: int 
 
 
 def pose_protocol(
-    networks: Networks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
+    networks: PoseDepthNetworks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
     """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and a straight
     constant motion.
@@ -86,26 +85,33 @@ def pose_protocol(
         DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
             not allowed.
     """
-    recordings = [r for r in reversed(discover(root)) if r.sequence]
-    found = {r.name: r for r in recordings} | {r.sequence: r for r in recordings}
+    found: dict[str, list[Recording]] = {}
+    for each in discover(root):
+        for name in {each.name, each.sequence} if each.sequence else ():
+            found.setdefault(name, []).append(each)
     rows = []
     for name in sequences:
-        span = FrameRange.parse(name)
-        whole = found.get(span.recording)
-        if whole is None:
+        span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
+        if span.recording not in found:
             raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
-        recording = whole.part(span.start, span.stop)
-        T_world_camera = recording.true_poses(fidelity)
-        if T_world_camera is None:
-            raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
-        leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-        shown = whole.name if recording == whole else recording.frames_name
-        rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
+        camera = found[span.recording][0].images[0].parent
+        wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
+        parts = [whole.within(span.start, span.stop) for whole in wholes]
+        chosen = [part for part in parts if part is not None]
+        if not chosen:
+            raise DataError(f"{name} names no frame that there is: found {', '.join(w.frames_name for w in wholes)}")
+        for recording in chosen:
+            T_world_camera = recording.true_poses(fidelity)
+            if T_world_camera is None:
+                raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
+            leak = refuse_leak(networks, [recording.frames_name], allow_leak)
+            shown = recording.name if [recording] == wholes else recording.frames_name
+            rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
     return rows
 
 
 def _pose_rows(
-    networks: Networks,
+    networks: PoseDepthNetworks,
     recording: Recording,
     T_world_camera: NDArray[np.float64],
     fidelity: Fidelity,
@@ -129,7 +135,7 @@ def _pose_rows(
     return rows
 
 
-def windows(networks: Networks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
+def windows(networks: PoseDepthNetworks, recording: Recording) -> Iterator[list[NDArray[np.uint8]]]:
     """The images of each window of a pose network; no more of them are held than one window has."""
     images: deque[NDArray[np.uint8]] = deque(maxlen=networks.sources + 1)
     for index in range(len(recording)):
@@ -154,11 +160,11 @@ def _depth_row(name: str, errors: list[DepthErrors], leak: bool) -> dict[str, An
     return {"method": name, **mean, "scale_spread": spread, "images": len(errors), "leak": leak}
 
 
-def refuse_leak(networks: Networks, names: Sequence[str], allow_leak: bool) -> bool:
-    """Whether training saw some of the frames named.
+def refuse_leak(networks: PoseDepthNetworks, names: Sequence[str], allow_leak: bool) -> bool:
+    """Whether some of the frames were trained on.
 
     Raises:
-        DataError: it did, and that was not allowed.
+        DataError: they were, and that was not allowed.
     """
     leaked = networks.leaks(names)
     if leaked and not allow_leak:

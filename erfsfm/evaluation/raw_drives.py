@@ -1,7 +1,7 @@
 """Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
 
 Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
-of the date (`erfsfm.data.kitti_raw`). Images may be smaller than the original: the calibration follows them.
+of the date (`erfsfm.readers.kitti_drives`). Images may be smaller than the original: the calibration follows them.
 """
 
 from __future__ import annotations
@@ -15,8 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
-from erfsfm.data.kitti_raw import ASPECT_TOLERANCE, CALIBRATION, CAMERA_HEIGHT_M, FloatArray, read_calibration, velocity
 from erfsfm.errors import DataError
+from erfsfm.readers.kitti_calibration import (
+    ASPECT_TOLERANCE,
+    CAM_TO_CAM,
+    CAMERA_HEIGHT_M,
+    VELO_TO_CAM,
+    CalibrationFile,
+    FloatArray,
+)
+from erfsfm.readers.kitti_oxts import velocity
 
 _FRAME = re.compile(
     r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"
@@ -189,7 +197,7 @@ def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -
     Raises:
         DataError: the calibration is missing or incomplete, or of another camera.
     """
-    camera = _rectified_camera(read_calibration(frame.folder.parent / CALIBRATION), frame, size)
+    camera = _rectified_camera(CalibrationFile(frame.folder.parent / CAM_TO_CAM), frame, size)
     below_horizon = np.arange(1, size[0] + 1) - camera[1, 2]
     depth = camera[1, 1] * CAMERA_HEIGHT_M / np.maximum(below_horizon, 1e-9)
     return np.repeat(np.minimum(depth, farthest_m).astype(np.float32)[:, None], size[1], axis=1)
@@ -198,27 +206,19 @@ def flat_road_depth(frame: RawFrame, size: tuple[int, int], farthest_m: float) -
 def _projection(frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     """LiDAR points to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
-    camera = read_calibration(date / CALIBRATION)
-    velodyne = read_calibration(date / "calib_velo_to_cam.txt")
-    try:
-        R_rect, T_cam_velo = np.eye(4), np.eye(4)
-        R_rect[:3, :3] = camera["R_rect_00"].reshape(3, 3)
-        T_cam_velo[:3, :3] = velodyne["R"].reshape(3, 3)
-        T_cam_velo[:3, 3] = velodyne["T"]
-    except (KeyError, ValueError) as error:
-        raise DataError(f"the calibration in {date} is incomplete: {error}") from error
+    camera = CalibrationFile(date / CAM_TO_CAM)
+    T_cam_velo = CalibrationFile(date / VELO_TO_CAM).transform("R", "T")
+    R_rect = np.eye(4)
+    R_rect[:3, :3] = camera.matrix("R_rect_00", (3, 3))
     projection: FloatArray = _rectified_camera(camera, frame, size) @ R_rect @ T_cam_velo
     return projection
 
 
-def _rectified_camera(camera: dict[str, FloatArray], frame: RawFrame, size: tuple[int, int]) -> FloatArray:
+def _rectified_camera(camera: CalibrationFile, frame: RawFrame, size: tuple[int, int]) -> FloatArray:
     """Points of the rectified camera 0 to pixels that count from one, ``(3, 4)``, at the image's size."""
     date = frame.folder.parent
-    try:
-        full_width, full_height = camera[f"S_rect_0{frame.camera}"]
-        P_rect = camera[f"P_rect_0{frame.camera}"].reshape(3, 4)
-    except (KeyError, ValueError) as error:
-        raise DataError(f"the calibration in {date} is incomplete: {error}") from error
+    full_width, full_height = camera.matrix(f"S_rect_0{frame.camera}", (2,))
+    P_rect = camera.matrix(f"P_rect_0{frame.camera}", (3, 4))
     scale_y, scale_x = size[0] / full_height, size[1] / full_width
     if abs(scale_x / scale_y - 1) > ASPECT_TOLERANCE:
         raise DataError(

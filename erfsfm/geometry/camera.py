@@ -1,4 +1,4 @@
-"""The pinhole camera: its matrix follows every resize, crop and flip here and nowhere else.
+"""The pinhole camera, and its matrix under resize, crop and flip.
 
 Pixel (0, 0) is the centre of the top-left pixel, so a resize by s moves the principal point as
 ``c' = (c + 0.5) s - 0.5``.
@@ -14,28 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.config import Fidelity
+from erfsfm.readers.pinhole import Pinhole
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Pinhole):
     """Size in pixels and intrinsics of one image."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
 
     @property
     def K(self) -> NDArray[np.float32]:
         """The camera matrix ``(3, 3)``, pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float32)
-
-    def resized(self, width: int, height: int) -> Camera:
-        """The camera of the image resized to ``width x height``."""
-        sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of the window whose top-left pixel is ``(left, top)``."""

@@ -1,4 +1,4 @@
-"""SE(3) on tensors: the pose network's six-vector and what is done with it."""
+"""SE(3) on tensors: the pose network's six-vector as a transform, and transforms of points."""
 
 from __future__ import annotations
 

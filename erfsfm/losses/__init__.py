@@ -1,1 +1,1 @@
-"""What the networks are asked to make small."""
+"""Terms of the training objective."""

@@ -1,4 +1,4 @@
-"""Agreement of the networks with themselves and with image geometry."""
+"""Consistency of depth between frames, and of rotations with two-view geometry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Appearance differences between a target image and a source warped onto it."""
+"""Photometric error between a target image and a source warped onto it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 class BoxMean(torch.autograd.Function):
-    """Mean over each 3 x 3 window, as ``avg_pool2d(x, 3, 1)``, by two runs of additions.
+    """Mean over each 3 x 3 window, as ``avg_pool2d(x, 3, 1)``, by separable additions.
 
     On a CPU this is several times faster than the pooling operator (make benchmark), which dominated the training step.
     """
@@ -24,7 +24,7 @@ class BoxMean(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        """The transposed window is the same window on the padded gradient."""
+        """The transposed window mean is the same window mean of the padded gradient."""
         return _box(F.pad(gradient, (2, 2, 2, 2)))
 
 

@@ -1,4 +1,4 @@
-"""Priors on the maps: smooth depth, and masks that do not explain everything away."""
+"""Regularisation: smoothness of depth, and a prior on explainability masks."""
 
 from __future__ import annotations
 

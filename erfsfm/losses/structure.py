@@ -1,4 +1,4 @@
-"""Agreement of the networks with structure measured by classical geometry, whose scale may be a little off."""
+"""Losses of depth and translation against two-view geometry (the teacher), up to its scale error."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 SURE = 1.5  # most over least
-FARTHEST = 100.0  # camera heights: what is farther weighs no more
-STILL = 0.01  # network units: a step so short counts as no movement
+FARTHEST = 100.0  # camera heights: weights do not grow beyond
+STILL = 0.01  # network units: added to the length of a step, against division by zero
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Between which inverse depths the measurements lie.
+    """Bounds of the inverse depth of each pixel, as measured.
 
     Attributes:
         least: ``(B, 1, H, W)``, 0 where nothing bounds it from below.
@@ -30,7 +30,7 @@ class Bounds:
         return Bounds(self.least[..., middle::step, middle::step], self.most[..., middle::step, middle::step])
 
     def log_scale(self, disparity: Tensor) -> Tensor:
-        """``(B, 1, 1, 1)`` mean of log disparity minus log measured, over sure pixels; 0 where there are none."""
+        """Mean of log disparity minus log measured ``(B, 1, 1, 1)``, over pixels with narrow bounds; 0 without any."""
         sure = (self.least > 0) & (self.most < SURE * self.least)
         middle = torch.where(sure, (self.least * self.most).sqrt(), 1)
         difference = torch.where(sure, disparity.log() - middle.log(), 0).sum(dim=(1, 2, 3), keepdim=True)
@@ -38,15 +38,14 @@ class Bounds:
 
 
 def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
-    """Mean log distance of a disparity from the bounds, over pixels with a bound; nothing within them.
+    """Mean log distance of a disparity from the bounds, over pixels with a bound; zero between them.
 
-    Far surfaces are few pixels and easily blurred away by the near ones around them: a pixel weighs by the square root
-    of its depth.
+    Far surfaces are few pixels beside near ones, so a pixel weighs by the square root of its depth.
 
     Args:
         disparity: inverse depth ``(B, 1, H, W)``, positive.
         bounds: of the same size.
-        log_scale: by which the disparity is larger than the measured unit says, ``(B, 1, 1, 1)``.
+        log_scale: log of the disparity's scale over that of the bounds, ``(B, 1, 1, 1)``.
     """
     has_most = torch.isfinite(bounds.most)
     said = disparity.log() - log_scale

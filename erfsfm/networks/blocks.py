@@ -78,7 +78,7 @@ class Encoder(nn.Module):
         self.stages = nn.ModuleList(nn.Sequential(*stage) for stage in stages)
 
     def forward(self, features: Tensor) -> list[Tensor]:
-        """Map ``(B, C, H, W)`` to the outputs of all stages, finest first."""
+        """Outputs of all stages for ``(B, C, H, W)``, finest first."""
         outputs = []
         for stage in self.stages:
             features = stage(features)
@@ -86,11 +86,11 @@ class Encoder(nn.Module):
         return outputs
 
     def layers(self) -> list[Layer]:
-        """Geometry of the convolutions in the order in which data meets them."""
+        """Geometry of the convolutions, first to last."""
         return [block.layer for block in self.blocks()]
 
     def blocks(self) -> Iterator[ConvBlock]:
-        """Convolution blocks in the order in which data meets them."""
+        """Convolution blocks, first to last."""
         for stage in self.stages:
             for block in stage.children():
                 assert isinstance(block, ConvBlock)
@@ -110,7 +110,7 @@ def crop_like(features: Tensor, reference: Tensor) -> Tensor:
 def let_leak(network: nn.Module, slope: float = 0.1) -> None:
     """Turn every ReLU into a leaky one, as FlowNet and DispNet had them (Mayer et al. 2016).
 
-    A narrow decoder has four channels at full resolution: where all are at rest, only a bias would still learn.
+    A narrow decoder has four channels at full resolution: where all ReLUs are zero, only a bias has a gradient.
     """
     for block in network.modules():
         if isinstance(block, ConvBlock | UpBlock):

@@ -15,11 +15,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-# Sampled values handled at once on a CPU, so that they stay in its caches: forward and backward of the
+# Sampled values processed at once on a CPU, so that they stay in its caches: forward and backward of the
 # paper's largest layer (7 x 7 on 32 channels, 208 x 64, batch 4) take 1.6 s so, 6 s in one piece.
 _CPU_CHUNK = 2**20
 
-# The compiled path reads a pixel's channels at once: with few of them, or with few samples, it gains nothing.
+# The compiled path reads all channels of a pixel at once: with few channels or few samples it is not faster.
 _KERNEL_CHANNELS = 8
 _KERNEL_SAMPLES = 2**20
 
@@ -50,7 +50,7 @@ def deform_conv2d(
         bias: ``(C_out,)`` or None.
         stride: one value, or (rows, columns); so are `padding` and `dilation`.
         padding: zeros around the image.
-        dilation: distance between the resting places of neighbouring taps.
+        dilation: distance between neighbouring taps at zero offset.
         mask: tap factors, ``(B, G * k_h * k_w, H_out, W_out)``, or None for one.
 
     Returns:
@@ -138,7 +138,7 @@ def _check_shapes(
     padding: tuple[int, int],
     dilation: tuple[int, int],
 ) -> tuple[int, int]:
-    """Refuse what does not fit, and return the size of the output."""
+    """Check the shapes and return the size of the output."""
     if input.dim() != 4 or weight.dim() != 4:
         raise ValueError(
             f"input and weight must have four dimensions; got {tuple(input.shape)} and {tuple(weight.shape)}"
@@ -169,8 +169,8 @@ def _check_shapes(
 
 
 def _resting_places(out: int, kernel: int, stride: int, padding: int, dilation: int, like: Tensor) -> Tensor:
-    """Where the taps of each output lie along one axis without offsets, in pixels, ``(out, kernel)``."""
-    dtype = torch.promote_types(like.dtype, torch.float32)  # half precision cannot count pixels
+    """Positions of the taps of each output along one axis at zero offset, in pixels, ``(out, kernel)``."""
+    dtype = torch.promote_types(like.dtype, torch.float32)  # half precision cannot represent pixel indices
     first = torch.arange(out, device=like.device, dtype=dtype) * stride - padding
     return first[:, None] + torch.arange(kernel, device=like.device, dtype=dtype) * dilation
 
@@ -192,7 +192,7 @@ def _sampling_grid(offset: Tensor, rows: Tensor, columns: Tensor, size: tuple[in
 
 
 def _suits_kernel(input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | None) -> bool:
-    """Whether the compiled path knows the case and gains by it; anything that traces must see PyTorch alone."""
+    """Whether the compiled path supports the case and is faster; tracing needs plain PyTorch."""
     if torch.jit.is_tracing() or torch.compiler.is_compiling():  # type: ignore[attr-defined]
         return False
     taps = weight.shape[2] * weight.shape[3]
@@ -208,7 +208,7 @@ def _suits_kernel(input: Tensor, offset: Tensor, weight: Tensor, mask: Tensor | 
 
 @functools.cache
 def _compiled_kernel() -> ModuleType | None:
-    """The compiled path, or None where Numba cannot be used; says once which it is."""
+    """The compiled path, or None where Numba cannot be used; logs once which it is."""
     try:
         from erfsfm.networks import deformable_kernel
     except ImportError as error:
@@ -225,7 +225,7 @@ def _sample_in_pytorch(
 
     Args:
         input, offset, weight, mask: as given.
-        rows: where the taps of each output row rest, in pixels, ``(H_out, k_h)``.
+        rows: positions of the taps of each output row at zero offset, in pixels, ``(H_out, k_h)``.
         columns: the same along the other axis, ``(W_out, k_w)``.
     """
     batch, channels = input.shape[:2]
@@ -251,9 +251,9 @@ def _sample_in_pytorch(
 def _sample_and_combine(
     maps: Tensor, grid: Tensor, factors: Tensor, weight: Tensor, channels: int, places: int
 ) -> Tensor:
-    """Read the taps of some images, `places` outputs at a time, and weigh them.
+    """Sample the taps of some images, `places` outputs at a time, and multiply them by the kernel.
 
-    Splitting rather than slicing matters: the gradient of n slices is n full-size sums.
+    `split` rather than slices: the gradient of n slices is n full-size sums.
 
     Args:
         maps: inputs, ``(b * G, C_in / G, H, W)``.

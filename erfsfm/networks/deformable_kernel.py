@@ -1,9 +1,8 @@
 """Deformable convolution on a CPU with its sampling compiled by Numba: an optional fast path.
 
-A tap reads four pixels with all their channels, which lie side by side here; `grid_sample` reads one
-channel after the other. Nothing but the arguments is kept for the backward pass: reading the image again
-costs less than storing every sample. `erfsfm.networks.deformable` holds the plain path that this one must
-equal, and chooses between them.
+A tap reads four pixels with all their channels, which are contiguous here; `grid_sample` reads one channel
+after the other. Only the arguments are kept for the backward pass: sampling the image again costs less than
+storing every sample. `erfsfm.networks.deformable` holds the reference path in PyTorch and chooses between them.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-# Sampled values handled at once, so that they stay in the caches.
+# Sampled values processed at once, so that they stay in the caches.
 _CHUNK = 2**19
 
 Array = NDArray[np.floating[Any]]
@@ -37,7 +36,7 @@ def deform_conv2d(input: Tensor, offset: Tensor, mask: Tensor, weight: Tensor, r
         offset: tap offsets in pixels, ``(B, 2 * k_h * k_w, H_out, W_out)``, (dy, dx) per tap.
         mask: tap factors, ``(B, k_h * k_w, H_out, W_out)``.
         weight: kernel, ``(C_out, C_in, k_h, k_w)``.
-        rows: where the taps of each output row rest, in pixels, ``(H_out, k_h)``.
+        rows: positions of the taps of each output row at zero offset, in pixels, ``(H_out, k_h)``.
         columns: the same along the other axis, ``(W_out, k_w)``.
 
     Returns:
@@ -87,7 +86,7 @@ class _DeformConv2d(torch.autograd.Function):
                 part = upstream[:, first : first + chunk].flatten(0, 1)  # (B * count, C_out)
                 of_samples = (part @ kernel).view(batch, -1, mask.shape[1], channels)
                 samples = torch.empty_like(of_samples)
-                list(pool.map(_spread, *arguments, repeat(first), of_samples.numpy(), samples.numpy(), *results))
+                list(pool.map(_spread, *arguments, repeat(first), of_samples.numpy(), samples.numpy(), zip(*results)))
                 of_kernel.addmm_(part.T, samples.view(len(part), -1))
         of_weight = of_kernel.view(-1, *weight.shape[2:], channels).permute(0, 3, 1, 2)
         return of_input.permute(0, 3, 1, 2), of_offset.view_as(offset), of_mask.view_as(mask), of_weight, None, None
@@ -99,10 +98,10 @@ def _taps_before_channels(weight: Tensor) -> Tensor:
 
 
 def _arrays(input: Tensor, offset: Tensor, mask: Tensor, rows: Tensor, columns: Tensor) -> tuple[Any, ...]:
-    """What `_read` and `_spread` take first, image by image."""
+    """The first arguments of `_read` and `_spread`, image by image."""
     images = input.detach().permute(0, 2, 3, 1).contiguous().numpy()
     offsets, factors = (tensor.detach().flatten(2).contiguous().numpy() for tensor in (offset, mask))
-    return images, repeat(rows.numpy()), repeat(columns.numpy()), offsets, factors
+    return images, repeat((rows.numpy(), columns.numpy())), offsets, factors
 
 
 def _places_at_once(input: Tensor, mask: Tensor) -> int:
@@ -116,7 +115,7 @@ def _pool(batch: int) -> ThreadPoolExecutor:
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile on first use and keep the result on disk, where Numba finds a folder that it may write.
 
-    Sums may be reordered, which vectorises them; a value that is not a number stays one.
+    Sums may be reordered, so that they vectorise; NaN stays NaN.
     """
     options: dict[str, Any] = {"nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
     try:
@@ -147,21 +146,21 @@ def _neighbours(place: float, size: int) -> tuple[int, int, float, float, float,
 
 
 @_compiled
-def _read(image: Array, rows: Array, columns: Array, offset: Array, mask: Array, first: int, samples: Array) -> None:
+def _read(image: Array, rest: tuple[Array, Array], offset: Array, mask: Array, first: int, samples: Array) -> None:
     """Sample the taps of some outputs of one image.
 
     Args:
         image: ``(H, W, C)``.
-        rows: resting places in pixels, ``(H_out, k_h)``.
-        columns: resting places in pixels, ``(W_out, k_w)``.
+        rest: rows ``(H_out, k_h)`` and columns ``(W_out, k_w)`` of the taps without offsets, pixels.
         offset: ``(2 * k_h * k_w, H_out * W_out)``.
         mask: ``(k_h * k_w, H_out * W_out)``.
         first: index of the first output.
         samples: receives values times factors, ``(outputs, k_h * k_w, C)``.
     """
     height, width, channels = image.shape
+    rows, columns = rest
     out_w, k_w = columns.shape
-    as_image = image.dtype.type  # places are doubles; in the loop over channels these would halve the speed
+    as_image = image.dtype.type  # positions are doubles; in the loop over channels these would halve the speed
     for n in range(samples.shape[0]):
         i, j = divmod(first + n, out_w)
         for k in range(mask.shape[0]):
@@ -184,28 +183,25 @@ def _read(image: Array, rows: Array, columns: Array, offset: Array, mask: Array,
 @_compiled
 def _spread(
     image: Array,
-    rows: Array,
-    columns: Array,
+    rest: tuple[Array, Array],
     offset: Array,
     mask: Array,
     first: int,
     of_samples: Array,
     samples: Array,
-    of_image: Array,
-    of_offset: Array,
-    of_mask: Array,
+    gradients: tuple[Array, Array, Array],
 ) -> None:
-    """Sample as `_read` does, and hand the gradient of the samples on to what they were made of.
+    """Sample as `_read` does, and propagate the gradient of the samples to image, offset and mask.
 
     Args:
-        image, rows, columns, offset, mask, first: as of `_read`.
+        image, rest, offset, mask, first: as of `_read`.
         of_samples: gradient, ``(outputs, k_h * k_w, C)``.
         samples: receives what `_read` gives.
-        of_image: gradient of ``image``, added to.
-        of_offset: receives that of ``offset``.
-        of_mask: receives that of ``mask``.
+        gradients: that of ``image``, added to; receives those of ``offset`` and ``mask``.
     """
+    of_image, of_offset, of_mask = gradients
     height, width, channels = image.shape
+    rows, columns = rest
     out_w, k_w = columns.shape
     as_image = image.dtype.type
     for n in range(samples.shape[0]):
@@ -231,7 +227,7 @@ def _spread(
             of_mask[k, first + n] = y0 * (x0 * g00 + x1 * g01) + y1 * (x0 * g10 + x1 * g11)
             of_offset[2 * k, first + n] = factor * (dy0 * (x0 * g00 + x1 * g01) + dy1 * (x0 * g10 + x1 * g11))
             of_offset[2 * k + 1, first + n] = factor * (y0 * (dx0 * g00 + dx1 * g01) + y1 * (dx0 * g10 + dx1 * g11))
-            # one loop a corner: corners of one place may be one pixel, and four sums in a loop would not vectorise
+            # one loop for each corner: corners may be the same pixel, and four sums in one loop would not vectorise
             for c in range(channels):
                 of_image[top, left, c] += w00 * of_samples[n, k, c]
             for c in range(channels):

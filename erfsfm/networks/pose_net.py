@@ -103,7 +103,7 @@ class PoseNet(nn.Module):
         return self._pose(self.encoder(self._stack(target, sources))[-1])
 
     def forward_with_masks(self, target: Tensor, sources: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """Predict motions, and how far each source's pixels can be explained by them.
+        """Predict motions and the explainability mask of each source (Zhou et al. 2017, Section 3.3).
 
         Args:
             target: colours in [-1, 1], ``(B, 3, H, W)``.

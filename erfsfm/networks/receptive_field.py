@@ -1,6 +1,6 @@
-"""How much of the image a network's encoder sees, and what a forward pass costs.
+"""Receptive field of a network's encoder, in theory and by gradients, and the cost of a forward pass.
 
-The paper compares its networks by the field of one pixel of the last encoder layer (its figure 4).
+The paper compares its networks by the receptive field of one pixel of the last encoder layer (its figure 4).
 """
 
 import copy
@@ -19,13 +19,13 @@ from erfsfm.networks.pose_net import PoseNet
 
 Network = DepthNet | PoseNet
 
-# Shares of the largest gradient below this are rounding of the sampling positions in float64, not field.
+# Gradients below this ratio of the largest are rounding of the sampling positions in float64.
 _ROUNDING = 1e-11
 
 
 @dataclass(frozen=True)
 class MeasuredField:
-    """Which image pixels move one output pixel.
+    """The image pixels that influence one output pixel, by input gradients.
 
     Attributes:
         pixel: (row, column) of the output pixel in the last encoder layer.
@@ -55,7 +55,7 @@ class MeasuredField:
         return self.right - self.left + 1
 
     def share_holding(self, weight: float) -> float:
-        """The smallest share of the image's pixels that holds this share of the gradient, 0 for an empty field."""
+        """Ratio of the image's pixels, the fewest that hold this share of the gradient; 0 for an empty field."""
         total = self.gradient.double().flatten().sort(descending=True).values.cumsum(0)
         if total[-1] == 0:
             return 0.0
@@ -69,8 +69,8 @@ def theoretical(network: Network, offsets_px: float = 0.0) -> int:
 
     Args:
         network: any depth or pose network.
-        offsets_px: how far deformable taps may be pushed outwards, in pixels of the layer's input; a part
-            of a pixel reads the next one too.
+        offsets_px: largest outward offset of deformable taps, in pixels of the layer's input; a fraction of a
+            pixel reads the next one, too.
     """
     layers = network.encoder_layers()
     moving = sum(jump for layer, jump in zip(layers, _jumps(layers)) if layer.deformable)
@@ -117,7 +117,7 @@ def measured(
 ) -> MeasuredField:
     """Bounding box and coverage by input gradients, with constant positive weights and a white image.
 
-    Weights are one over the fan-in, so that no activation overflows; the network given is left alone.
+    Weights are one over the fan-in, so that no activation overflows; the given network is not changed.
 
     Args:
         network: any depth or pose network.
@@ -167,7 +167,7 @@ def field_of(
 ) -> MeasuredField:
     """Field of one pixel of an encoder's output, by input gradients of the sum of its channels.
 
-    All channels, for a single one may be dead behind its ReLU.
+    All channels, since a single one may be zero behind its ReLU.
 
     Args:
         encoder: the encoder as it is.
@@ -210,7 +210,7 @@ def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
         return hook
 
     for module in shadow.modules():
-        if isinstance(module, nn.ConvTranspose2d):  # every input place spreads the whole kernel
+        if isinstance(module, nn.ConvTranspose2d):  # every input pixel is multiplied by the whole kernel
             module.register_forward_hook(count(lambda before, _: before[0, 0].numel(), module.weight.numel()))
         elif isinstance(module, nn.Conv2d):
             module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), module.weight.numel()))

@@ -1,7 +1,7 @@
-"""A trained network as the start of another variant of it, or of one twice as wide, that says the same at first.
+"""Initial weights from a trained network of another variant, or of half the width, with the same output at first.
 
-In another variant the kernels stay, and only where their taps lie is learned. In a wider one every channel stands
-twice and counts half (Chen et al. 2016, Net2Net); a little noise lets the two part.
+Between variants the kernels are kept and only the offsets of deformable layers are new. For twice the width every
+channel is duplicated at half its weight (Net2Net, Chen et al. 2016), with a little noise to break the symmetry.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ PARTING = 0.05  # of a tensor's standard deviation
 def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
     """Fill ``network`` with the weights of one that may have deformable layers in other places or half the width.
 
-    A deformable layer that was plain starts with its kernel at rest, zero offsets and a modulator of one; a plain
-    layer that was deformable keeps the kernel and loses what moved it. A bias that has no place is dropped, and one
-    that is missing starts at zero.
+    A deformable layer that was plain starts with its kernel, zero offsets and a modulator of one. A plain layer that
+    was deformable keeps the kernel and drops the convolutions of offsets and modulation. A bias without a counterpart
+    is dropped, and a missing one starts at zero.
 
     Args:
         network: to be filled.
@@ -46,9 +46,9 @@ def take_over(network: nn.Module, trained: dict[str, Tensor]) -> None:
 
 
 def _widened(value: Tensor, shape: torch.Size, name: str) -> Tensor:
-    """A weight at its new shape: outputs twice, inputs twice at half their strength.
+    """A weight at its new shape: outputs duplicated, inputs duplicated at half their weight.
 
-    Images and, behind the skip connections, a disparity come in as often as before; they are the first layer's whole
+    Input images, and a disparity behind the skip connections, are not duplicated; they are the first layer's whole
     input or a decoder layer's last channel.
     """
     if value.shape == shape:

@@ -1,1 +1,1 @@
-"""What the networks see: measured, drawn, and the street that is looked at."""
+"""Receptive fields of the networks: measurement, figure, and a drawn street as input."""

@@ -1,4 +1,4 @@
-"""The picture of measured receptive fields: each box, what a network can read of it, and its weight."""
+"""The figure of measured receptive fields: theoretical box, support and effective field of each network."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _UNREAD = (24, 32, 64)
 
 
 def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) -> None:
-    """Write the figure: a line for each network, what it can read on the left, what it weighs on the right.
+    """Write the figure: a row for each network, its support on the left, its effective field on the right.
 
     Args:
         rows: what to show.
-        image: ``(H, W, 3)`` uint8 RGB, the middle image of the snippet looked at.
+        image: ``(H, W, 3)`` uint8 RGB, the middle image of the input snippet.
         path: its ending names the format: png, pdf or svg.
     """
     height, width = image.shape[:2]
@@ -87,7 +87,7 @@ def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
 
 
 def _smoothed_core(weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Near 1 where the pixels that hold most of the gradient lie densely, without their single dots."""
+    """Near 1 where the pixels with most of the gradient are dense; isolated pixels are smoothed away."""
     import cv2
 
     blurred = cv2.GaussianBlur(weight, (0, 0), sigmaX=4)
@@ -98,7 +98,7 @@ def _smoothed_core(weight: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _magnify(axis: Axes, read: NDArray[np.bool_], image: NDArray[np.uint8]) -> None:
-    """A few pixels of the field, enlarged and brightened: a comb is invisible at the size of the picture."""
+    """A few pixels of the field, enlarged and brightened: single skipped pixels are invisible in the figure."""
     rows, columns = np.nonzero(read)
     top = int(np.median(rows)) - _COMB_PX // 2
     left = int(np.median(columns)) - _COMB_PX // 2

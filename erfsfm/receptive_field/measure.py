@@ -1,4 +1,4 @@
-"""Receptive fields of networks side by side: in theory, by gradients, and weighted by what was learned."""
+"""Receptive fields of networks: theoretical, by gradients, and effective with trained weights."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class FieldRow:
     Attributes:
         name: preset.
         fidelity: ``paper`` or ``default``.
-        offsets_px: how far deformable taps are pushed outwards in `seen`; 0 for other networks.
-        side_px: theoretical side, taps pushed by `offsets_px`.
+        offsets_px: outward offset of deformable taps in `seen`, pixels; 0 for other networks.
+        side_px: theoretical side with taps moved by `offsets_px`.
         side_at_rest_px: theoretical side at zero offsets.
-        corner: image row and column of the theoretical box, taps pushed.
-        seen: what the layer can read, by gradients with constant weights.
-        union_share: share of the image that some pixel of the layer can read.
-        weighed: what it does read on an image, with the weights named by `weights`.
+        corner: image row and column of the theoretical box, taps moved.
+        seen: support of the pixel's gradient, with constant weights.
+        union_share: share of the image in the support of any pixel of the layer.
+        weighed: effective field on an image, with the weights named by `weights`.
         weights: name of the learned weights, or ``untrained``.
     """
 
@@ -84,13 +84,13 @@ def measure_fields(
     learned: tuple[str, Model] | None = None,
     device: torch.device | None = None,
 ) -> list[FieldRow]:
-    """Fields of presets; beside our dilated pose network the paper's, which skips three pixels of four.
+    """Fields of presets; with our dilated pose network also the paper's, which skips three pixels of four.
 
     Args:
         names: keys of `PRESETS`.
         fidelity: of all networks.
         snippet: five images ``(H, W, 3)`` uint8 RGB in time order; depth networks see the middle one.
-        offsets_px: how far deformable taps are pushed outwards.
+        offsets_px: outward offset of deformable taps, pixels.
         learned: name and weights to take effective fields from, for the presets that they are of.
         device: where to compute; None is the CPU.
 
@@ -105,6 +105,17 @@ def measure_fields(
         if name == "erf-posenet-dilated" and fidelity == "default":
             wanted.append((name, "paper"))
     return [_row(*which, snippet, offsets_px, learned, device or torch.device("cpu")) for which in wanted]
+
+
+def field_table(rows: Sequence[FieldRow]) -> str:
+    """The summaries of rows as text, a line each below a heading."""
+    lines = [f"{'network':32}{'theory':>9}{'columns x rows':>16}{'share':>8}{'all outputs':>13}{'95 % in':>9}  weights"]
+    for row in (row.summary() for row in rows):
+        name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
+        box = f"{row['columns']} x {row['rows']}"
+        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
+        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+    return "\n".join(lines)
 
 
 def _row(

@@ -1,11 +1,11 @@
-"""A drawn street to look at where no picture is given: a road between two textured walls."""
+"""A drawn street, the input where no images are given: a road between two textured walls."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.data.kitti_raw import CAMERA_HEIGHT_M
+from erfsfm.readers.kitti_calibration import CAMERA_HEIGHT_M
 
 _HALF_WIDTH_M = 7.0
 _FOCAL_SHARE = 0.58  # focal length over image width, as KITTI's

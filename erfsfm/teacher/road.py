@@ -1,4 +1,4 @@
-"""The road before the camera as a plane: the unit of length that every street offers."""
+"""The ground plane before the camera, whose distance to the camera is the unit of length."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def road_plane(
 
     The plane contains the direction of travel; it is found by random sampling among the points in the lower middle
     of the image and refined by least squares. The camera is ``1 / |m|`` above it, and a ray p meets it at the inverse
-    depth ``m . p``. Without that direction the few rows of a road leave its slope, and with it the height, all too
-    free.
+    depth ``m . p``. Without that direction the few rows of a road would hardly constrain its slope, and with it the
+    height.
 
     Args:
         inverse_depth: ``(H, W)``.
@@ -40,7 +40,7 @@ def road_plane(
         forward: direction of travel in the camera's frame, ``(3,)``, of length one.
 
     Returns:
-        None where no plane like a road is seen.
+        None where no plane like a road is found.
     """
     height, width = inverse_depth.shape
     part = (
@@ -74,7 +74,7 @@ def road_plane(
 
 
 def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDArray[np.bool_]:
-    """Where the road is, also where nothing was measured: nearly all that is known around lies on it, ``(H, W)``.
+    """Pixels on the road, also without measurements of their own: nearly all known neighbours lie on it, ``(H, W)``.
 
     Args:
         inverse_depth: ``(H, W)``.
@@ -90,9 +90,9 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
 
 
 def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bool_]:
-    """Where something was measured to lie clearly under the road, with a rim around it, ``(H, W)``.
+    """Pixels measured clearly below the road, with a rim around them, ``(H, W)``.
 
-    Nothing lies there: it moves as the camera does, like a car ahead, and only seems to be far away.
+    These are dynamic objects that move with the camera, like a car ahead, and only appear far away.
 
     Args:
         inverse_depth: ``(H, W)``.

@@ -1,7 +1,7 @@
-"""What classical geometry sees in a snippet: a teacher for both networks that needs no label.
+"""Depth and motion of a snippet by classical two-view geometry: pseudo-labels for both networks.
 
-Each source and the target give depth up to the length of their motion; the lengths are compared where both are
-sure, the depths averaged, and everything is put in heights of the camera over the road.
+Each source with the target gives depth up to the length of their motion. The lengths are brought to one unit where
+both depths are certain, the depths are averaged, and all is expressed in heights of the camera over the road.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from erfsfm.files import write_atomically
 from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
-from erfsfm.teacher.two_view import TwoView, rays, two_view
+from erfsfm.teacher.two_view import MotionAndDepth, rays, two_view
 
 VERSION = 4
 SURE = 5.0  # inverse depth over its sigma
@@ -27,7 +27,7 @@ LEAST_SHARED = 100  # pixels
 
 
 @dataclass(frozen=True)
-class Structure:
+class TeacherStructure:
     """Lengths are in heights of the camera over the road.
 
     Attributes:
@@ -42,7 +42,7 @@ class Structure:
     most: NDArray[np.float16]
 
 
-def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> Structure:
+def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> TeacherStructure:
     """From the N + 1 images ``(H, W, 3)`` of a snippet, the target in the middle."""
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     middle = len(images) // 2
@@ -74,11 +74,11 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
     with np.errstate(over="ignore"):
         least = (np.maximum(inverse_depth - sigma, at_least) * height).astype(np.float16)
         most = ((np.maximum(inverse_depth, 0) + sigma) * height).astype(np.float16)
-    return Structure(T_source_target.astype(np.float32), least, most)
+    return TeacherStructure(T_source_target.astype(np.float32), least, most)
 
 
 def _forward(T_source_target: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Direction of travel at the target, in its frame: from the frames before to the frames after, ``(3,)``."""
+    """Direction of travel in the target's frame, from the frames before to the frames after, ``(3,)``."""
     places = -np.swapaxes(T_source_target[:, :3, :3], 1, 2) @ T_source_target[:, :3, 3:]  # of the sources, (N, 3, 1)
     middle = len(places) // 2
     travelled = np.concatenate([-places[:middle, :, 0], places[middle:, :, 0]])
@@ -88,12 +88,12 @@ def _forward(T_source_target: NDArray[np.float64]) -> NDArray[np.float64] | None
 
 
 class StructureCache:
-    """Structures already measured, as files named by the bytes of their images; None keeps nothing."""
+    """Measured structures as files named by a hash of their images; without a folder nothing is kept."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
 
-    def structure(self, images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> Structure:
+    def structure(self, images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32]) -> TeacherStructure:
         """``measure_structure``, at most once for the same images and camera."""
         if self._folder is None:
             return measure_structure(images, K)
@@ -109,16 +109,16 @@ class StructureCache:
         return kept
 
 
-def _read(path: Path) -> Structure | None:
-    """None if there is no whole structure."""
+def _read(path: Path) -> TeacherStructure | None:
+    """None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as entry:
-            return Structure(entry["T_source_target"], entry["least"], entry["most"])
+            return TeacherStructure(entry["T_source_target"], entry["least"], entry["most"])
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def _write(path: Path, structure: Structure) -> None:
+def _write(path: Path, structure: TeacherStructure) -> None:
     def fill(part: Path) -> None:
         with part.open("wb") as file:  # given a path, savez would end its name in .npz
             np.savez(file, T_source_target=structure.T_source_target, least=structure.least, most=structure.most)
@@ -126,8 +126,8 @@ def _write(path: Path, structure: Structure) -> None:
     write_atomically(path, fill)
 
 
-def _relative_lengths(views: Sequence[TwoView | None]) -> list[float]:
-    """Length of each view's translation over that of the surest view; 0 of a still one, NaN where unknown."""
+def _relative_lengths(views: Sequence[MotionAndDepth | None]) -> list[float]:
+    """Length of each view's translation over that of the most certain view; 0 if still, NaN if unknown."""
     sure = [None if v is None or v.still else v.inverse_depth > SURE * v.sigma for v in views]
     counts = [0 if s is None else int(s.sum()) for s in sure]
     best = int(np.argmax(counts))
@@ -146,7 +146,7 @@ def _relative_lengths(views: Sequence[TwoView | None]) -> list[float]:
 
 
 def _average(
-    views: Sequence[TwoView | None], lengths: Sequence[float], shape: tuple[int, ...]
+    views: Sequence[MotionAndDepth | None], lengths: Sequence[float], shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Inverse depth and sigma of all views in the reference's unit; those far from the average are left out."""
     usable = [(v, s) for v, s in zip(views, lengths) if v is not None and s > 0]

@@ -1,4 +1,4 @@
-"""What two images of a moving camera say without any label: its motion up to length, and depth in that length.
+"""Motion up to scale and depth in units of that motion, from two images of a moving camera.
 
 Dense inverse search flow (Kroeger et al. 2016), the five-point essential matrix on it (Nister 2004), and the
 least-squares point on each epipolar line.
@@ -25,13 +25,13 @@ LEAST_MATCHES = 50
 
 
 @dataclass(frozen=True)
-class TwoView:
+class MotionAndDepth:
     """The second view of a pair, measured from the first.
 
     Attributes:
         T_second_first: ``(4, 4)``, translation of length one; the identity of a camera that stood still.
         inverse_depth: of the first camera's pixels in units of one over the translation, ``(H, W)``.
-        sigma: its standard deviation; infinite where nothing is known.
+        sigma: its standard deviation; infinite where unknown.
     """
 
     T_second_first: NDArray[np.float64]
@@ -44,7 +44,7 @@ class TwoView:
         return not self.T_second_first[:3, 3].any()
 
 
-def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> TwoView | None:
+def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> MotionAndDepth | None:
     """Motion and structure from two grey images ``(H, W)`` of one camera; None where they show no clear motion.
 
     Args:
@@ -56,10 +56,10 @@ def two_view(first: Grey, second: Grey, K: NDArray[np.float32], fine: bool) -> T
     if T_second_first is None:
         return None
     if not T_second_first[:3, 3].any():
-        return TwoView(T_second_first, np.zeros_like(flow[..., 0]), np.full_like(flow[..., 0], np.inf))
+        return MotionAndDepth(T_second_first, np.zeros_like(flow[..., 0]), np.full_like(flow[..., 0], np.inf))
     inverse_depth, sigma, off_line_px = _triangulate(flow, T_second_first, K)
     sigma[~trusted | (off_line_px > OFF_LINE_PX)] = np.inf
-    return TwoView(T_second_first, inverse_depth, sigma)
+    return MotionAndDepth(T_second_first, inverse_depth, sigma)
 
 
 def rays(height: int, width: int, K: NDArray[np.float32]) -> Array:
@@ -69,7 +69,7 @@ def rays(height: int, width: int, K: NDArray[np.float32]) -> Array:
 
 
 def _flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[np.bool_]]:
-    """Flow ``(H, W, 2)`` and where the way back leads to where it began."""
+    """Optical flow ``(H, W, 2)`` and the mask of the forward-backward check ``(H, W)``."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     if fine:
         search.setFinestScale(0)
@@ -108,7 +108,7 @@ def _motion(flow: Array, trusted: NDArray[np.bool_], K: NDArray[np.float64]) -> 
 def _triangulate(
     flow: Array, T_second_first: NDArray[np.float64], K: NDArray[np.float32]
 ) -> tuple[Array, Array, Array]:
-    """Inverse depth d with ``pi(R p + d t)`` nearest to where the flow leads, its sigma, and the distance left."""
+    """Inverse depth d with ``pi(R p + d t)`` nearest to the flow's end point, its sigma, and the residual in pixels."""
     R, t = T_second_first[:3, :3].astype(np.float32), T_second_first[:3, 3].astype(np.float32)
     p = rays(flow.shape[0], flow.shape[1], K)
     q = p @ R.T

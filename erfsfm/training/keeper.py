@@ -1,4 +1,4 @@
-"""Which weights of a run are kept, and what is written beside them."""
+"""Weights kept of a run: the latest, the best, and their records."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from lightning.pytorch.callbacks import Callback
 import erfsfm
 from erfsfm.checkpoint import Model, ModelRecord, commit, read_record, save_model
 from erfsfm.data.splits import merge
+from erfsfm.errors import TrainingError
 from erfsfm.training.module import SelfSupervision
 
 logger = logging.getLogger(__name__)
 
 
 class WeightKeeper(Callback):
-    """Writes weights that can be used at once: the latest, the best and those with the best poses.
+    """Writes weights folders: the latest, the best, and those with the best poses.
 
-    How long the last improvement is ago follows from the step in the best ones' record, so that a run
-    that is killed and resumed stops where it would have stopped.
+    The step of the last improvement is read from the record of the best weights, so that a run that is
+    killed and resumed stops where it would have stopped.
     """
 
     def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
@@ -41,7 +42,7 @@ class WeightKeeper(Callback):
         self._saved_step = -1
 
     def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Keep what was just validated; end the run where the last improvement is too long ago."""
+        """Write the validated weights; end the run after `patience` validations without improvement."""
         if trainer.sanity_checking or not isinstance(module, SelfSupervision):
             return
         improved = self._improved(module.validation_metrics)
@@ -60,18 +61,27 @@ class WeightKeeper(Callback):
     def on_exception(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
     ) -> None:
-        """Keep the weights so far, if they are numbers."""
-        numbers = all(torch.isfinite(weights).all() for weights in module.parameters())
-        if isinstance(module, SelfSupervision) and trainer.is_global_zero and trainer.global_step > 0 and numbers:
+        """Keep the weights so far, if they are finite."""
+        if not isinstance(module, SelfSupervision) or not trainer.is_global_zero or trainer.global_step == 0:
+            return
+        if _all_finite(module):
             save_model(self._output / "last", self._model(module, trainer.global_step))
 
     def save(self, module: SelfSupervision, step: int) -> None:
-        """Write ``last/``; and the folders whose measure is the best so far.
+        """Write ``last/``, and the folders whose metric is the best so far.
 
         Without validation the last is the best.
+
+        Raises:
+            TrainingError: weights are NaN or infinite; nothing is written.
         """
         if step == self._saved_step:
             return
+        if not _all_finite(module):
+            raise TrainingError(
+                f"weights are NaN or infinite at step {step}: lower training.learning_rate, or set "
+                "training.gradient_clip or training.precision=32-true, and start anew; older weights are in last/"
+            )
         self._saved_step = step
         model = self._model(module, step)
         save_model(self._output / "last", model)
@@ -95,7 +105,7 @@ class WeightKeeper(Callback):
         return Model(record, module.depth_net, module.pose_net)
 
     def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
-        """What each folder's weights are judged by; less is better."""
+        """The metric by which each folder's weights are chosen; less is better."""
         pose = metrics.get("snippet_ate", math.inf)
         return {self._output: decisive(metrics), self._output / "best_pose": pose if math.isfinite(pose) else math.inf}
 
@@ -103,22 +113,26 @@ class WeightKeeper(Callback):
         return {folder: value for folder, value in self._measures(metrics).items() if value < self._best[folder]}
 
     def state_dict(self) -> dict[str, list[str]]:
-        """What was seen survives a resume, also with other data."""
+        """Recordings trained on, kept over a resume with other data."""
         return {"seen": self._seen}
 
     def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
-        """Add what the run had seen before it was interrupted."""
+        """Add the recordings trained on before the interruption."""
         self._seen = merge([*self._seen, *state_dict.get("seen", [])])
 
 
+def _all_finite(module: SelfSupervision) -> bool:
+    return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
+
+
 def decisive(metrics: dict[str, float]) -> float:
-    """What a validation is judged by: true depth where it has it, else the photometric error; less is better."""
+    """The metric of a validation: error of depth where it has ground truth, else photometric error; less is better."""
     value = metrics.get("abs_rel", metrics.get("photometric", math.inf))
     return value if math.isfinite(value) else math.inf
 
 
 def licence_of(seen: list[str]) -> str:
-    """Licence that weights inherit from what they saw."""
+    """Licence that weights inherit from their training data."""
     if all(name.startswith("simulated/") for name in seen):
         return "MIT"
     if any(name.startswith(("kitti", "folder/kitti", "folder/karlsruhe")) for name in seen):

@@ -1,4 +1,4 @@
-"""The Lightning module: one optimisation step, and what a validation measures."""
+"""The Lightning module: optimisation step and validation metrics."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class SelfSupervision(lightning.LightningModule):
         self.config = config
         plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
         self._warm_up = config.model_copy(update={"loss": plain})
-        unlooked = config.loss.model_copy(update={"photometric_weight": 0.0})
-        self._alone = config.model_copy(update={"loss": unlooked})
+        geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
+        self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.pose_net.requires_grad_(config.training.networks == "both")
         self.train()  # Lightning keeps the modes that modules come with
@@ -46,28 +46,28 @@ class SelfSupervision(lightning.LightningModule):
         self._constant_steps = 0
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """The objective of one batch; stops the run where it is not a number, or the depth stays a constant.
+        """The loss of one batch; stops the run where it is not finite, or the depth stays a constant.
 
         Raises:
-            TrainingError: so it is.
+            TrainingError: the loss is not finite, or the depth has been constant for many steps.
         """
         bounds = Bounds(batch["least"], batch["most"]) if "least" in batch else None
         snippets = SnippetBatch(
             batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
-        outcome = evaluate_objective(self.depth_net, self.pose_net, snippets, self._present())
-        if not torch.isfinite(outcome.total):
-            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in outcome.terms.items())
+        result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._config_of_step())
+        if not torch.isfinite(result.total):
+            parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
                 "training.gradient_clip, then go on with --resume; the weights so far are in last/"
             )
-        self._refuse_constant(outcome.disparities[0].detach())
-        self.log("loss", outcome.total.detach(), prog_bar=True)
-        self.log_dict({f"loss/{name}": value.detach() for name, value in outcome.terms.items()})
+        self._refuse_constant(result.disparities[0].detach())
+        self.log("loss", result.total.detach(), prog_bar=True)
+        self.log_dict({f"loss/{name}": value.detach() for name, value in result.terms.items()})
         if self.global_step % (20 * self.config.training.log_every) == 0:
-            self._log_pictures(snippets, outcome.disparities[0], outcome.warped)
-        return outcome.total
+            self._log_pictures(snippets, result.disparities[0], result.warped)
+        return result.total
 
     def _refuse_constant(self, disparity: Tensor) -> None:
         """Stop once the disparity ``(B, 1, H, W)`` has been flat in all images for many steps on end."""
@@ -80,21 +80,21 @@ class SelfSupervision(lightning.LightningModule):
                 "loss.smoothness_weight and start anew; the weights so far are in last/"
             )
 
-    def _present(self) -> ExperimentConfig:
-        """The configuration with the objective of this step."""
+    def _config_of_step(self) -> ExperimentConfig:
+        """The configuration with the loss of this step."""
         if self.global_step < self.config.teacher.alone_steps:
-            return self._alone
+            return self._teacher_alone
         return self._warm_up if self.global_step < self.config.loss.warm_up_steps else self.config
 
     def train(self, mode: bool = True) -> Self:
-        """Training mode, but for a network that does not learn: its norms would drift."""
+        """Training mode, except for a network that is not trained: its batch statistics would drift."""
         super().train(mode)
         if self.config.training.networks == "depth":
             self.pose_net.eval()
         return self
 
     def configure_optimizers(self) -> Any:
-        """Adam or Muon on what learns; the schedule counts steps."""
+        """Adam or Muon on the trained parameters; the schedule counts steps."""
         training = self.config.training
         offsets = [
             parameter
@@ -124,7 +124,7 @@ class SelfSupervision(lightning.LightningModule):
         self._validation = {}
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        """Photometric error of every snippet; depth and pose errors where truth is known."""
+        """Photometric error of every snippet; depth and pose errors where ground truth is known."""
         target, sources = to_network_range(batch["target"]), to_network_range(batch["sources"])
         disparity = self.depth_net(target).float()
         vectors = self.pose_net(target, list(sources.unbind(dim=1))).float()
@@ -147,7 +147,7 @@ class SelfSupervision(lightning.LightningModule):
             self._note("snippet_re", errors_pose.re_mean)
 
     def on_validation_epoch_end(self) -> None:
-        """Mean of every measure; the spread of the depth scale is what a SLAM system lives on."""
+        """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""
         means = {name: float(np.mean(values)) for name, values in self._validation.items()}
         scales = np.array(self._validation.get("depth_scale", []))
         if len(scales) > 1:

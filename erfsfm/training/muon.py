@@ -1,4 +1,4 @@
-"""Adam, and Muon for what are matrices: steps of equal size in every direction (Jordan et al. 2024)."""
+"""Muon for matrices, steps of equal size in every direction (Jordan et al. 2024), and Adam for other parameters."""
 
 from __future__ import annotations
 

@@ -30,9 +30,9 @@ HEIGHTS = 10.0  # camera heights in a taught network's unit: steps are hundredth
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    What classical geometry measured, where it was asked (`erfsfm.teacher.structure`): ``T_source_target``
+    Measurements of the teacher (`erfsfm.teacher.structure`), where one is used: ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
-    Where the networks see them otherwise: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order.
+    With simulated weather: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """
 
     target: Tensor
@@ -52,12 +52,11 @@ class SnippetBatch:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The loss, its terms, and what the networks said.
+class ObjectiveResult:
+    """The loss, its terms, and the networks' outputs.
 
     ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
-    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution seen from the target, None where no photometric
-    error was asked for.
+    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution warped to the target, None without photometric error.
     """
 
     total: Tensor
@@ -74,26 +73,26 @@ def to_network_range(image: Tensor) -> Tensor:
 
 def evaluate_objective(
     depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
-) -> Outcome:
-    """Predict depth and poses of a batch and say how badly they explain it.
+) -> ObjectiveResult:
+    """Predict depth and poses of a batch and evaluate the loss.
 
-    The networks may run under autocast; geometry and losses keep the images' precision, for a pixel
-    coordinate does not fit into the eight bits of a bfloat16.
+    The networks may run under autocast; geometry and losses keep the images' precision: a pixel
+    coordinate needs more than the eight bits of a bfloat16.
 
     Args:
         depth_net: in training mode, where it gives a pyramid of disparities.
         pose_net: for as many sources as the batch has.
-        batch: what to explain.
-        config: its ``loss`` and ``network`` sections count.
+        batch: images and intrinsics.
+        config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
     said = _Prediction.of(depth_net, pose_net, batch, config)
     with torch.autocast(batch.target.device.type, enabled=False):
-        return _judge(said, batch, config)
+        return _evaluate(said, batch, config)
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What the networks say, in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
+    """Outputs of the networks in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
 
     disparities: list[Tensor]
     pose_vectors: Tensor
@@ -136,7 +135,7 @@ def _adjacent(count: int) -> tuple[int, int]:
     return count // 2 - 1, count // 2
 
 
-def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> Outcome:
+def _evaluate(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
     T_source_target = pose_vector_to_matrix(said.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
@@ -158,7 +157,7 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
         terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
     if batch.T_source_target is not None and batch.bounds is not None:
-        taught = _taught(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
+        taught = _teacher_terms(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
         terms |= taught
         for name, weight in config.teacher.weights.items():
             total = total + weight * taught[name]
@@ -166,16 +165,16 @@ def _judge(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> 
         terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
     warped_finest = None if finest is None else finest[0].reshape(batch.sources.shape)
-    return Outcome(total, terms, said.disparities, T_source_target, warped_finest)
+    return ObjectiveResult(total, terms, said.disparities, T_source_target, warped_finest)
 
 
-def _taught(
+def _teacher_terms(
     said: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
 ) -> dict[str, Tensor]:
-    """How far the networks are from measured structure.
+    """Loss terms of the teacher's measurements.
 
-    Shape and motion are compared after the unit, which the road gives only roughly, has been fitted to the depth
-    network's; the unit itself is a term of its own.
+    Depth and motion are compared after the teacher's unit, which the road measures only roughly, has been fitted to the
+    depth network's; the unit itself is a separate term.
     """
     finest = said.disparities[0]
     log_scale = bounds.log_scale(finest)
@@ -216,7 +215,7 @@ class _Level:
         )
 
     def warp(self, T_source_target: Tensor) -> tuple[Tensor, Projection]:
-        """All sources seen from the target, ``(B * N, 3, h, w)``, and how they were found."""
+        """All sources warped to the target, ``(B * N, 3, h, w)``, and the projection."""
         count = self.sources.shape[1]
         depth = (1 / self.disparity).repeat_interleave(count, dim=0)  # (B*N, 1, h, w)
         K = self.K.repeat_interleave(count, dim=0)

@@ -1,4 +1,4 @@
-"""A line on the terminal while training: steps, speed, time left, loss."""
+"""A progress bar on the terminal while training: steps, speed, time left, loss."""
 
 from __future__ import annotations
 

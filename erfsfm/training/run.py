@@ -1,18 +1,14 @@
-"""One training run: data in, an output folder that ``--weights`` takes out."""
+"""One training run; its output folder is what ``--weights`` takes."""
 
 from __future__ import annotations
 
 import logging
 import os
-import pickle
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -24,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model
-from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
+from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
@@ -32,8 +28,10 @@ from erfsfm.errors import ConfigError, DataError, TrainingError
 from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
+from erfsfm.threads import single_threaded_opencv
 from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
+from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.progress import ProgressLine
 
 logger = logging.getLogger(__name__)
@@ -65,25 +63,35 @@ def train(
         The output folder.
 
     Raises:
-        ConfigError, DataError, TrainingError: what a user can mend, in one line.
+        ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
-    checkpoint = output / "checkpoints" / "last.ckpt"
+    folder = OutputFolder(output)
+    rank = int(os.environ.get("LOCAL_RANK", 0)) if config.training.devices > 1 else 0
+    done_steps = 0
+    if resume:
+        done_steps = folder.resumable_steps(config)
+    elif rank == 0:  # the first process has written there before it starts the others
+        folder.require_free()
     training, validation = split_recordings(config.data)
-    done_steps = _prepare_output(config, output, checkpoint, resume)
+    if config.data.validation and not validation and rank == 0:
+        logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
     module = SelfSupervision(config)
     batch, workers = config.training.batch, config.data.workers
     together = batch * config.training.devices
-    rank = int(os.environ.get("LOCAL_RANK", 0)) if config.training.devices > 1 else 0
     draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank)
+    validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
     if config.initial_weights and not resume:
         seen = merge([*seen, *_start_from(module, config.initial_weights)])
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
-    loader = DataLoader(draws, batch, num_workers=workers, worker_init_fn=_calm_worker, persistent_workers=workers > 0)
-    validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
+    loader = DataLoader(
+        draws, batch, num_workers=workers, worker_init_fn=_single_threaded_worker, persistent_workers=workers > 0
+    )
     trainer = _trainer(config, output, device, quiet or rank > 0, keeper, done_steps)
-    _fit(trainer, module, loader, validation_loader, checkpoint if resume else None)
+    if rank == 0:
+        folder.write_config(config)
+    _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
     if not trainer.is_global_zero:
         sys.exit()
     keeper.save(module, trainer.global_step)
@@ -102,9 +110,9 @@ def _fit(
     validation_loader: DataLoader[dict[str, Tensor]] | None,
     checkpoint: Path | None,
 ) -> None:
-    """Run the loop; what stops it becomes one line."""
+    """Run the training loop; errors that stop it become one line."""
     try:
-        with _opencv_without_threads(), warnings.catch_warnings():
+        with single_threaded_opencv(), warnings.catch_warnings():
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
             warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")
@@ -118,48 +126,8 @@ def _fit(
         raise TrainingError(f"interrupted at step {trainer.global_step}: go on with --resume") from error
 
 
-def _prepare_output(config: ExperimentConfig, output: Path, checkpoint: Path, resume: bool) -> int:
-    """Make the folder ready; the number of steps already done."""
-    written = output / "config.yaml"
-    for needed in (checkpoint, written):
-        if resume and not needed.is_file():
-            raise TrainingError(
-                f"nothing to resume in {output}: no {needed.relative_to(output)}; start without --resume"
-            )
-    if not resume and (checkpoint.is_file() or (output / "model.yaml").is_file()):
-        raise TrainingError(f"{output} holds a run already: go on with --resume or choose another --output")
-    done_steps = 0
-    if resume:
-        begun = load_experiment(written)
-        if begun.network != config.network:
-            raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
-        if begun.training.optimiser != config.training.optimiser:
-            raise ConfigError(
-                f"{written} began with training.optimiser {begun.training.optimiser}, whose state another cannot take "
-                f"over; got {config.training.optimiser}: resume with the same one, or start anew from its weights"
-            )
-        done_steps = _steps_of(checkpoint)
-    output.mkdir(parents=True, exist_ok=True)
-    write_atomically(written, lambda path: path.write_text(dump_yaml(config)))
-    return done_steps
-
-
-def _steps_of(checkpoint: Path) -> int:
-    """Steps done at a checkpoint. Only tensors and plain values are read: no code in it can run."""
-    try:
-        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        missing = {"global_step", "state_dict", "optimizer_states", "loops"} - set(state)
-        if missing:
-            raise KeyError(*sorted(missing))
-        return int(state["global_step"])
-    except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise TrainingError(
-            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew in another --output"
-        ) from error
-
-
 def _start_from(module: SelfSupervision, name: str) -> list[str]:
-    """Take over trained weights, of another variant or half the width too; what they were trained on."""
+    """Load initial weights, also of another variant or half the width; returns what they were trained on."""
     model = load_model(name)
     wanted = module.config.network
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width")}
@@ -221,24 +189,13 @@ def _trainer(
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """A checkpoint replaces the last one at once, or not at all: Lightning's goes through another file system."""
+    """Checkpoints that are replaced atomically; Lightning's go through another file system."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``."""
         write_atomically(Path(path), lambda part: torch.save(checkpoint, part))
 
 
-@contextmanager
-def _opencv_without_threads() -> Iterator[None]:
-    """End OpenCV's threads while workers are forked: a child waits forever for threads it did not inherit."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)
-
-
-def _calm_worker(_: int) -> None:
-    """A worker computes with one thread: the cores belong to the training step."""
+def _single_threaded_worker(_: int) -> None:
+    """One thread in a data loader process: the cores are the training step's."""
     torch.set_num_threads(1)

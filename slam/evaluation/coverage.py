@@ -1,11 +1,13 @@
-"""Whether factors err as far as they say: the share of them within their own bounds, at the truth."""
+"""Coverage: the ratio of factors whose error at the true poses lies inside the bounds of their stated noise."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from slam.errors import SlamError
@@ -16,8 +18,19 @@ from slam.se3 import FloatArray
 LEVELS = (50, 90, 95)
 
 
-def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float) -> dict[str, float]:
-    """Share of factors whose error lies within what 50, 90 and 95 % of all errors of their stated noise do.
+@dataclass(frozen=True)
+class Coverage:
+    """Ratio of factors inside their own bounds, by level in percent: ``{"50": 0.49, ...}``.
+
+    ``by_source`` has the same for the factors of each source, and their number under ``factors``.
+    """
+
+    overall: dict[str, float]
+    by_source: dict[str, dict[str, float]]
+
+
+def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float) -> Coverage:
+    """Ratio of factors whose error lies inside the 50, 90 and 95 % bound of their stated noise.
 
     Args:
         relative_poses: measurements with their noise, at least one.
@@ -32,32 +45,31 @@ def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatA
     T_world_camera = T_world_camera_true.copy()
     T_world_camera[:, :3, 3] *= scale
     squared = whitened_squared(relative_poses, T_world_camera)
-    laws, law = np.unique([edge.student_t_dof for edge in relative_poses], return_inverse=True)
-    bounds = {
-        level: np.array([squared_bound(level / 100, student_t_dof) for student_t_dof in laws])[law] for level in LEVELS
-    }
-    return {str(level): float((squared <= bound).mean()) for level, bound in bounds.items()}
+    dofs, dof_of_factor = np.unique([edge.student_t_dof for edge in relative_poses], return_inverse=True)
+    inside = {}
+    for level in LEVELS:
+        bounds = np.array([squared_bound(level / 100, dof) for dof in dofs])
+        inside[str(level)] = squared <= bounds[dof_of_factor]  # (F,)
+    sources = np.array([edge.source for edge in relative_poses])
+    return Coverage(
+        overall=_ratios(inside, np.ones(len(sources), dtype=bool)),
+        by_source={
+            str(source): {"factors": int((sources == source).sum()), **_ratios(inside, sources == source)}
+            for source in np.unique(sources)
+        },
+    )
 
 
-def squared_bound(share: float, student_t_dof: float) -> float:
-    """Whitened squared error of six numbers that this share of all errors stays within.
+def squared_bound(probability: float, student_t_dof: float) -> float:
+    """Quantile of the whitened squared error of six numbers.
 
     For errors by Student's t with ``student_t_dof`` degrees of freedom, whose standard deviations are the sigmas: a
     quantile of Fisher's F. For normal errors (infinite ``student_t_dof``): a quantile of chi-square.
     """
     if math.isinf(student_t_dof):
-        return float(chi2.ppf(share, 6))
-    return float(6 * (student_t_dof - 2) / student_t_dof * f.ppf(share, 6, student_t_dof))
+        return float(chi2.ppf(probability, 6))
+    return float(6 * (student_t_dof - 2) / student_t_dof * f.ppf(probability, 6, student_t_dof))
 
 
-def coverage_by_source(
-    relative_poses: Sequence[RelativePose], T_world_camera_true: FloatArray, scale: float
-) -> dict[str, dict[str, float]]:
-    """Number of factors and `coverage` of each kind of measurement, by the name of its source."""
-    kinds: dict[str, list[RelativePose]] = {}
-    for edge in relative_poses:
-        kinds.setdefault(edge.source, []).append(edge)
-    return {
-        source: {"factors": len(edges), **coverage(edges, T_world_camera_true, scale)}
-        for source, edges in sorted(kinds.items())
-    }
+def _ratios(inside: Mapping[str, NDArray[np.bool_]], chosen: NDArray[np.bool_]) -> dict[str, float]:
+    return {level: float(within[chosen].mean()) for level, within in inside.items()}

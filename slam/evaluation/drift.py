@@ -1,27 +1,41 @@
-"""How far the trajectories of a run stand from the truth once they are laid over it, for figures.
+"""KITTI's drift: relative errors over segments of a given path length (Geiger et al. 2012), and the alignment of a
+run's trajectories for figures.
 
-The numbers of ``metrics.json`` come from ``slam/evaluation/trajectory.py``.
+``slam/evaluation/trajectory.py`` computes the numbers of ``metrics.json`` from the same segments.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam import se3
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory, associate
 
 REFERENCE = "reference"
-SEGMENT_LENGTHS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+FIGURE_LENGTHS_M = (10.0, 20.0, 50.0, *KITTI_LENGTHS_M)
 SEGMENT_STEP = 10
+
+IndexArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class SegmentErrors:
+    """Errors of all segments of one path length, both ``(S,)``: ``translation_m``, ``rotation`` in radians."""
+
+    length_m: float
+    translation_m: FloatArray
+    rotation: FloatArray
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Mean error of segments of one length: ``translation`` as a share, ``rotation`` in radians a metre."""
+    """Mean errors per metre over segments of one path length: ``translation`` a ratio, ``rotation`` in radians."""
 
     length_m: float
     translation: float
@@ -50,28 +64,51 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
     return drawn
 
 
-def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
-    """Mean relative error of all segments of each length that the path holds, one start every tenth frame.
+def segment_errors(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, lengths_m: Iterable[float]
+) -> list[SegmentErrors]:
+    """Relative errors of all segments of each length that the true path holds, a start every ten frames.
 
-    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+    A segment ends at the first frame beyond its length. Lengths that no segment reaches are left out.
 
     Args:
-        estimate: metric poses, row k beside row k of the reference.
-        reference: true poses.
+        T_world_estimate: poses ``(N, 4, 4)``, row k beside row k of the reference, in metres.
+        T_world_reference: true poses ``(N, 4, 4)``.
+        lengths_m: path lengths, in increasing order.
     """
-    distance = travelled(reference)
-    drifts = []
-    for length_m in SEGMENT_LENGTHS_M:
-        starts = np.arange(0, len(reference), SEGMENT_STEP)
+    distance = path_distance(T_world_reference)
+    segments = []
+    for length_m in lengths_m:
+        starts = np.arange(0, len(distance), SEGMENT_STEP)
         ends = np.searchsorted(distance, distance[starts] + length_m, side="right")
-        starts, ends = starts[ends < len(reference)], ends[ends < len(reference)]
-        if not len(starts):
+        fits = ends < len(distance)
+        if not fits.any():
             break
-        T_start_end = [se3.invert(t.T_world_camera[starts]) @ t.T_world_camera[ends] for t in (estimate, reference)]
-        T_error = se3.invert(T_start_end[0]) @ T_start_end[1]
-        translation = float(np.linalg.norm(T_error[:, :3, 3], axis=1).mean()) / length_m
-        drifts.append(Drift(length_m, translation, float(se3.rotation_angle(T_error[:, :3, :3]).mean()) / length_m))
-    return drifts
+        errors = relative_errors(T_world_estimate, T_world_reference, starts[fits], ends[fits])
+        segments.append(SegmentErrors(length_m, *errors))
+    return segments
+
+
+def relative_errors(
+    T_world_estimate: FloatArray, T_world_reference: FloatArray, starts: IndexArray, ends: IndexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Translation (metres) and rotation (radians) errors ``(M,)`` of the motions between pairs of rows.
+
+    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
+    """
+    T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
+    T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
+    T_error = se3.invert(T_start_end_estimate) @ T_start_end_reference
+    return np.linalg.norm(T_error[:, :3, 3], axis=1), se3.rotation_angle(T_error[:, :3, :3])
+
+
+def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
+    """Mean drift over segments of each of ``FIGURE_LENGTHS_M``; row k of the estimate belongs to row k."""
+    segments = segment_errors(estimate.T_world_camera, reference.T_world_camera, FIGURE_LENGTHS_M)
+    return [
+        Drift(each.length_m, *(float(error.mean()) / each.length_m for error in (each.translation_m, each.rotation)))
+        for each in segments
+    ]
 
 
 def estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Trajectory]]:
@@ -79,7 +116,12 @@ def estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Traject
     return [(name, trajectory) for name, trajectory in trajectories.items() if name != REFERENCE]
 
 
-def travelled(trajectory: Trajectory) -> FloatArray:
-    """Distance travelled ``(N,)`` up to each pose."""
-    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+def path_distance(T_world_camera: FloatArray) -> FloatArray:
+    """Distance travelled ``(N,)`` up to each of the poses ``(N, 4, 4)``."""
+    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def travelled(trajectory: Trajectory) -> FloatArray:
+    """Distance travelled ``(N,)`` up to each pose of a trajectory."""
+    return path_distance(trajectory.T_world_camera)

@@ -19,6 +19,7 @@ import numpy as np
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
 from slam import se3
 from slam.errors import ConfigError, TrajectoryError
+from slam.evaluation.drift import KITTI_LENGTHS_M, path_distance, relative_errors, segment_errors
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory, matching_tolerance_s, read_trajectory
 
@@ -28,8 +29,6 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 Metric = float | int | str
 """A number, or in words why there is none."""
 
-SEGMENT_LENGTHS_M = np.arange(100.0, 900.0, 100.0)
-SEGMENT_STEP = 10
 SNIPPET_LENGTH = 5
 
 _SNIPPET_KEYS = ("ate_mean", "ate_std", "re_mean", "re_std", "count")
@@ -38,6 +37,7 @@ _EVO_KEYS = ("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference")
 # With fewer frames an alignment leaves no freedom for an error, and its zero would mean nothing.
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 1, "first": 2, "scale": 2, "6dof": 2, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
+_REFERENCE_STANDS_STILL = "the reference does not move, so scaling would hide every error"
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,16 @@ def trajectory_metrics(
     reason = _why_not(estimate, reference)
     if reference is None or reason:
         aligned_metrics = {name: _null(_ALIGN_KEYS, reason) for name in ALIGNMENTS}
-        snippets = _snippet_record(snippet5) if snippet5 else _null(_SNIPPET_KEYS, reason)
-        return {"snippet5": snippets, "align": aligned_metrics, "evo": _null(_EVO_KEYS, reason)}
+        unmatched = _record(_snippet_metrics(snippet5)) if snippet5 else _null(_SNIPPET_KEYS, reason)
+        return {"snippet5": unmatched, "align": aligned_metrics, "evo": _null(_EVO_KEYS, reason)}
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
     ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
+    snippets = snippet5 or _cut_snippets(T_world_estimate, T_world_reference)
+    snippet_metrics = _snippet_metrics(snippets)
+    if snippets and _stands_still(T_world_reference):
+        snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL)
     return {
-        "snippet5": _snippet_record(snippet5 or _cut_snippets(T_world_estimate, T_world_reference)),
+        "snippet5": _record(snippet_metrics),
         "align": {name: _record(metrics) for name, metrics in ours.items()},
         "evo": _record(_evo_metrics(T_world_estimate, T_world_reference, ours["7dof"])),
     }
@@ -182,7 +186,7 @@ def _alignment_metrics(
     if frames < fewest:
         return dict.fromkeys(_ALIGN_KEYS, f"this alignment needs {fewest} frames; there are {frames}")
     if alignment in ("scale", "7dof") and _stands_still(T_world_reference):
-        return dict.fromkeys(_ALIGN_KEYS, "the reference does not move, so scaling would hide every error")
+        return dict.fromkeys(_ALIGN_KEYS, _REFERENCE_STANDS_STILL)
     aligned = align(T_world_estimate, T_world_reference, alignment)
     offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
     return {
@@ -194,19 +198,17 @@ def _alignment_metrics(
 
 
 def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, Metric]:
-    """KITTI's drift: mean error of all segments of 100 to 800 m of true path, a start every ten frames."""
-    steps = np.linalg.norm(np.diff(T_world_reference[:, :3, 3], axis=0), axis=1)
-    distance = np.concatenate([[0.0], np.cumsum(steps)])  # (N,), metres
-    starts, lengths = np.meshgrid(np.arange(0, len(distance), SEGMENT_STEP), SEGMENT_LENGTHS_M)
-    ends = np.searchsorted(distance, distance[starts] + lengths, side="right")  # first frame beyond
-    fits = ends < len(distance)
-    if not fits.any():
-        reason = f"no segment of {SEGMENT_LENGTHS_M[0]:.0f} m fits into the path of {distance[-1]:.1f} m"
+    """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
+    segments = segment_errors(T_world_estimate, T_world_reference, KITTI_LENGTHS_M)
+    if not segments:
+        path_m = path_distance(T_world_reference)[-1]
+        reason = f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m"
         return {"t_rel_percent": reason, "r_rel_deg_per_100m": reason}
-    translation, rotation = _relative_errors(T_world_estimate, T_world_reference, starts[fits], ends[fits])
+    translation = np.concatenate([each.translation_m / each.length_m for each in segments])
+    rotation = np.concatenate([each.rotation / each.length_m for each in segments])
     return {
-        "t_rel_percent": float(100.0 * (translation / lengths[fits]).mean()),
-        "r_rel_deg_per_100m": float(100.0 * np.rad2deg(rotation / lengths[fits]).mean()),
+        "t_rel_percent": float(100.0 * translation.mean()),
+        "r_rel_deg_per_100m": float(100.0 * np.rad2deg(rotation).mean()),
     }
 
 
@@ -215,21 +217,8 @@ def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -
     first = np.arange(len(T_world_estimate) - 1)
     if not first.size:
         return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), "a single frame makes no step")
-    translation, rotation = _relative_errors(T_world_estimate, T_world_reference, first, first + 1)
+    translation, rotation = relative_errors(T_world_estimate, T_world_reference, first, first + 1)
     return {"rpe_trans_m": float(translation.mean()), "rpe_rot_deg": float(np.rad2deg(rotation).mean())}
-
-
-def _relative_errors(
-    T_world_estimate: FloatArray, T_world_reference: FloatArray, starts: Any, ends: Any
-) -> tuple[FloatArray, FloatArray]:
-    """Translation (metres) and rotation (radians) errors ``(M,)`` of motions between pairs of rows.
-
-    E = (T_est,i^-1 T_est,j)^-1 (T_ref,i^-1 T_ref,j)      (Geiger et al. 2012, Eqs. 2-3)
-    """
-    T_start_end_estimate = se3.invert(T_world_estimate[starts]) @ T_world_estimate[ends]
-    T_start_end_reference = se3.invert(T_world_reference[starts]) @ T_world_reference[ends]
-    T_error = se3.invert(T_start_end_estimate) @ T_start_end_reference
-    return np.linalg.norm(T_error[:, :3, 3], axis=1), se3.rotation_angle(T_error[:, :3, :3])
 
 
 def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> SnippetErrors | None:
@@ -240,11 +229,11 @@ def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -
     return snippet_errors(predicted, snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH))
 
 
-def _snippet_record(errors: SnippetErrors | None) -> dict[str, Any]:
+def _snippet_metrics(errors: SnippetErrors | None) -> dict[str, Metric]:
     if errors is None:
-        return {**_null(_SNIPPET_KEYS[:-1], f"a snippet needs {SNIPPET_LENGTH} frames"), "count": 0}
+        return {**dict.fromkeys(_SNIPPET_KEYS, f"a snippet needs {SNIPPET_LENGTH} frames"), "count": 0}
     values = asdict(errors)
-    return _record({key: values[key] for key in _SNIPPET_KEYS})
+    return {key: values[key] for key in _SNIPPET_KEYS}
 
 
 def _evo_metrics(

@@ -8,12 +8,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam.errors import RunError
 from slam.frames import RelativePose
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)
+_VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+_INDICES = {_VERTEX: 1, _EDGE: 2}
+_NUMBERS = {_VERTEX: 7, _EDGE: 7 + 21}  # a pose, and the upper triangle of the information matrix
 
 
 def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera: FloatArray) -> None:
@@ -23,9 +27,9 @@ def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera
         SlamError: the file cannot be written.
     """
     T_from_to = np.array([edge.T_from_to for edge in relative_poses]).reshape(-1, 4, 4)
-    lines = [f"VERTEX_SE3:QUAT {k} {pose}" for k, pose in enumerate(_g2o_poses(T_world_camera))]
+    lines = [f"{_VERTEX} {k} {pose}" for k, pose in enumerate(_g2o_poses(T_world_camera))]
     lines += [
-        f"EDGE_SE3:QUAT {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.graph_sigmas)}"
+        f"{_EDGE} {edge.from_index} {edge.to_index} {pose} {_g2o_information(edge.graph_sigmas)}"
         for edge, pose in zip(relative_poses, _g2o_poses(T_from_to), strict=True)
     ]
     text = "\n".join(lines) + "\n"
@@ -49,3 +53,32 @@ def _g2o_information(sigmas: FloatArray) -> str:
 
 def _numbers(row: FloatArray) -> str:
     return " ".join(map(repr, row.tolist()))
+
+
+def check_g2o(path: Path) -> None:
+    """Make sure that a file is a whole graph as `write_g2o` writes it.
+
+    Raises:
+        RunError: it is missing, cut short, or a line is not one of the graph.
+    """
+    try:
+        text = path.read_text(encoding="ascii")
+        if not text.endswith("\n"):
+            raise ValueError("its last line is cut short")
+        vertices = 0
+        ends: list[tuple[int, int]] = []
+        for number, (kind, *words) in enumerate((line.split() for line in text.splitlines()), start=1):
+            indices = _INDICES.get(kind)
+            if indices is None or len(words) != indices + _NUMBERS[kind]:
+                raise ValueError(f"line {number} is neither a vertex nor an edge")
+            if not np.isfinite(np.array(words[indices:], dtype=np.float64)).all():
+                raise ValueError(f"line {number} has a number that is not finite")
+            if kind == _VERTEX:
+                vertices += 1
+            else:
+                ends.append((int(words[0]), int(words[1])))
+        edges = np.array(ends, dtype=np.int64).reshape(-1, 2)
+        if edges.size and not 0 <= edges.min() <= edges.max() < vertices:
+            raise ValueError("an edge leads to a vertex that is not there")
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} is no pose graph that can be read ({error}): run the sequence again") from error

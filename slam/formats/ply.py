@@ -1,68 +1,181 @@
-"""Points of PLY files, as Open3D and most others write them."""
+"""Point clouds and triangle meshes as PLY files, read and written whole.
+
+Open3D's own writer reports a full disk as a line for every vertex and as success, so files are written here. They have
+the layout, and the bytes, of Open3D's.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import RunError
 from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
+_NAMES = {"f8": "double", "f4": "float", "u1": "uchar", "i1": "char"}
+_NAMES |= {"u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"}
+_AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _GREY = 128
+_TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 
-def read_ply_points(path: Path) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Vertices ``(P, 3)`` and their RGB colours ``(P, 3)``, grey where the file has none.
+@dataclass(frozen=True)
+class Ply:
+    """Vertices as a structured array ``(V,)`` with the fields of the file, and triangles ``(T, 3)`` or None."""
+
+    vertices: NDArray[np.void]
+    triangles: NDArray[np.int64] | None = None
+
+    def columns(self, names: tuple[str, ...]) -> FloatArray | None:
+        """Fields of the vertices ``(V, len(names))``; None where the file has not all of them."""
+        if not set(names) <= set(self.vertices.dtype.names or ()):
+            return None
+        return np.stack([self.vertices[name].astype(np.float64) for name in names], axis=1)
+
+
+@dataclass
+class _Element:
+    """An element of the header: its name, how many there are, and its scalar and list properties."""
+
+    name: str
+    count: int
+    fields: list[tuple[str, str]] = field(default_factory=list)
+    list_types: tuple[str, str] | None = None
+
+
+def read_ply(path: Path) -> Ply:
+    """Read a whole file: every vertex, every triangle, and nothing after them.
 
     Raises:
-        RunError: no PLY in text or little-endian form, or its vertices do not come first and whole.
+        RunError: it is no PLY in text or little-endian form, is cut short, or holds impossible values.
     """
     try:
         with path.open("rb") as file:
-            is_text, count, vertex = _header(file)
-            if is_text:
-                rows = [tuple(file.readline().split()) for _ in range(count)]
-                vertices = np.array(rows, dtype=vertex)
-            else:
-                vertices = np.frombuffer(file.read(count * vertex.itemsize), dtype=vertex, count=count)
-        points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-        names = ("red", "green", "blue")
-        if not set(names) <= set(vertex.names or ()):
-            return points, np.full((count, 3), _GREY, np.uint8)
-        return points, np.stack([vertices[name].astype(np.uint8) for name in names], axis=1)
-    except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
+            is_text, elements = _header(file)
+            read = _read_text if is_text else _read_binary
+            parts = {element.name: read(file, element) for element in elements}
+            if file.read(1).strip():
+                raise ValueError("there is more in it than its header says")
+        ply = Ply(parts["vertex"], parts["face"].astype(np.int64) if "face" in parts else None)
+        _check(ply)
+        return ply
+    except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
         raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
 
 
-def _header(file: BinaryIO) -> tuple[bool, int, np.dtype[np.void]]:
-    """Whether the body is text, the number of vertices, and one vertex as a record."""
+def read_ply_points(path: Path) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """Vertices ``(P, 3)`` and their RGB colours ``(P, 3)``, grey where the file has none; raises as `read_ply`."""
+    ply = read_ply(path)
+    points, colours = ply.columns(_AXES), ply.columns(_COLOURS)
+    if points is None:
+        raise RunError(f"{path} is no PLY that can be read (its vertices have no x, y, z): run the sequence again")
+    if colours is None:
+        return points, np.full(points.shape, _GREY, np.uint8)
+    return points, colours.astype(np.uint8)
+
+
+def coloured_ply(
+    points: FloatArray, normals: FloatArray, colours: FloatArray, triangles: NDArray[np.int64] | None = None
+) -> Ply:
+    """A cloud or a mesh.
+
+    Args:
+        points: ``(P, 3)``.
+        normals: ``(P, 3)`` of length 1.
+        colours: RGB ``(P, 3)``, clipped to [0, 1].
+        triangles: ``(T, 3)`` indices of points; None for a cloud.
+    """
+    kinds = [*((name, "<f8") for name in (*_AXES, *_NORMALS)), *((name, "u1") for name in _COLOURS)]
+    vertices = np.empty(len(points), dtype=kinds)
+    whole = np.hstack([points, normals, np.rint(np.clip(colours, 0, 1) * 255)])
+    for name, column in zip((*_AXES, *_NORMALS, *_COLOURS), whole.T, strict=True):
+        vertices[name] = column
+    return Ply(vertices, triangles)
+
+
+def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
+    """The same with vertices and normals turned by ``R_up_world`` ``(3, 3)``."""
+    vertices = ply.vertices.copy()
+    for names in (_AXES, _NORMALS):
+        directions = ply.columns(names)
+        if directions is not None:
+            for name, column in zip(names, (directions @ R_up_world.T).T, strict=True):
+                vertices[name] = column
+    return replace(ply, vertices=vertices)
+
+
+def write_ply(path: Path, ply: Ply) -> None:
+    """Write a binary PLY, atomically.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam"]
+    lines.append(f"element vertex {len(ply.vertices)}")
+    for name in ply.vertices.dtype.names or ():
+        lines.append(f"property {_NAMES[ply.vertices.dtype[name].str[1:]]} {name}")
+    parts: list[NDArray[np.void]] = [ply.vertices]
+    if ply.triangles is not None:
+        lines += [f"element face {len(ply.triangles)}", "property list uchar uint vertex_indices"]
+        faces = np.empty(len(ply.triangles), _TRIANGLE)
+        faces["count"], faces["vertices"] = 3, ply.triangles
+        parts.append(faces)
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+    def fill(partial: Path) -> None:
+        with partial.open("wb") as file:
+            file.write(header)
+            for part in parts:
+                file.write(np.ascontiguousarray(part).view(np.uint8).data)
+
+    write_atomically(path, fill, RunError)
+
+
+def _check(ply: Ply) -> None:
+    points = ply.columns(_AXES)
+    if points is None:
+        raise ValueError("its vertices have no x, y, z")
+    if not np.isfinite(points).all():
+        raise ValueError("a coordinate is not finite")
+    triangles = ply.triangles
+    if triangles is not None and triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise ValueError("a triangle has a vertex that does not exist")
+
+
+def _header(file: BinaryIO) -> tuple[bool, list[_Element]]:
+    """Whether the body is text, and the elements in their order."""
     lines = _words(file)
     if next(lines) != ["ply"]:
         raise ValueError("it does not begin with 'ply'")
     _, form, _ = next(lines)
     if form not in ("ascii", "binary_little_endian"):
         raise ValueError(f"its format is {form}")
-    elements: list[tuple[str, int]] = []
-    fields: list[tuple[str, str]] = []
+    elements: list[_Element] = []
     for words in lines:
         if words[0] == "end_header":
             break
         if words[0] == "element":
-            elements.append((words[1], int(words[2])))
-        elif words[0] == "property" and len(elements) == 1:
-            fields.append((words[2], "<" + _TYPES[words[1]]))
-    if not elements or elements[0][0] != "vertex":
+            elements.append(_Element(words[1], int(words[2])))
+        elif words[1] == "list":
+            elements[-1].list_types = (f"<{_TYPES[words[2]]}", f"<{_TYPES[words[3]]}")
+        else:
+            elements[-1].fields.append((words[2], f"<{_TYPES[words[1]]}"))
+    else:
+        raise ValueError("its header has no end")
+    if not elements or elements[0].name != "vertex":
         raise ValueError("its vertices do not come first")
-    return form == "ascii", elements[0][1], np.dtype(fields)
+    return form == "ascii", elements
 
 
 def _words(file: BinaryIO) -> Iterator[list[str]]:
@@ -70,3 +183,31 @@ def _words(file: BinaryIO) -> Iterator[list[str]]:
         words = line.decode("ascii").split()
         if words and words[0] not in ("comment", "obj_info"):
             yield words
+
+
+def _read_text(file: BinaryIO, element: _Element) -> NDArray[Any]:
+    rows = [file.readline().split() for _ in range(element.count)]
+    if element.list_types is None:
+        return np.array([tuple(row) for row in rows], dtype=element.fields)
+    if any(len(row) != 4 or int(row[0]) != 3 for row in rows):
+        raise ValueError(f"each {element.name} must have 3 vertices")
+    return np.array([row[1:] for row in rows], dtype=np.int64).reshape(-1, 3)
+
+
+def _read_binary(file: BinaryIO, element: _Element) -> NDArray[Any]:
+    if element.list_types is None:
+        return _records(file, element, np.dtype(element.fields))
+    count_type, index_type = element.list_types
+    faces = _records(file, element, np.dtype([("count", count_type), ("vertices", index_type, (3,))]))
+    if (faces["count"] != 3).any():
+        raise ValueError(f"each {element.name} must have 3 vertices")
+    vertices: NDArray[Any] = faces["vertices"]
+    return vertices
+
+
+def _records(file: BinaryIO, element: _Element, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    content = file.read(element.count * dtype.itemsize)
+    if len(content) != element.count * dtype.itemsize:
+        there = len(content) // dtype.itemsize
+        raise ValueError(f"it is cut short: {there} of {element.count} elements '{element.name}' are there")
+    return np.frombuffer(content, dtype)

@@ -1,4 +1,4 @@
-"""The honest answer of a measurement that could not be made."""
+"""The result of a measurement that could not be made."""
 
 from __future__ import annotations
 

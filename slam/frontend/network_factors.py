@@ -3,14 +3,13 @@
 Noise measured beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
 overlapping snippets measured of it, with the correlation of their errors. On the drive this noise is scaled to the
 disagreement with image geometry, apart for straights and turns, and geometry's own noise is added
-(``docs/design/0019``). Errors have heavier tails than normal ones and are correlated from snippet to snippet: the graph
-takes inflated sigmas for that (``docs/design/0020``).
+(``docs/design/noise-and-the-pose-graph.md``). Errors have heavier tails than normal ones and are correlated from
+snippet to snippet: the graph takes inflated sigmas for that (``docs/design/noise-and-the-pose-graph.md``).
 
 Weights without measured noise: the network errs by a ratio of what it measures. For a pair n frames apart the rotation
-sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length
-plus a floor (a share of the median one-frame step). Overlapping snippets measure a pair again from
-nearly the same images, so their errors are taken as fully correlated: m measurements of one pair get
-their sigmas times sqrt(m) and count as one.
+sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length plus a
+floor (a share of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
+their errors are taken as fully correlated: m measurements of one pair get their sigmas times sqrt(m) and count as one.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from slam.robust import mad_sigma, mad_sigmas
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
-# image geometry errs too: agreement beyond this is not believed
+# image geometry errs too: sigmas are not scaled down beyond this
 _LEAST_SCALING = 0.3
 _STRETCHES = 4
 
@@ -125,11 +124,11 @@ def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> Flo
 
 
 def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
-    """Factors ``(P, 6)`` that make the noise of pairs add up along the drive as their errors do.
+    """Factors ``(P, 6)`` on the sigmas of pairs for the correlation of their errors along the drive.
 
-    A network errs alike on neighbouring snippets. What stretches of a quarter of the drive add up to is compared with
-    what independent errors would; where few pairs are measured, errors are taken to last for as long. Every distance in
-    frames says the same once more.
+    The network's errors on neighbouring snippets are correlated. Sums of whitened errors over a quarter of the drive are
+    compared with those of independent errors. Where few pairs are measured, errors are taken to be the same over a
+    quarter of the drive. Pairs of different distances in frames repeat each other, so each distance counts as a part.
     """
     factors = np.ones_like(whitened)
     frames = np.array([pair.last - pair.first for pair in pairs])
@@ -159,10 +158,9 @@ def _noise_of_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativeP
         between = []
         frame = pair.first
         while frame < pair.last:
-            ends = by_start.get(frame)
-            known = ends is not None and ends[1] <= pair.last
-            between.append(steps[ends].sigmas if known and ends is not None else usual)
-            frame = ends[1] if known and ends is not None else frame + 1
+            ends = by_start.get(frame, (frame, frame + 1))
+            between.append(steps[ends].sigmas if ends in steps and ends[1] <= pair.last else usual)
+            frame = ends[1]
         sigmas.append(np.linalg.norm(between, axis=0))
     return np.stack(sigmas)
 

@@ -1,7 +1,8 @@
 """Rotations of single steps corrected by relative rotations across several steps.
 
 A corner errs by as much over two steps as over one, and where its window drifts to one side it does so in every step.
-Measured between frames that lie farther apart, the same error is made half as often (``docs/design/0014``).
+Measured between frames that lie farther apart, the same error is made half as often
+(``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where new images were taken, in the map of an old run: places that look alike, and their points seen again."""
+"""Localisation of new images in the map of an old run: image retrieval, then PnP against the points of each place."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from erfsfm.errors import DataError
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.folder import image_folder
+from erfsfm.readers.images import list_images, read_image
 from slam.config import LoopsConfig, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
@@ -18,9 +22,7 @@ from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, invert, rotation_angle
-from slam.sequences.camera_file import CAMERA_FILE, CameraFile, read_camera_file, read_explicit
-from slam.sequences.folder import image_folder
-from slam.sequences.images import list_images, read_image
+from slam.sequences.camera_file import beside, read_explicit
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
@@ -29,7 +31,7 @@ _ASPECT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Localisation:
-    """Where an image was taken, ``T_world_camera`` in the unit of the map; or None and the reason."""
+    """The pose ``T_world_camera`` of an image in the unit of the map; or None and the reason."""
 
     image: str
     T_world_camera: FloatArray | None = None
@@ -39,43 +41,45 @@ class Localisation:
 
 
 def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterator[Localisation]:
-    """Find images in the map of a run, one after the other.
+    """Localise images in the map of a run, one after the other.
 
     Args:
         images: an image or a folder of images.
         run: a finished run with loops switched on.
-        camera: their ``camera.yaml``; else one beside them, else they are taken to be of the run's camera.
+        camera: their ``camera.yaml``; None for the one beside them, or else the camera of the run.
 
     Raises:
-        SlamError: no images, no places in the run, or a camera file that does not fit.
+        SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
     """
     paths = _image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} keeps no places: it ran with loops.enabled=false; run the sequence again")
-    told = _camera_file(camera, paths[0].parent)
-    localiser = Localiser(places, load_config(run.path / "config.yaml").loops, None if told is None else _pinhole(told))
-    undistortion = Undistortion(told) if told is not None and told.is_distorted else None
+    own_camera = _camera_file(camera, paths[0].parent)
+    localiser = Localiser(
+        places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
+    )
+    undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
     for path in paths:
         try:
             image = read_image(path)
             if undistortion is not None:
                 image = undistortion.apply(image)
             yield localiser.locate(path.name, image)
-        except SequenceError as error:
+        except (SequenceError, DataError) as error:
             yield Localisation(path.name, reason=str(error))
 
 
 class Localiser:
-    """Finds single images among the places of one drive; no network is asked."""
+    """Localises single images among the places of one run; no network is used."""
 
     def __init__(self, places: Places, config: LoopsConfig, intrinsics: Intrinsics | None = None) -> None:
-        """Learn the places.
+        """Index the places.
 
         Args:
             places: of an old run, at least one view.
-            config: gates, those of the run's own loops.
-            intrinsics: of the new images; None for those of the run, to whose size they are brought.
+            config: thresholds, those of the run's own loops.
+            intrinsics: of the new images; None for those of the run, to whose size images are resized.
         """
         self._places = places
         self._config = config
@@ -86,7 +90,7 @@ class Localiser:
         self._index = PlaceIndex(places.views, config)
 
     def locate(self, name: str, image: Image) -> Localisation:
-        """Find an image ``(H, W, 3)`` uint8 RGB: one place must see it well, or two must agree where it is.
+        """Localise an image ``(H, W, 3)`` uint8 RGB: one place with many inliers, or two places that agree on the pose.
 
         Raises:
             SequenceError: the image has another shape than its camera.
@@ -95,18 +99,18 @@ class Localiser:
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
             return Localisation(name, reason="no place of the map looks like it")
-        sightings: list[_Sighting] = []
+        hypotheses: list[_PoseHypothesis] = []
         reasons: list[str] = []
         for row in rows:
-            found = self._sight(self._places.views[row], self._places.T_world_camera[row], view)
+            found = self._resect(self._places.views[row], self._places.T_world_camera[row], view)
             if isinstance(found, str):
                 reasons.append(found)
             else:
-                sightings.append(found)
-        if not sightings:
+                hypotheses.append(found)
+        if not hypotheses:
             return Localisation(name, reason=f"{len(rows)} places look like it; of the first, {reasons[0]}")
-        best = max(sightings, key=lambda sighting: sighting.inliers)
-        support = sum(self._agree(best, other) for other in sightings) - 1
+        best = max(hypotheses, key=lambda hypothesis: hypothesis.inliers)
+        support = sum(self._agree(best, other) for other in hypotheses) - 1
         if support == 0 and best.inliers < self._config.alone_inliers:
             reason = f"frame {best.frame} sees it with {best.inliers} corners, and no other place agrees"
             return Localisation(name, reason=reason)
@@ -127,7 +131,7 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _sight(self, place: View, T_world_place: FloatArray, view: View) -> _Sighting | str:
+    def _resect(self, place: View, T_world_place: FloatArray, view: View) -> _PoseHypothesis | str:
         rows_place, rows_view = matches(place, view, self._config)
         if len(rows_place) < self._config.min_inliers:
             return f"only {len(rows_place)} corners match"
@@ -135,9 +139,9 @@ class Localiser:
         if isinstance(found, str):
             return found
         T_world_camera = T_world_place @ invert(found.T_image_points)
-        return _Sighting(place.index, T_world_camera, found.inliers, found.depth)
+        return _PoseHypothesis(place.index, T_world_camera, found.inliers, found.depth)
 
-    def _agree(self, one: _Sighting, other: _Sighting) -> bool:
+    def _agree(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
         T = invert(one.T_world_camera) @ other.T_world_camera
         turned = float(rotation_angle(T[:3, :3]))
         limit = self._config.agreement_ratio * min(one.depth, other.depth)
@@ -145,8 +149,8 @@ class Localiser:
 
 
 @dataclass(frozen=True)
-class _Sighting:
-    """What one place says of the image: its pose, by so many corners at a median ``depth``."""
+class _PoseHypothesis:
+    """The pose of the image by the points of one place: number of inliers and their median ``depth``."""
 
     frame: int
     T_world_camera: FloatArray
@@ -165,11 +169,8 @@ def _image_paths(images: Path) -> list[Path]:
 
 
 def _camera_file(explicit: Path | None, folder: Path) -> CameraFile | None:
-    if explicit is not None:
-        return read_explicit(explicit)
-    beside = folder / CAMERA_FILE
-    return read_camera_file(beside) if beside.is_file() else None
+    return beside(folder) if explicit is None else read_explicit(explicit)
 
 
 def _pinhole(camera: CameraFile) -> Intrinsics:
-    return Undistortion(camera).intrinsics if camera.is_distorted else camera.intrinsics
+    return Undistortion(camera).intrinsics if camera.is_distorted else Intrinsics.of(camera.pinhole)

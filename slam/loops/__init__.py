@@ -1,1 +1,1 @@
-"""Loop closure: places seen before, found by their words, measured against depth, checked against each other."""
+"""Loop closure: retrieval by binary words, verification against learned depth, consistency among loops."""

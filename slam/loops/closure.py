@@ -1,4 +1,4 @@
-"""One sweep over the whole run: candidates, measurements, and the loops that agree with each other."""
+"""Loop closure over a whole run: candidates, verified loops, and the consistent ones among them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ MOST_REJECTED = 200
 
 @dataclass(frozen=True)
 class LoopClosures:
-    """What became of all candidates; ``verified`` were measured, of these ``accepted`` support each other.
+    """The result for all candidates: ``verified`` were measured, ``accepted`` are those of them that are consistent.
 
-    ``not_sought`` says why there was no search, where there was none.
+    ``not_sought`` is the reason where no search was made.
     """
 
     candidates: int = 0
@@ -38,14 +38,14 @@ class LoopClosures:
     not_sought: str | None = None
 
     def without(self, dropped: Sequence[RelativePose]) -> LoopClosures:
-        """The same after the pose graph gave up some accepted loops."""
+        """The same after the pose graph dropped some accepted loops."""
         ends = {(edge.from_index, edge.to_index) for edge in dropped}
-        gone = tuple(loop.refused("the trajectory cannot meet it") for loop in self.accepted if loop.ends in ends)
+        gone = tuple(loop.refused("contradicts the pose graph") for loop in self.accepted if loop.ends in ends)
         kept = tuple(loop for loop in self.accepted if loop.ends not in ends)
         return replace(self, accepted=kept, rejected=gone + self.rejected)
 
     def summary(self) -> dict[str, Any]:
-        """For ``metrics.json``: how many, and why the most telling others were refused."""
+        """For ``metrics.json``: the numbers, and the reasons of the rejected loops with most inliers."""
         if self.not_sought is not None:
             names = ("candidates", "verified", "accepted")
             absent = dict.fromkeys(names) | {f"{name}_reason": self.not_sought for name in names}
@@ -61,7 +61,7 @@ class LoopClosures:
         }
 
     def details(self) -> dict[str, Any]:
-        """For ``loops.json``: every accepted loop and the most telling rejected ones, with what was measured."""
+        """For ``loops.json``: every accepted loop and the rejected ones with most inliers, with their measurements."""
         return {
             "accepted": [
                 {
@@ -96,16 +96,14 @@ def close_loops(
     get_or_compute: GetOrCompute = without_cache,
     seed: int = 0,
 ) -> LoopClosures:
-    """Find where the drive came back.
-
-    The sweep comes after the last frame: some drives close only in their last metres.
+    """Find the loops of a drive, after its last frame: some drives close only in their last metres.
 
     Args:
         views: in time order, their points in the unit of the trajectory.
         T_world_camera: odometry ``(N, 4, 4)``.
         intrinsics: of the images that the views were taken from.
-        config: gates and bounds.
-        recall: what images alone determine.
+        config: thresholds.
+        get_or_compute: cache of words, matches and features.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")

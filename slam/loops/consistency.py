@@ -1,7 +1,7 @@
-"""Loops judged together: against the trajectory so far, and against other loops of the same place.
+"""Consistency of loops with the odometry and with each other.
 
-A pairwise test as in Mangelson et al. 2018 (PCM), kept to neighbours: two loops that leave and arrive near each
-other must close a ring with the two short pieces of odometry between them.
+Pairwise consistency as in PCM (Mangelson et al. 2018), between neighbours only: two loops whose ends are near each
+other must close a cycle with the two short stretches of odometry between their ends.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from slam.se3 import FloatArray, invert, rotation_angle
 def agreeing(
     loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfig
 ) -> tuple[list[Loop], list[RejectedLoop]]:
-    """Split verified loops into those that support each other and those that stand alone or are contradicted.
+    """Split verified loops into consistent ones and those without support or in conflict with others.
 
     Args:
         loops: verified, in the unit of the trajectory.
         T_world_camera: odometry ``(N, 4, 4)``.
-        config: how far neighbours reach and how much they may differ.
+        config: thresholds; how near neighbours are and how much they may differ.
     """
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))])
     possible, kept, refused = [], [], []
@@ -33,7 +33,7 @@ def agreeing(
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         way = path[later] - path[earlier]
         if drift > config.max_drift_ratio * way:
-            refused.append(loop.refused(f"moves the trajectory by {drift:.1f} on a way of {way:.0f}"))
+            refused.append(loop.refused(f"corrects the odometry by {drift:.1f} over a path of {way:.0f}"))
         else:
             possible.append(loop)
     for loop, (supporting, conflicting) in zip(possible, _votes(possible, T_world_camera, config), strict=True):
@@ -47,7 +47,7 @@ def agreeing(
 
 
 def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfig) -> list[tuple[int, int]]:
-    """How many loops nearby agree and disagree with each loop; loops of the same image have one vote."""
+    """How many loops nearby support and conflict with each loop; loops of the same image count once."""
     ends = np.array([loop.ends for loop in loops]).reshape(-1, 2)
     T_from_to = np.array([loop.measured.T_from_to for loop in loops]).reshape(-1, 4, 4)
     sigmas = np.array([loop.measured.sigmas for loop in loops]).reshape(-1, 6)

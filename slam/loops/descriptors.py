@@ -1,4 +1,4 @@
-"""What closing loops remembers of a frame: oriented binary corners (ORB) and their points from learned depth."""
+"""Features of a frame for loop closure: ORB (Rublee et al. 2011) and 3-D points from learned depth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EDGE_PX = 16
 
 @dataclass(frozen=True)
 class View:
-    """The features of one frame: about 60 bytes each.
+    """The features of one frame, about 60 bytes each.
 
     ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
     NaN where the learned depth is not trusted, in the unit of the depth.
@@ -41,7 +41,7 @@ class View:
 
 
 class FeatureExtractor:
-    """Takes the features of frames of one sequence, the strongest of each part of the image."""
+    """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
     def __init__(
         self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
@@ -75,10 +75,8 @@ class FeatureExtractor:
     def _features(self, grey: Grey) -> Answer:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         found = self._orb.detect(grey, None)
-        chosen: Sequence[cv2.KeyPoint] = [
-            found[k] for k in _strongest_per_cell(found, grey.shape, self._config.max_features)
-        ]
-        chosen, descriptors = self._orb.compute(grey, chosen)
+        strongest = _strongest_per_cell(found, grey.shape, self._config.max_features)
+        chosen, descriptors = self._orb.compute(grey, [found[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
         return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors

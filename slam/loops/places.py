@@ -1,8 +1,7 @@
-"""What a run keeps so that new images can be found in its map: features, their points and where they were seen."""
+"""The localisation map of a run (``places.npz``): features, their 3-D points and the poses they were seen from."""
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -13,6 +12,7 @@ from slam.errors import RunError
 from slam.frames import Intrinsics
 from slam.loops.descriptors import View
 from slam.se3 import FloatArray
+from slam.storage.archive import reading_archive
 
 PLACES = "places.npz"
 _FORMAT = 1
@@ -27,7 +27,7 @@ class Places:
     T_world_camera: FloatArray
 
     def write(self, path: Path) -> None:
-        """Write as ``.npz``; what each array is stands in ``docs/outputs.md``."""
+        """Write as ``.npz``; ``docs/outputs.md`` describes each array."""
         camera = self.intrinsics
         np.savez_compressed(
             path,
@@ -48,16 +48,14 @@ class Places:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        try:
+        with reading_archive(path):
             with np.load(path, allow_pickle=False) as file:
                 content = {name: file[name] for name in file.files}
             if int(content["format"]) != _FORMAT:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
             width, height, *pinhole = content["camera"].tolist()
             frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
-            # beyond the last view there is nothing
+            # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
             return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])
-        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise RunError(f"{path} is damaged ({type(error).__name__}): run the sequence again") from error

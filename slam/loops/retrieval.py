@@ -1,7 +1,7 @@
-"""Places that look alike: a vocabulary of binary words learned on the run itself, compared by tf-idf.
+"""Place recognition: a bag of binary words learned on the run itself, compared by tf-idf.
 
 As in DBoW2 (Galvez-Lopez and Tardos 2012), with one flat vocabulary instead of a downloaded tree: a run has
-few enough frames for it, and words of its own streets tell them apart better than those of others.
+few enough frames for it, and words learned on its own images discriminate better.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BLOCK_DESCRIPTORS = 200  # fit the processor's cache
 
 @dataclass(frozen=True)
 class Candidate:
-    """Two rows of a list of views that look alike; ``score`` is a share of what neighbouring frames reach."""
+    """Two similar views by their rows; ``score`` is their similarity over that of neighbouring frames."""
 
     earlier: int
     later: int
@@ -37,13 +37,13 @@ class Candidate:
 def find_candidates(
     views: Sequence[View], path_m: FloatArray, config: LoopsConfig, get_or_compute: GetOrCompute = without_cache
 ) -> list[Candidate]:
-    """For each view the earlier views that look most like it, the best first.
+    """For each view the most similar earlier views, the best first.
 
     Args:
         views: in time order.
-        path_m: way driven up to each view ``(V,)``, in the unit of the trajectory.
-        config: how many, and how far apart in time and on the way.
-        recall: what images alone determine.
+        path_m: distance driven up to each view ``(V,)``, in the unit of the trajectory.
+        config: how many, and how far apart in time and distance.
+        get_or_compute: cache of the words.
     """
     everything = _all_descriptors(views)
     if len(views) < 2 or len(everything) == 0:
@@ -72,10 +72,10 @@ def find_candidates(
 
 
 class PlaceIndex:
-    """The views of an old drive, to be asked which of them look like a new one."""
+    """Finds the views of a drive that are similar to a new one."""
 
     def __init__(self, views: Sequence[View], config: LoopsConfig) -> None:
-        """Learn the words of the drive; at least one view."""
+        """Train the vocabulary on the drive's views, at least one."""
         everything = _all_descriptors(views)
         self._words = train_vocabulary(everything, config.words)
         counts = _word_counts(views, nearest_words(everything, self._words), config.words)
@@ -94,7 +94,7 @@ class PlaceIndex:
 
 
 def train_vocabulary(descriptors: Descriptors, words: int) -> Descriptors:
-    """Binary words ``(K, 32)``, at most so many, by k-majority (Grana et al. 2013) on an even sample of descriptors."""
+    """At most ``words`` binary words ``(K, 32)`` by k-majority (Grana et al. 2013) on an even sample of descriptors."""
     take = np.linspace(0, len(descriptors) - 1, min(len(descriptors), _TRAINING_DESCRIPTORS)).astype(int)
     sample = descriptors[take]
     centres = np.unique(sample[np.linspace(0, len(sample) - 1, min(words, len(sample))).astype(int)], axis=0)
@@ -120,7 +120,7 @@ def _all_descriptors(views: Sequence[View]) -> Descriptors:
 
 
 def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int) -> csr_array:
-    """How often each view has each of at most so many words ``(V, words)``, from those of all descriptors in a row."""
+    """Counts ``(V, words)`` of each word in each view; ``word`` is of all descriptors, view after view."""
     row = np.repeat(np.arange(len(views)), [len(view) for view in views])
     counts = csr_array((np.ones(len(word)), (row, word)), shape=(len(views), words))
     counts.sum_duplicates()
@@ -128,14 +128,14 @@ def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int) -> 
 
 
 def _inverse_frequency(counts: csr_array) -> FloatArray:
-    """Weight ``(K,)`` of each word: the fewer views have it, the more it tells."""
+    """Inverse document frequency ``(K,)`` of each word."""
     seen_in = np.bincount(counts.indices, minlength=counts.shape[1])
     weight: FloatArray = np.log(counts.shape[0] / np.maximum(seen_in, 1))
     return weight
 
 
 def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
-    """Unit vectors; square roots of the counts against bursts of one word."""
+    """Unit tf-idf vectors, of the square roots of the counts: repeated structure counts less (Jegou et al. 2009)."""
     weights = counts.copy()
     weights.data = np.sqrt(counts.data) * inverse_frequency[counts.indices]
     norm = np.sqrt(np.asarray((weights * weights).sum(axis=1)).ravel())

@@ -1,6 +1,6 @@
-"""A loop is measured or refused: matched corners against learned depth, in both directions.
+"""Verification of a loop candidate: perspective-n-point on learned depth, in both directions.
 
-Every gate is free of scale: pixels, shares, degrees, and lengths as a share of the depth of what was seen.
+All thresholds are independent of scale: pixels, ratios, degrees, and lengths over the depth of the points.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from slam.storage.cache import GetOrCompute, without_cache
 
 @dataclass(frozen=True)
 class Loop:
-    """A measured loop; ``inliers`` is the smaller of both directions."""
+    """A verified loop; ``inliers`` is the smaller of both directions."""
 
     measured: RelativePose
     inliers: int
@@ -33,13 +33,13 @@ class Loop:
         return self.measured.from_index, self.measured.to_index
 
     def refused(self, reason: str) -> RejectedLoop:
-        """The same loop, refused after all."""
+        """The same loop, rejected for a reason."""
         return RejectedLoop(*self.ends, reason, self.score, self.inliers, self.measured.T_from_to)
 
 
 @dataclass(frozen=True)
 class RejectedLoop:
-    """A loop that was looked at and refused, with as much as was measured of it."""
+    """A rejected candidate or loop, with what was measured of it."""
 
     from_index: int
     to_index: int
@@ -65,7 +65,7 @@ class LoopVerifier:
         self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
-        """Measure the pose of the later view in the earlier one, or say why not."""
+        """Measure the pose of the later view in the earlier one, or reject it with a reason."""
         given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
         rows_earlier, rows_later = self._get_or_compute(
             "corners alike", given, lambda: matches(earlier, later, self._config)
@@ -119,9 +119,9 @@ class LoopVerifier:
     def _sigmas(
         self, T_a_b: FloatArray, depth: float, difference: FloatArray, forward: Sighting, backward: Sighting
     ) -> FloatArray:
-        """Sigmas ``(6,)`` in camera b: of corners in both directions, of learned depth, of what they disagree about.
+        """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
-        Both directions see the same corners, and neighbouring corners err together: the second gains nothing.
+        Both directions use the same corners, whose errors are correlated: averaging them does not narrow the sigmas.
         """
         config = self._config
         corners = config.corner_sigma_widening * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
@@ -153,7 +153,7 @@ class Sighting:
 
 
 def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of both views that are each other's nearest by Hamming distance, clearly before the second nearest."""
+    """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     distance = hamming(first.descriptors, second.descriptors)
@@ -166,7 +166,7 @@ def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.
 
 
 def _halfway(T_a_b: FloatArray, T_a_b_again: FloatArray) -> FloatArray:
-    """The mean of two measurements of one transform that lie close together."""
+    """The mean of two close measurements of one transform."""
     R_a_b = T_a_b[:3, :3]
     half = Rotation.from_rotvec(0.5 * Rotation.from_matrix(R_a_b.T @ T_a_b_again[:3, :3]).as_rotvec())
     return make(R_a_b @ half.as_matrix(), 0.5 * (T_a_b[:3, 3] + T_a_b_again[:3, 3]))

@@ -1,13 +1,12 @@
 """A session on disk: all that was measured of a drive so far, without its images, so that it can go on.
 
 The frames that follow are looked at as if there had been no pause. Lengths, noise, loops and graph are then found anew
-for the whole drive (``docs/design/0016``).
+for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from slam.pipeline.observations import Keyframe, Observations
 from slam.pipeline.observer import ObserverState, RecentFrame
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
+from slam.storage.archive import reading_archive
 from slam.storage.serialisation import Serialiser
 from slam.storage.spill import SpillFile
 
@@ -126,9 +126,6 @@ def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
 
 def _read_keyframes(path: Path) -> Iterator[Keyframe]:
     spill_file = SpillFile()
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            for index in sorted(int(name.removeprefix("image_")) for name in file.files if name.startswith("image_")):
-                yield Keyframe(index, spill_file.put(file[f"image_{index}"]), spill_file.put(file[f"depth_{index}"]))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise RunError(f"{path} is damaged ({type(error).__name__}): run the sequence again") from error
+    with reading_archive(path), np.load(path, allow_pickle=False) as file:
+        for index in sorted(int(name.removeprefix("image_")) for name in file.files if name.startswith("image_")):
+            yield Keyframe(index, spill_file.put(file[f"image_{index}"]), spill_file.put(file[f"depth_{index}"]))

@@ -29,7 +29,7 @@ from slam.trajectory import Trajectory
 class Slam:
     """Monocular SLAM fed frame by frame; it keeps no images and makes no map.
 
-    What is measured is the pipeline's, causally: lengths and noise are judged anew as the drive goes on, so earlier
+    Measurements are those of the pipeline, causally. Lengths and noise are estimated anew as the drive goes on, so earlier
     poses move a little with every update.
     """
 

@@ -71,7 +71,7 @@ def written(value: Any, decimals: int) -> str:
 
 
 def failure(metrics: Mapping[str, Any]) -> str:
-    """Why a run failed, in one line; empty for a run that did not."""
+    """Why a run did not end well, in one line; empty for a run that did."""
     if metrics.get("status") == "ok":
         return ""
     reason = metrics.get("reason") or metrics.get("status_reason") or metrics.get("error") or "no reason recorded"
@@ -94,7 +94,7 @@ def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def comparison_table(runs: Sequence[RunFolder]) -> Table:
-    """One row for each run and trajectory; failed runs say why.
+    """One row for each run and trajectory; runs that failed or were killed say why.
 
     Raises:
         RunError: no run was given, or its ``metrics.json`` is damaged.
@@ -112,10 +112,11 @@ def comparison_table(runs: Sequence[RunFolder]) -> Table:
     for name, metrics in zip(run_names(runs), contents):
         leak, _ = lookup(metrics, "provenance", "leak")
         title = Text.assemble(name, ("\nLEAK", "bold red") if leak else "")
-        rows = [] if failure(metrics) else _rows(name, metrics, notes)
         if failure(metrics):
-            notes[f"{name} failed: {failure(metrics)}."] = None
-            title.append("\nfailed", "bold red")
+            ended = "failed" if metrics.get("status") == "failed" else "did not end"
+            notes[f"{name} {ended}: {failure(metrics)}."] = None
+            title.append(f"\n{ended}", "bold red")
+        rows = _rows(name, metrics, notes) if metrics.get("trajectories") else []
         names, *columns = zip(*rows) if rows else [()] * (1 + len(STATISTICS))
         table.add_row(title, *("\n".join(cells) for cells in (names, *columns)), end_section=True)
         if leak:
@@ -152,7 +153,17 @@ def run_names(runs: Sequence[RunFolder]) -> list[str]:
 def _contents(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
     if not runs:
         raise RunError("no run was given: name one or more run folders")
-    return [run.metrics() for run in runs]
+    return [_numbers(run) for run in runs]
+
+
+def _numbers(run: RunFolder) -> dict[str, Any]:
+    """The metrics of a run; where it was killed before it wrote them, those of the trajectories that it left."""
+    metrics = run.metrics()
+    if "trajectories" not in metrics and run.trajectory("optimised") is not None:
+        from slam.results.metrics import trajectory_metrics_of
+
+        metrics["trajectories"] = trajectory_metrics_of(run)
+    return metrics
 
 
 def _rows(name: str, metrics: Mapping[str, Any], notes: dict[str, None]) -> list[list[str]]:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from slam import se3
-from slam.formats.colmap import write_colmap
 from slam.errors import RunError
-from slam.storage.files import write_atomically
+from slam.formats.colmap import write_colmap
+from slam.formats.g2o import check_g2o
+from slam.formats.ply import read_ply, read_ply_points, rotated, write_ply
 from slam.loops.places import PLACES, Places
-from slam.formats.ply import read_ply_points
+from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, write_kitti, write_tum
 
 WHATS = ("mesh", "cloud", "trajectory", "graph", "colmap")
@@ -24,16 +25,10 @@ UPS = ("y-down", "z")
 R_UP_WORLD: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
-class RotatePly(Protocol):
-    """Writes a PLY whose vertices and normals are those of another, turned by ``R_up_world`` ``(3, 3)``."""
-
-    def __call__(self, source: Path, target: Path, R_up_world: FloatArray, /) -> None:
-        """Read ``source``, turn it and write ``target``, which ends in ``.ply``."""
-        ...
-
-
-def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: RotatePly) -> Path:
+def export(folder: RunFolder, what: str, output: Path, up: str) -> Path:
     """Write one part of a run, each file whole or not at all; missing parent folders are made.
+
+    The part is read whole and checked before anything is written.
 
     Args:
         folder: the run.
@@ -42,13 +37,13 @@ def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: Rota
         output: the file; for ``colmap`` the folder.
         up: ``y-down`` as the run has it, or ``z``: x right, y ahead, z up. A trajectory's cameras keep
             their own axes, only the world is turned.
-        rotate_ply: turns a PLY (``slam.mapping.rotate_ply``).
 
     Returns:
         What was written.
 
     Raises:
-        RunError: an unknown ``what`` or ``up``, a part that the run lacks, or a file that cannot be written.
+        RunError, TrajectoryError: an unknown ``what`` or ``up``, a part that the run lacks or that is damaged, or a
+            file that cannot be written.
     """
     if what not in WHATS:
         raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(WHATS)}")
@@ -60,24 +55,26 @@ def export(folder: RunFolder, what: str, output: Path, up: str, rotate_ply: Rota
     if output.is_dir():
         raise RunError(f"{output} is a folder: give the name of a file to write")
     if what in ("mesh", "cloud"):
-        _export_ply(folder.require(f"map_{what}.ply"), output, up, rotate_ply)
+        _export_ply(folder.require(f"map_{what}.ply"), output, up)
     elif what == "trajectory":
         _export_trajectory(folder, output, up)
     else:
         if up != "y-down":
             raise RunError("a graph is exported as the run has it: leave --up out or give --up y-down")
         source = folder.require("graph.g2o")
+        check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     return output
 
 
-def _export_ply(source: Path, output: Path, up: str, rotate_ply: RotatePly) -> None:
+def _export_ply(source: Path, output: Path, up: str) -> None:
     if output.suffix.lower() != ".ply":
         raise RunError(f"meshes and clouds are written as PLY; got '{output.name}', give a name that ends in .ply")
+    ply = read_ply(source)
     if up == "y-down":
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     else:
-        write_atomically(output, lambda path: rotate_ply(source, path, R_UP_WORLD), RunError)
+        write_ply(output, rotated(ply, R_UP_WORLD))
 
 
 def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
@@ -104,6 +101,11 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
         raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    frames, _ = lookup(folder.metrics(), "sequence", "frames")
+    if frames is not None and frames != len(trajectory):
+        raise RunError(
+            f"{folder.path}: trajectory_optimised.tum.txt is damaged: it has {len(trajectory)} rows for {frames} frames"
+        )
     if up == "z":
         T_up_world = se3.make(R_UP_WORLD, np.zeros(3))
         trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)

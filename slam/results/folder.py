@@ -4,66 +4,79 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import re
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from slam.errors import RunError
+from slam.results.output import ESTIMATE, METRICS, claim, replace_run, stamped
+from slam.results.output import TRAJECTORIES as TRAJECTORIES
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 logger = logging.getLogger(__name__)
 
-TRAJECTORIES = ("network", "odometry", "optimised", "lidar")
-_STEMS = ("reference", *(f"trajectory_{name}" for name in TRAJECTORIES))
-_OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "tum")) | {
-    "config.yaml",
-    "metrics.json",
-    "graph.g2o",
-    "loops.json",
-    "places.npz",
-    "drive.zip",
-    "keyframes.npz",
-    "map_mesh.ply",
-    "map_cloud.ply",
-    "report.html",
-    "run.log",
-}
-
 
 class RunFolder:
     """The files of one run, under the names of the contract (``docs/outputs.md``)."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, replaces: Path | None = None) -> None:
+        """A folder that exists.
+
+        Args:
+            path: where its files are.
+            replaces: the folder of an earlier run, whose place this one takes with `publish`.
+        """
         self.path = path
+        self.replaces = replaces
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str) -> RunFolder:
         """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` to it.
 
+        Where ``output`` holds an earlier run, the new one is written to ``output/unfinished`` until `publish`.
+
         Raises:
             RunError: ``output`` exists and holds something that is not a run, or no folder can be made there.
         """
         try:
-            return cls(_cleared(output) if output is not None else _stamped(results, sequence))
+            if output is None:
+                return cls(stamped(results, sequence))
+            place = claim(output)
+            return cls(place, None if place == output else output)
         except OSError as error:
             where = output if output is not None else results
             raise RunError(f"no run folder can be made in {where}: {error.strerror or error}") from error
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
-        """An existing run.
+        """An existing run, also one that failed or was killed: one line of the log says so.
 
         Raises:
             RunError: no run there.
         """
-        if not (path / "metrics.json").is_file():
-            what = "no such folder" if not path.exists() else "it holds no metrics.json"
+        if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
+            what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
             raise RunError(f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote")
-        return cls(path)
+        folder = cls(path)
+        metrics = folder.metrics()
+        if metrics.get("status", "ok") != "ok":
+            logger.warning("%s: %s: files that are there are whole", path, metrics.get("reason", metrics["status"]))
+        return folder
+
+    def publish(self) -> None:
+        """Take the place of the earlier run; nothing to do where there is none.
+
+        Raises:
+            RunError: a file cannot be moved or removed.
+        """
+        if self.replaces is None:
+            return
+        try:
+            replace_run(self.replaces, self.path)
+        except OSError as error:
+            raise RunError(f"the run in {self.replaces} cannot be replaced: {error.strerror or error}") from error
+        self.path, self.replaces = self.replaces, None
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file at once."""
@@ -75,7 +88,7 @@ class RunFolder:
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """Write ``metrics.json``; a number that is not finite is a mistake and is refused."""
-        self.write_text("metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+        self.write_text(METRICS, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, stem: str, trajectory: Trajectory) -> None:
         """Write ``<stem>.kitti.txt`` and ``<stem>.tum.txt``."""
@@ -83,15 +96,20 @@ class RunFolder:
         write_tum(self.path / f"{stem}.tum.txt", trajectory)
 
     def metrics(self) -> dict[str, Any]:
-        """What ``metrics.json`` says.
+        """What ``metrics.json`` says; of a run without one, that it was killed.
 
         Raises:
             RunError: the file is damaged.
         """
+        path = self.path / METRICS
         try:
-            content: dict[str, Any] = json.loads((self.path / "metrics.json").read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise RunError(f"{self.path / 'metrics.json'} is damaged: {error}; run the sequence again") from error
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {"status": "running", "reason": f"the run was killed before it wrote {METRICS}"}
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path} is damaged: {error}; run the sequence again") from error
+        if not isinstance(content, dict):
+            raise RunError(f"{path} is damaged: it holds no object; run the sequence again")
         return content
 
     def trajectory(self, name: str) -> Trajectory | None:
@@ -111,41 +129,3 @@ class RunFolder:
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
             raise RunError(f"{self.path} has no {name}: it holds {present}")
         return path
-
-
-def _cleared(output: Path) -> Path:
-    """``output`` as an empty run folder: an earlier run in it goes, files of other kinds beside it stay."""
-    if output.exists() and not output.is_dir():
-        raise RunError(f"{output} is a file: give a folder as --output")
-    output.mkdir(parents=True, exist_ok=True)
-    present = {path.name for path in output.iterdir()}
-    if present - _OWN and "metrics.json" not in present:
-        raise RunError(f"{output} is not empty and holds no run: choose another --output")
-    for name in present & _OWN:
-        (output / name).unlink()
-    return output
-
-
-def _stamped(results: Path, sequence: str) -> Path:
-    """A new ``<stamp>_<sequence>`` in ``results``, with ``latest`` pointing to it."""
-    safe = re.sub(r"[^\w.-]+", "-", sequence)
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = results / f"{stamp}_{safe}"
-    number = 1
-    while path.exists():
-        number += 1
-        path = results / f"{stamp}-{number}_{safe}"
-    path.mkdir(parents=True)
-    _link(results / "latest", path)
-    return path
-
-
-def _link(link: Path, target: Path) -> None:
-    """Point ``link`` to a sibling; a file system without links keeps the folders and loses the shortcut."""
-    temporary = link.with_name(f".{link.name}.{os.getpid()}")
-    try:
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(target.name, target_is_directory=True)
-        temporary.replace(link)
-    except OSError as error:
-        logger.warning("could not link %s to %s: %s", link, target, error)

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import SlamError
-from slam.frames import Sequence
 from slam.evaluation.map import accuracy_median_m, completeness, pose_similarity, visible_surface
+from slam.frames import Sequence
 from slam.pipeline.batch import SlamResult
 from slam.results.folder import RunFolder
+from slam.results.summary import null
 from slam.se3 import apply
 from slam.sequences.excerpt import Excerpt
-from slam.results.summary import null
 
 logger = logging.getLogger(__name__)
 
@@ -31,15 +31,20 @@ class Surface:
 
 
 def write_map(folder: RunFolder, result: SlamResult, sequence: Sequence) -> Surface:
-    """Write mesh and cloud; a map that is empty is a reason and no error."""
+    """Write mesh and cloud; a map that is empty is a reason and no error.
+
+    Raises:
+        RunError: a file cannot be written.
+    """
     if result.map is None:
         return Surface(_no_map("fusion is switched off (mapping.enabled)"))
     try:
-        folder.write("map_mesh.ply", result.map.write_mesh)
-        folder.write("map_cloud.ply", result.map.write_cloud)
+        result.map.mesh(), result.map.cloud()
     except SlamError as error:
         logger.warning("no map: %s", error)
         return Surface(_no_map(str(error)))
+    result.map.write_mesh(folder.path / "map_mesh.ply")
+    result.map.write_cloud(folder.path / "map_cloud.ply")
     cloud = result.map.cloud()
     quality = _map_quality(cloud.points_world, result, sequence)
     return Surface(asdict(result.map.statistics()) | quality, cloud.points_world, cloud.colours)

@@ -1,4 +1,4 @@
-"""What a run can say of itself: ``metrics.json`` (``docs/outputs.md``)."""
+"""The content of ``metrics.json`` (``docs/outputs.md``)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from erfsfm.evaluation.pose_metrics import (
     snippet_from_network,
     snippets_from_trajectory,
 )
-from slam.evaluation.coverage import coverage, coverage_by_source
+from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.pipeline.batch import SlamResult
+from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
 from slam.se3 import umeyama
 from slam.sequences.continued import Continued
-from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
-from slam.trajectory import Trajectory
+from slam.trajectory import Trajectory, associate
 
 
 def lidar_trajectory(result: SlamResult) -> Trajectory | None:
@@ -40,12 +41,9 @@ def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
     return {"lidar": trajectory_metrics(lidar, reference)}
 
 
-def run_metrics(
-    result: SlamResult, sequence: Sequence, provenance: Provenance, map_summary: dict[str, Any]
-) -> dict[str, Any]:
-    """All of it, every number that cannot be known null with its reason."""
+def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provenance) -> dict[str, Any]:
+    """Everything that is known before the map is fused; a number that cannot be known is null with its reason."""
     reference = result.reference
-    before = sequence.before if isinstance(sequence, Continued) else 0
     trajectories = {
         "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
         "odometry": trajectory_metrics(result.odometry, reference),
@@ -55,20 +53,50 @@ def run_metrics(
     metrics: dict[str, Any] = finite(
         {
             "schema": SCHEMA,
-            "status": "ok",
+            "status": "estimated",
+            "reason": "the run has not ended, or was killed while it made the map",
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
-            | {"continued_at": before},
-            "timing": describe_timing(result.stopwatch, len(sequence) - before),
+            | {"continued_at": _frames_before(sequence)},
+            "timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)),
             "scale": _scale(result),
             "trajectories": trajectories,
             "graph": _graph(result),
             "loops": result.loops.summary(),
-            "map": map_summary,
+            **null("map", "the run ended before its map was whole"),
         }
     )
     return metrics
+
+
+def whole_metrics(
+    metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any]
+) -> dict[str, Any]:
+    """The metrics of an estimate, of a run that ended well: with its map, and timed again."""
+    rest = {"timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)), "map": map_summary}
+    whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)
+    return {key: value for key, value in whole.items() if key not in ("reason", "map_reason")}
+
+
+def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
+    """Errors of the trajectories that a killed run left in its folder; of those that are not there, why."""
+    reference = folder.trajectory("reference")
+    numbers: dict[str, Any] = {}
+    for name in TRAJECTORIES:
+        estimate = folder.trajectory(name)
+        if estimate is None:
+            numbers |= null(name, "the run left no such trajectory")
+        elif reference is None:
+            numbers[name] = trajectory_metrics(estimate, None)
+        else:
+            numbers[name] = trajectory_metrics(*associate(estimate, reference))
+    return numbers
+
+
+def _frames_before(sequence: Sequence) -> int:
+    """Frames that an earlier run has seen (``run --continue``)."""
+    return sequence.before if isinstance(sequence, Continued) else 0
 
 
 def _network_snippets(result: SlamResult) -> SnippetErrors | None:
@@ -93,12 +121,12 @@ def _scale(result: SlamResult) -> dict[str, Any]:
 
 
 def _graph(result: SlamResult) -> dict[str, Any]:
-    """Size of the graph, and whether its noise means what it says: truth brought to the graph's scale."""
+    """Size of the graph, and coverage of its noise by the truth, brought to the graph's scale."""
     summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
     if result.reference is None:
         return summary | null("coverage", "the sequence has no true poses")
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
         return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
-    compared = (result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
-    return summary | {"coverage": coverage(*compared), "coverage_by_source": coverage_by_source(*compared)}
+    covered = coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
+    return summary | {"coverage": covered.overall, "coverage_by_source": covered.by_source}

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.errors import RunError
-from slam.storage.files import write_atomically
+from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.frames import DepthMap, Image
 from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, associate
 
 if TYPE_CHECKING:

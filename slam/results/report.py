@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
-from slam.results import report_page as page
+from slam.errors import SlamError
+from slam.evaluation.drift import REFERENCE
+from slam.frames import DepthMap, Image
 from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
-from slam.evaluation.drift import REFERENCE
-from slam.errors import SlamError
-from slam.frames import DepthMap, Image
+from slam.results.folder import RunFolder
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -27,7 +29,7 @@ from slam.results.plots import (
     trajectories_of,
     trajectory_figure,
 )
-from slam.results.folder import RunFolder
+from slam.results.report_tables import Cell, Table
 from slam.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -38,6 +40,14 @@ logger = logging.getLogger(__name__)
 Metrics = Mapping[str, Any]
 
 REPORT = "report.html"
+_TEMPLATES = Environment(
+    loader=PackageLoader("slam", "results"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
 _MEANINGS = {
     "config.yaml": "resolved configuration",
     "metrics.json": "every number of this page",
@@ -49,6 +59,8 @@ _MEANINGS = {
     "graph.g2o": "pose graph",
     "loops.json": "loop candidates and verdicts",
     "places.npz": "features of places, for localize",
+    "drive.zip": "measurements of every frame, for run --continue",
+    "keyframes.npz": "keyframes of the map, for run --continue",
     "map_mesh.ply": "map as a mesh, y down",
     "map_cloud.ply": "map as a coloured cloud, y down",
     "run.log": "log of the run",
@@ -62,6 +74,16 @@ class DepthExample:
     index: int
     image: Image
     depth: DepthMap
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure as a base64 PNG, or why it could not be drawn."""
+
+    title: str
+    caption: str
+    data: str = ""
+    reason: str = ""
 
 
 def write_report(
@@ -84,54 +106,49 @@ def write_report(
     metrics = folder.metrics()
     name = str(lookup(metrics, "sequence", "name")[0] or folder.path.resolve().name)
     trajectories, unit = _trajectories(folder), length_unit(folder)
-    ok = not failure(metrics)
-    body = [
-        *_header(name, metrics),
-        page.section("What ran", report_tables.what_ran(metrics)),
-        _trajectory_section(trajectories, unit),
-        page.section("Errors", report_tables.errors(metrics), *_error_pictures(trajectories)),
-        _depth_section(examples),
-        page.section(
-            "Map",
-            _map_picture(trajectories.get("optimised"), unit, map_points, map_colours),
-            report_tables.map_numbers(metrics) if ok else "",
-        ),
-        page.section("Loops", report_tables.loops(metrics, folder.path / "loops.json") if ok else ""),
-        page.section("Pose graph", report_tables.graph(metrics)),
-        page.section("Time", report_tables.timing(metrics)),
-        page.section("Every alignment", report_tables.alignments(metrics)),
-        _file_section(folder),
-        _footer(metrics),
-    ]
-    folder.write_text(REPORT, page.page(f"{name}: erfsfm-slam report", filter(None, body)))
+    page = _TEMPLATES.get_template("report.html.j2").render(
+        name=name,
+        failure=failure(metrics),
+        leak=lookup(metrics, "provenance", "leak")[0],
+        version=lookup(metrics, "provenance", "version")[0] or "",
+        unit_notes=unit_notes(metrics),
+        key_numbers=[] if failure(metrics) else report_tables.key_numbers(metrics),
+        what_ran=report_tables.what_ran(metrics),
+        trajectories=_trajectory_picture(trajectories, unit),
+        errors=report_tables.errors(metrics),
+        no_errors=report_tables.no_errors(metrics),
+        error_pictures=list(_error_pictures(trajectories)),
+        depth=_depth_picture(examples),
+        map_picture=_map_picture(trajectories.get("optimised"), unit, map_points, map_colours),
+        map=report_tables.map_numbers(metrics),
+        no_map=_absence(metrics, "map"),
+        loops=report_tables.loops(metrics, folder.path / "loops.json"),
+        no_loops=_absence(metrics, "loops"),
+        graph=report_tables.graph(metrics),
+        timing=report_tables.timing(metrics),
+        alignments=report_tables.alignments(metrics),
+        files=_files(folder),
+    )
+    folder.write_text(REPORT, page)
 
 
-def _header(name: str, metrics: Metrics) -> Iterator[str]:
-    yield f"<header>{page.text('erfsfm-slam report', 'kicker')}<h1>{escape(name)}</h1></header>"
-    reason = failure(metrics)
-    if reason:
-        yield page.stamp("FAILED", reason)
-    if lookup(metrics, "provenance", "leak")[0]:
-        words = "The weights have seen this sequence, or a part of it, in training: the errors below are no test."
-        yield page.stamp("LEAK", words)
-    for note in unit_notes(metrics):
-        yield page.hint(note)
-    if not reason:
-        yield report_tables.key_numbers(metrics)
+def _absence(metrics: Metrics, name: str) -> str:
+    """Why a run has no such part; empty where it has one, or failed before it said anything of it."""
+    part, reason = lookup(metrics, name)
+    return "" if part is not None or (failure(metrics) and name not in metrics) else reason
 
 
-def _trajectory_section(trajectories: Mapping[str, Trajectory], unit: str) -> str:
+def _trajectory_picture(trajectories: Mapping[str, Trajectory], unit: str) -> Picture | None:
     if not trajectories:
-        return page.section("Trajectories", page.text("No trajectory was written.", "soft"))
+        return None
     if REFERENCE in trajectories:
         caption = "Seen from above. Each estimate is laid over the ground truth by rotation, translation and one scale."
     else:
         caption = "Seen from above, as written; no ground truth is known. The raw network chain is scaled to the rest."
-    picture = _drawn(lambda: trajectory_figure(trajectories, unit=unit), "Trajectories from above", caption)
-    return page.section("Trajectories", picture)
+    return _drawn(lambda: trajectory_figure(trajectories, unit=unit), "Trajectories from above", caption)
 
 
-def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[str]:
+def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]:
     if REFERENCE not in trajectories or len(trajectories) < 2:
         return
     caption = "Distance to the true position, after the 7-dof alignment."
@@ -140,13 +157,13 @@ def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[str]:
     yield _drawn(lambda: drift_figure(trajectories), "Drift over segment length", caption)
 
 
-def _depth_section(examples: Sequence[DepthExample]) -> str:
+def _depth_picture(examples: Sequence[DepthExample]) -> Picture | None:
     if not examples:
-        return ""
+        return None
     labels = [f"frame {example.index}" for example in examples]
-    figure = depth_figure([e.image for e in examples], [e.depth for e in examples], labels)
     caption = "Frames above their learned disparity: bright is near, dark is far, one colour scale for all."
-    return page.section("Depth", page.picture(figure, "Depth maps", caption))
+    images, depths = [example.image for example in examples], [example.depth for example in examples]
+    return _drawn(lambda: depth_figure(images, depths, labels), "Depth maps", caption)
 
 
 def _map_picture(
@@ -154,30 +171,22 @@ def _map_picture(
     unit: str,
     points: NDArray[np.floating] | None,
     colours: NDArray[np.floating] | None,
-) -> str:
+) -> Picture | None:
     if points is None or colours is None or not len(points):
-        return ""
-    figure = map_figure(points, colours, optimised, unit)
-    return page.picture(figure, "Map from above", "The map from above in its own colours.")
+        return None
+    caption = "The map from above in its own colours."
+    return _drawn(lambda: map_figure(points, colours, optimised, unit), "Map from above", caption)
 
 
-def _file_section(folder: RunFolder) -> str:
-    entries = []
+def _files(folder: RunFolder) -> Table | None:
+    """Every other file of the run with its meaning and size."""
+    rows = []
     for path in sorted(folder.path.iterdir()):
         if path.is_file() and not path.name.startswith(".") and path.name != REPORT:
             meaning = _MEANINGS.get(path.name) or _MEANINGS.get(path.name.partition(".")[0], "")
-            entries.append((quote(path.name), path.name, meaning, _size(path.stat().st_size)))
-    return page.section("Files", page.links(entries) if entries else "")
-
-
-def _footer(metrics: Metrics) -> str:
-    version = lookup(metrics, "provenance", "version")[0] or ""
-    words = (
-        f"erfsfm-slam {version}. Axes: x right, y down, z ahead; the world is the first camera. ATE: root mean square "
-        "of position errors. RPE: mean over consecutive frames. The raw network chain has no metric scale of its "
-        "own: compare it under the alignments with scale."
-    )
-    return f"<footer>{page.text(words, 'soft')}</footer>"
+            size = _size(path.stat().st_size)
+            rows.append([Cell(path.name, address=quote(path.name)), Cell(meaning), Cell(size)])
+    return Table((), rows, "words") if rows else None
 
 
 def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
@@ -185,16 +194,18 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
     try:
         return trajectories_of(folder)
     except SlamError as error:
-        logger.warning("the report shows no trajectories: %s", error)
+        logger.info("the report shows no trajectories: %s", error)
         return {}
 
 
-def _drawn(draw: Callable[[], Figure], alternative: str, caption: str) -> str:
+def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
     """A picture, or why it cannot be drawn (trajectories that share no time, for one)."""
+    buffer = io.BytesIO()
     try:
-        return page.picture(draw(), alternative, caption)
+        draw().savefig(buffer, format="png", dpi=160, metadata={"Software": None})
     except SlamError as error:
-        return page.text(f"{alternative}: not drawn, {error}.", "soft")
+        return Picture(title, caption, reason=str(error))
+    return Picture(title, caption, base64.b64encode(buffer.getvalue()).decode("ascii"))
 
 
 def _size(count: int) -> str:

@@ -1,14 +1,13 @@
-"""The tables of a report: ``metrics.json`` in, HTML out; every missing number shows its reason."""
+"""The tables of a report, from ``metrics.json``; every missing number shows its reason."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from slam.results import report_page as page
 from slam.results.comparison import (
     ALIGNED_ATE,
     EVO_DIFFERENCE,
@@ -24,10 +23,31 @@ from slam.results.comparison import (
     lookup,
     written,
 )
-from slam.results.report_page import Cell
 from slam.results.folder import TRAJECTORIES
 
 Metrics = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A table cell: its text or a bar of ``bar`` percent, a tooltip, a style (``best``, ``missing``) and a link."""
+
+    text: str
+    tooltip: str = ""
+    style: str = ""
+    bar: float | None = None
+    address: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells row by row; a row that is a string heads the rows below it. Notes stand under the table."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell] | str]
+    style: str = ""
+    notes: Sequence[str] = field(default_factory=tuple)
+
 
 ALIGNMENTS = ("none", "first", "scale", "6dof", "7dof")
 MOST_LOOPS = 40
@@ -49,23 +69,21 @@ def number(metrics: Metrics, *path: str, decimals: int = 0) -> Cell:
     return Cell(words, reason, "missing" if reason else "")
 
 
-def key_numbers(metrics: Metrics) -> str:
-    """The numbers to see first."""
+def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
+    """The numbers to see first: name, value and unit of each."""
     best = ("trajectories", "optimised")
-    return page.cards(
-        [
-            ("Position error", number(metrics, *best, "align", "7dof", "ate_rmse_m", decimals=2), "m, 7 dof"),
-            ("Drift, t_rel", number(metrics, *best, *T_REL.path, decimals=2), "%"),
-            ("Path", number(metrics, "sequence", "length_m"), "m"),
-            ("Frames", number(metrics, "sequence", "frames"), ""),
-            ("Speed", number(metrics, "timing", "frames_per_second", decimals=1), "frames/s"),
-            ("Loops accepted", number(metrics, "loops", "accepted"), ""),
-            ("Map triangles", number(metrics, "map", "triangles"), ""),
-        ]
-    )
+    return [
+        ("Position error", number(metrics, *best, "align", "7dof", "ate_rmse_m", decimals=2), "m, 7 dof"),
+        ("Drift, t_rel", number(metrics, *best, *T_REL.path, decimals=2), "%"),
+        ("Path", number(metrics, "sequence", "length_m"), "m"),
+        ("Frames", number(metrics, "sequence", "frames"), ""),
+        ("Speed", number(metrics, "timing", "frames_per_second", decimals=1), "frames/s"),
+        ("Loops accepted", number(metrics, "loops", "accepted"), ""),
+        ("Map triangles", number(metrics, "map", "triangles"), ""),
+    ]
 
 
-def what_ran(metrics: Metrics) -> str:
+def what_ran(metrics: Metrics) -> Table:
     """Sequence, weights, scale and command; a run that failed early has less to say."""
 
     def say(*path: str, decimals: int = 1, unit: str = "") -> str:
@@ -91,23 +109,25 @@ def what_ran(metrics: Metrics) -> str:
         ("Version, commit", f"{say('provenance', 'version')}, {say('provenance', 'commit')}"),
     ]
     told = [row for row in rows if NOT_RECORDED not in row[1]] if failure(metrics) else rows
-    return page.table((), told, "words")
+    return Table((), _texts(told), "words")
 
 
-def errors(metrics: Metrics) -> str:
-    """Every trajectory against the truth, a column each; empty where nothing was evaluated."""
-    known = [name for name in TRAJECTORIES if lookup(metrics, "trajectories", name)[0] is not None]
-    if not known:
+def no_errors(metrics: Metrics) -> str:
+    """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
+    places = [("trajectories", name, *each.path) for each in STATISTICS for name in _evaluated(metrics)]
+    if not places or any(lookup(metrics, *place)[0] is not None for place in places):
         return ""
-    places = [("trajectories", name, *statistic.path) for statistic in STATISTICS for name in known]
-    if all(lookup(metrics, *place)[0] is None for place in places):
-        return page.text(f"No errors: {lookup(metrics, *places[0])[1]}.", "soft")
-    missing: dict[str, list[str]] = {}
+    return lookup(metrics, *places[0])[1]
 
-    def row(statistic: ErrorColumn) -> list[Cell | str]:
+
+def errors(metrics: Metrics) -> Table | None:
+    """Every trajectory against the truth, a column each; None where nothing was evaluated."""
+    known = _evaluated(metrics)
+    if not known or no_errors(metrics):
+        return None
+
+    def row(statistic: ErrorColumn) -> list[Cell]:
         values = [lookup(metrics, "trajectories", name, *statistic.path) for name in known]
-        for name, (_, why) in zip(known, values):
-            missing.setdefault(why, []).append(f"{statistic.name} of {name}")
         cells = _cells(values, statistic.decimals, mark_best=statistic is not EVO_DIFFERENCE)
         if statistic.path[0] == "snippet5":
             spread = (*statistic.path[:-1], statistic.path[-1].replace("_mean", "_std"))
@@ -116,9 +136,9 @@ def errors(metrics: Metrics) -> str:
                 cell if std is None else replace(cell, text=f"{cell.text} ± {written(std, statistic.decimals)}")
                 for cell, std in zip(cells, stds)
             ]
-        return [statistic.name, *cells]
+        return [Cell(statistic.name), *cells]
 
-    rows: list[page.Row | str] = [
+    rows: list[Sequence[Cell] | str] = [
         "Snippets of five frames, each with its own scale; ATE is norm / 5",
         *(row(statistic) for statistic in (SNIPPET_ATE, SNIPPET_RE)),
         "Whole trajectory: position error in metres, by alignment",
@@ -128,15 +148,12 @@ def errors(metrics: Metrics) -> str:
         "Cross-check",
         row(EVO_DIFFERENCE),
     ]
-    for name in TRAJECTORIES:
-        missing.setdefault(lookup(metrics, "trajectories", name)[1], []).append(f"{name} trajectory")
-    reasons = [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items() if why]
-    return page.table(["", *known], rows) + page.text("Bold: the best of a row.", "note") + _notes(reasons)
+    return Table(["", *known], rows, notes=["Bold: the best of a row.", *_notes(_missing_errors(metrics, known))])
 
 
-def alignments(metrics: Metrics) -> str:
-    """Every statistic of every trajectory under every alignment; empty where nothing was evaluated."""
-    rows: list[page.Row | str] = []
+def alignments(metrics: Metrics) -> Table | None:
+    """Every statistic of every trajectory under every alignment; None where nothing was evaluated."""
+    rows: list[Sequence[Cell] | str] = []
     for name in TRAJECTORIES:
         place = ("trajectories", name, "align")
         if lookup(metrics, *place)[0] is None:
@@ -144,30 +161,28 @@ def alignments(metrics: Metrics) -> str:
         rows.append(name)
         for how in ALIGNMENTS:
             cells = [number(metrics, *place, how, key, decimals=decimals) for key, _, decimals in _PER_ALIGNMENT]
-            rows.append([how, *cells])
-    return page.table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else ""
+            rows.append([Cell(how), *cells])
+    return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
 
 
-def map_numbers(metrics: Metrics) -> str:
-    """Size and quality of the map."""
-    numbers, reason = lookup(metrics, "map")
+def map_numbers(metrics: Metrics) -> Table | None:
+    """Size and quality of the map; None without one."""
+    numbers, _ = lookup(metrics, "map")
     if numbers is None:
-        return page.text(f"No map: {reason}.", "soft")
+        return None
     keys = [key for key in numbers if not key.endswith("_reason")]
     names = [_MAP_NAMES.get(key, key.replace("_", " ")) for key in keys]
     cells = [number(numbers, key, decimals=3) for key in keys]
     missing = [f"{name}: {cell.tooltip}" for name, cell in zip(names, cells) if cell.tooltip]
-    return page.table(["", *names], [["map", *cells]]) + _notes(missing)
+    return Table(["", *names], [[Cell("map"), *cells]], notes=_notes(missing))
 
 
-def loops(metrics: Metrics, loops_file: Path) -> str:
-    """How many loops were found; the accepted ones of ``loops.json`` and the rejected ones, with the reason."""
-    tree, reason = lookup(metrics, "loops")
+def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
+    """``counts`` of loops, ``reasons`` of those that are missing, and a ``table`` of the accepted and the rejected."""
+    tree, _ = lookup(metrics, "loops")
     if tree is None:
-        return page.text(f"No loops: {reason}.", "soft")
+        return None
     stages = ("candidates", "verified", "accepted")
-    counts = ", ".join(f"{number(tree, stage).text} {stage}" for stage in stages)
-    pieces = [page.text(f"{counts}."), _notes(lookup(tree, stage)[1] for stage in stages)]
     groups = (("accepted", _details(loops_file, "accepted")), ("rejected", tree.get("rejected") or []))
     rows = [
         (str(loop.get("from")), str(loop.get("to")), verdict, str(loop.get("reason") or ""))
@@ -175,48 +190,73 @@ def loops(metrics: Metrics, loops_file: Path) -> str:
         for loop in entries
         if isinstance(loop, Mapping)
     ]
-    if rows:
-        pieces.append(page.table(("from frame", "to frame", "verdict", "reason"), rows[:MOST_LOOPS], "words"))
-    if len(rows) > MOST_LOOPS:
-        pieces.append(page.text(f"{len(rows) - MOST_LOOPS} more in {loops_file.name}.", "note"))
-    return "".join(pieces)
+    more = [f"{len(rows) - MOST_LOOPS} more in {loops_file.name}."] if len(rows) > MOST_LOOPS else []
+    head = ("from frame", "to frame", "verdict", "reason")
+    return {
+        "counts": ", ".join(f"{number(tree, stage).text} {stage}" for stage in stages),
+        "reasons": _notes(lookup(tree, stage)[1] for stage in stages),
+        "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
+    }
 
 
-def graph(metrics: Metrics) -> str:
-    """Size of the pose graph, and whether its noise means what it says; empty without a graph."""
+def graph(metrics: Metrics) -> dict[str, Any] | None:
+    """``nodes`` and ``factors`` of the pose graph, and its ``coverage`` or the ``reasons`` why there is none."""
     if lookup(metrics, "graph")[0] is None:
-        return ""
-    nodes, factors = (number(metrics, "graph", key).text for key in ("nodes", "factors"))
-    size = page.text(f"{nodes} poses and {factors} factors.")
+        return None
+    size = {key: number(metrics, "graph", key).text for key in ("nodes", "factors")}
     coverage, reason = lookup(metrics, "graph", "coverage")
     if coverage is None:
-        return size + _notes([f"coverage: {reason}"])
-    rows: list[page.Row | str] = []
+        return size | {"coverage": None, "reasons": _notes([f"coverage: {reason}"])}
+    rows = []
     for level in ("50", "90", "95"):
         share, why = lookup(coverage, level)
         shown = MISSING if share is None else f"{100 * share:.0f} %"
-        rows.append([f"inside the {level} % quantile", Cell(shown, why, "missing" if why else "")])
+        rows.append([Cell(f"inside the {level} % quantile"), Cell(shown, why, "missing" if why else "")])
     words = (
         "Share of factors whose error at the truth lies inside a quantile of their stated noise. A share below its "
         "quantile means sigmas that are too small, one above it sigmas that are too large."
     )
-    return size + page.table(("factors", "share"), rows, "words") + page.text(words, "note")
+    return size | {"coverage": Table(("factors", "share"), rows, "words", [words]), "reasons": []}
 
 
-def timing(metrics: Metrics) -> str:
-    """Seconds by stage, the longest first; empty where nothing was timed."""
+def timing(metrics: Metrics) -> Table | None:
+    """Seconds by stage, the longest first; None where nothing was timed."""
     stages, _ = lookup(metrics, "timing", "stages")
     if not stages:
-        return ""
+        return None
     total = max(float(lookup(metrics, "timing", "seconds_total")[0] or 0.0), sum(stages.values()), 1e-9)
     longest = max(*stages.values(), 1e-9)
     rows = [
-        (name, f"{seconds:.1f} s", f"{100 * seconds / total:.0f} %", seconds / longest)
+        [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
         for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
     ]
     memory, processor = (number(metrics, "timing", key).text for key in ("peak_rss_mb", "cpu_seconds"))
     words = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
-    return page.bars(("stage", "time", "share"), rows) + page.text(words, "note")
+    return Table(("stage", "time", "share", ""), rows, notes=[words])
+
+
+def _evaluated(metrics: Metrics) -> list[str]:
+    return [name for name in TRAJECTORIES if lookup(metrics, "trajectories", name)[0] is not None]
+
+
+def _missing_errors(metrics: Metrics, known: Sequence[str]) -> list[str]:
+    """What of the errors is missing, by reason."""
+    missing: dict[str, list[str]] = {}
+    for statistic in (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, EVO_DIFFERENCE):
+        for name in known:
+            why = lookup(metrics, "trajectories", name, *statistic.path)[1]
+            missing.setdefault(why, []).append(f"{statistic.name} of {name}")
+    for name in TRAJECTORIES:
+        missing.setdefault(lookup(metrics, "trajectories", name)[1], []).append(f"{name} trajectory")
+    return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items() if why]
+
+
+def _texts(rows: Iterable[Sequence[str]]) -> list[list[Cell]]:
+    return [[Cell(text) for text in row] for row in rows]
+
+
+def _bar(share: float) -> Cell:
+    return Cell("", style="track", bar=100.0 * min(max(share, 0.0), 1.0))
 
 
 def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) -> list[Cell]:
@@ -230,10 +270,10 @@ def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) ->
     return cells
 
 
-def _notes(reasons: Iterable[str]) -> str:
-    """Why numbers are missing, each reason once, readable on paper too."""
+def _notes(reasons: Iterable[str]) -> list[str]:
+    """One line that says why numbers are missing, each reason once; none where nothing is missing."""
     distinct = [reason for reason in dict.fromkeys(reasons) if reason]
-    return page.text(f"{MISSING}  {'; '.join(distinct)}.", "note") if distinct else ""
+    return [f"{MISSING}  {'; '.join(distinct)}."] if distinct else []
 
 
 def _details(loops_file: Path, verdict: str) -> list[Any]:

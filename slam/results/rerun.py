@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from slam.errors import SlamError
-from slam.storage.files import write_atomically
-from slam.runtime.imports import import_rerun
 from slam.frames import Intrinsics
-from slam.pipeline.observations import Keyframe
 from slam.pipeline.batch import SlamResult
+from slam.pipeline.observations import Keyframe
+from slam.runtime.imports import import_rerun
 from slam.se3 import FloatArray
+from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory
 
 _COLOURS = {"reference": (120, 120, 120), "odometry": (240, 150, 40), "optimised": (40, 110, 240)}

@@ -55,23 +55,19 @@ def describe_gaps(frames: Mapping[int, str]) -> dict[str, Any]:
 
 def describe_timing(watch: Stopwatch, frames: int) -> dict[str, Any]:
     """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
-    seconds = watch.seconds
-    return {
-        "seconds_total": seconds,
-        "frames_per_second": frames / seconds,
-        "cpu_seconds": watch.cpu_seconds,
-        "peak_rss_mb": peak_rss_mb(),
-        "stages": dict(watch.stages),
-    }
+    seconds, peak = watch.seconds, peak_rss_mb()
+    timing = {"seconds_total": seconds, "frames_per_second": frames / seconds, "cpu_seconds": watch.cpu_seconds}
+    memory = null("peak_rss_mb", "Windows does not tell") if peak is None else {"peak_rss_mb": peak}
+    return timing | memory | {"stages": dict(watch.stages)}
 
 
-def describe_failure(provenance: Provenance | None, reason: str) -> dict[str, Any]:
-    """What a run that failed leaves in place of its metrics."""
+def describe_start(provenance: Provenance) -> dict[str, Any]:
+    """``metrics.json`` until the trajectories are whole."""
     return {
         "schema": SCHEMA,
-        "status": "failed",
-        "reason": reason,
-        "provenance": asdict(provenance) if provenance else None,
+        "status": "running",
+        "reason": "the run has not ended, or was killed before its trajectories were written",
+        "provenance": asdict(provenance),
     }
 
 

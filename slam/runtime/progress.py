@@ -11,7 +11,7 @@ class progress_bar:  # noqa: N801 - reads as the function it stands for
     """A progress bar on a terminal, silence in a pipe."""
 
     def __enter__(self) -> Callable[[str, int, int], None]:
-        if not sys.stderr.isatty():
+        if sys.stderr is None or not sys.stderr.isatty():
             return lambda stage, done, total: None
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -1,15 +1,11 @@
-"""What goes on in other threads, and how many of them libraries may use."""
+"""Work in other threads: reading ahead, and items side by side."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import TypeVar
-
-import cv2
-from threadpoolctl import threadpool_limits
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -33,18 +29,3 @@ def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
     """What ``do`` gives for each item, in their order; each depends on its item alone."""
     with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
         return list(side.map(do, items))
-
-
-@contextmanager
-def limit_library_threads() -> Iterator[None]:
-    """BLAS and OpenCV without threads of their own.
-
-    A run computes in several threads already; matrices and images are small, and more would only wait for each other.
-    """
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with threadpool_limits(1, "blas"):
-            yield
-    finally:
-        cv2.setNumThreads(threads)

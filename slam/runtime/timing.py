@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-import resource
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+if sys.platform != "win32":
+    import resource
 
 
 class Stopwatch:
@@ -22,7 +24,7 @@ class Stopwatch:
     def stage(self, name: str) -> Iterator[None]:
         """Add the time of the block to a stage; a stage may be entered many times.
 
-        Only the thread that waits for all others keeps stages, so that they add up: work beside another stage counts
+        Stages are kept by the thread that waits for all others, so that they add up: work in another thread counts
         for as long as it is waited for.
         """
         start = time.perf_counter()
@@ -42,8 +44,10 @@ class Stopwatch:
         return _cpu_seconds() - self._cpu_start
 
 
-def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far, MiB."""
+def peak_rss_mb() -> float | None:
+    """Largest resident memory of this process so far, MiB; None on Windows, where Python cannot tell."""
+    if sys.platform == "win32":
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 

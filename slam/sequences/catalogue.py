@@ -6,15 +6,19 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from slam.errors import SequenceError
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.folder import image_folder
+from erfsfm.readers.kitti_drives import OdometryRoot, drive_name, find_drives, find_odometry_root, odometry_camera
+from erfsfm.readers.video import VIDEO_SUFFIXES, list_videos
+from slam.errors import SequenceError, sequence_errors
 from slam.frames import Sequence
 from slam.sequences import tum
-from slam.sequences.camera_file import CameraFile, find_camera_file, read_explicit
+from slam.sequences.camera_file import find_camera_file, read_explicit
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
-from slam.sequences.folder import image_folder, open_folder
-from slam.sequences.kitti import odometry as kitti_odometry
-from slam.sequences.kitti import raw as kitti_raw
-from slam.sequences.video import VIDEO_SUFFIXES, list_videos, open_video
+from slam.sequences.folder import open_folder
+from slam.sequences.kitti.odometry import open_kitti_odometry
+from slam.sequences.kitti.raw import open_kitti_raw
+from slam.sequences.video import open_video
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
@@ -24,6 +28,7 @@ EMBEDDED_FRAMES = 320
 Opener = Callable[[], SourcedSequence]
 
 
+@sequence_errors()
 def open_sequence(
     dataset: Path | None = None,
     name: str | None = None,
@@ -58,6 +63,7 @@ def open_sequence(
     return Excerpt(sequence, *frame_range(frames, len(sequence)))
 
 
+@sequence_errors()
 def sequence_names(dataset: Path) -> list[str]:
     """Names of the sequences in a data set, for a list; empty where it is of no known kind.
 
@@ -97,17 +103,17 @@ def _openers(root: Path, name: str | None, camera: Path | None) -> dict[str, Ope
     """What a path holds: sequence names and how to open each; empty where it is of no known kind."""
     if root.is_file():
         return _video(root, camera)
-    kitti = kitti_odometry.find_root(root)
+    kitti = find_odometry_root(root)
     if kitti is not None:
         names = kitti.names()
         if name is not None and name not in names and (kitti.sequences / name).is_dir():
             names.append(name)  # to hear what it lacks
         return {n: _odometry(kitti, n, camera) for n in names}
     where = root.absolute()
-    above = kitti_odometry.find_root(where.parent) if where.parent.name == "sequences" else None
-    if above is not None and kitti_odometry.camera_of(root) is not None:
+    above = find_odometry_root(where.parent) if where.parent.name == "sequences" else None
+    if above is not None and odometry_camera(root) is not None:
         return {where.name: _odometry(above, where.name, camera)}
-    drives = kitti_raw.find_drives(root)
+    drives = find_drives(root)
     if drives:
         return {n: _raw(drive, camera) for n, drive in drives.items()}
     if name is not None and (root / name).exists():
@@ -134,12 +140,12 @@ def _own(root: Path, camera: Path | None) -> dict[str, Opener]:
     return {name: opener for path in list_videos(root) for name, opener in _video(path, camera).items()}
 
 
-def _odometry(root: kitti_odometry.OdometryRoot, name: str, camera: Path | None) -> Opener:
-    return lambda: kitti_odometry.open_kitti_odometry(root, name, _explicit(camera))
+def _odometry(root: OdometryRoot, name: str, camera: Path | None) -> Opener:
+    return lambda: open_kitti_odometry(root, name, _explicit(camera))
 
 
 def _raw(drive: Path, camera: Path | None) -> Opener:
-    return lambda: kitti_raw.open_kitti_raw(drive, _explicit(camera))
+    return lambda: open_kitti_raw(drive, _explicit(camera))
 
 
 def _video(path: Path, camera: Path | None) -> dict[str, Opener]:
@@ -163,9 +169,9 @@ def _choose(openers: dict[str, Opener], root: Path, name: str | None) -> Sourced
         if len(openers) > 1:
             raise SequenceError(f"{root} has {len(openers)} sequences: {found}; choose one with --sequence")
         (name,) = openers
-    name = name if name in openers else kitti_raw.drive_name(name)
+    name = name if name in openers else drive_name(name)
     if name not in openers:
-        kitti = kitti_odometry.find_root(root)
+        kitti = find_odometry_root(root)
         under = root if kitti is None else kitti.sequences
         raise SequenceError(
             f"no sequence {name} in {root}: found {found} under {under}; choose one of them with --sequence"
@@ -174,7 +180,7 @@ def _choose(openers: dict[str, Opener], root: Path, name: str | None) -> Sourced
 
 
 def _unknown(root: Path) -> str:
-    kitti = kitti_odometry.find_root(root)
+    kitti = find_odometry_root(root)
     if kitti is not None:
         return (
             f"no sequence with images under {kitti.sequences}: looked for png or jpg in */image_2, image_3, "

@@ -7,19 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.errors import SequenceError
+from erfsfm.readers.frame_range import EVERYTHING, FrameRange
+from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Frame, Intrinsics, Sequence
 from slam.se3 import FloatArray, invert
 from slam.sequences.excerpt import Excerpt
-from slam.sequences.recording import require_frame
+from slam.sequences.recording import MAX_GAP_FRAMES, MAX_GAP_S, require_frame
 
 logger = logging.getLogger(__name__)
 
 _ROUNDING_PX = 0.01
+_OWN = ("folder/", "tum/")  # names of recordings that the user gave
 
 
 class Continued:
-    """So many frames of before, then all of another sequence of the same camera. LiDAR scans are not followed."""
+    """So many frames of before, then all of another sequence of the same camera. LiDAR scans are not followed.
+
+    Frames of the recording between the last one of before and the first that follows are missing frames.
+    """
 
     T_camera_lidar: FloatArray | None = None
 
@@ -41,7 +46,8 @@ class Continued:
             following: where its stamps do not come after the last one of before, they are moved there.
 
         Raises:
-            SequenceError: another camera.
+            SequenceError: another camera, frames of another recording or of before the last one, or a gap longer
+                than 100 frames or 10 seconds.
         """
         if not _alike(following.intrinsics, intrinsics):
             raise SequenceError(
@@ -50,20 +56,30 @@ class Continued:
             )
         self.name, self.intrinsics, self.camera_height_m = name, intrinsics, camera_height_m
         self.before = len(stamps)
+        self._missing = missing_between(sources, following.provenance())
         self._following, self._sources = following, sources
-        self.stamps = np.concatenate([stamps, _after(stamps, following.stamps)])
-        self.reference = _joined(stamps, reference, following)
+        self.stamps = _joined_stamps(stamps, self._missing, following.stamps)
+        self._require_short_gap()
+        self.reference = _joined_poses(stamps, reference, self._missing, following)
 
     def __len__(self) -> int:
-        """Number of frames, those of before among them."""
+        """Number of frames, those of before and the missing ones among them."""
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        """Read one of the frames that follow; ``SequenceError`` where its image cannot be read, or is of before."""
+        """Read one of the frames that follow.
+
+        Raises:
+            MissingFrameError: it lies between those of before and those that follow.
+            SequenceError: its image cannot be read, or it is one of before.
+        """
         require_frame(self.name, index, len(self))
         if index < self.before:
             raise SequenceError(f"frame {index} of {self.name} was looked at before and is not kept")
-        return Frame(index, float(self.stamps[index]), self._following.frame(index - self.before).image)
+        first = self.before + self._missing
+        if index < first:
+            raise MissingFrameError(f"frame {index} of {self.name} lies between two runs: neither looked at it")
+        return Frame(index, float(self.stamps[index]), self._following.frame(index - first).image)
 
     def scan_path(self, index: int) -> Path | None:
         """None: scans of before are not kept."""
@@ -72,6 +88,51 @@ class Continued:
     def provenance(self) -> tuple[str, ...]:
         """Names of all that it is made of, as the leak record of a checkpoint writes them."""
         return (*self._sources, *self._following.provenance())
+
+    def _require_short_gap(self) -> None:
+        if not self._missing:
+            return
+        seconds = float(self.stamps[self.before + self._missing] - self.stamps[self.before - 1])
+        between = f"{self._missing} frames between {', '.join(self._sources)} and {self._following.provenance()[0]}"
+        if self._missing > MAX_GAP_FRAMES or seconds > MAX_GAP_S:
+            raise SequenceError(
+                f"{between} are missing ({seconds:.1f} s), too long a gap to interpolate: give frames that follow "
+                f"sooner, with --frames A:B, or run them on their own"
+            )
+        logger.warning("%s are missing: the motion across them is interpolated", between)
+
+
+def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
+    """How many frames of a recording lie between those of before and those that follow, by their leak-record names.
+
+    Simulated worlds have no frames in their names, so that none are missing. Of folders with other names nothing is
+    known: they are taken to follow, with a warning.
+
+    Raises:
+        SequenceError: other recordings, or frames from before the last one.
+    """
+    seen = [FrameRange.parse(name) for name in before]
+    ends: list[tuple[int, str]] = []
+    for name in following:
+        wanted = FrameRange.parse(name)
+        same = [span.counted_in(wanted.recording) for span in seen]
+        if wanted.stop == EVERYTHING and any(span is not None for span in same):
+            return 0
+        ends += [(wanted.start - span.stop, name) for span in same if span is not None]
+    if not ends:
+        if all(name.startswith(_OWN) for name in following):
+            logger.warning("%s is taken to follow right on %s", ", ".join(following), ", ".join(before))
+            return 0
+        raise SequenceError(
+            f"{', '.join(following)} cannot continue {', '.join(before)}: it is another recording; give the frames "
+            f"that follow, or run it on its own"
+        )
+    missing, name = min(ends)
+    if missing < 0:
+        raise SequenceError(
+            f"{name} does not come after {', '.join(before)}: give the frames that follow, with --frames A:B"
+        )
+    return missing
 
 
 def _alike(a: Intrinsics, b: Intrinsics) -> bool:
@@ -83,23 +144,33 @@ def _described(camera: Intrinsics) -> str:
     return f"{camera.width} x {camera.height} pixels, fx {camera.fx:.2f}, fy {camera.fy:.2f}"
 
 
-def _after(stamps: FloatArray, following: FloatArray) -> FloatArray:
+def _joined_stamps(stamps: FloatArray, missing: int, following: FloatArray) -> FloatArray:
+    """All stamps, those of missing frames evenly between their neighbours."""
+    after = _after(stamps, missing, following)
+    between = np.linspace(stamps[-1], after[0], missing + 2)[1:-1]
+    return np.concatenate([stamps, between, after])
+
+
+def _after(stamps: FloatArray, missing: int, following: FloatArray) -> FloatArray:
     if following[0] > stamps[-1]:
         return following
     interval = float(np.median(np.diff(np.concatenate([stamps, stamps[-1] + following - following[0]]))))
     logger.info(
         "stamps of the frames that follow begin at %.3f s: moved to come after %.3f s", following[0], stamps[-1]
     )
-    return np.asarray(following - following[0] + stamps[-1] + max(interval, 1e-3))
+    return np.asarray(following - following[0] + stamps[-1] + (missing + 1) * max(interval, 1e-3))
 
 
-def _joined(stamps: FloatArray, reference: FloatArray | None, following: Sequence) -> FloatArray | None:
-    """True poses of all frames, where both parts are of one recording and the second follows on the first."""
-    if reference is None or not isinstance(following, Excerpt) or following.start == 0:
+def _joined_poses(
+    stamps: FloatArray, reference: FloatArray | None, missing: int, following: Sequence
+) -> FloatArray | None:
+    """True poses of all frames, where both parts are of one recording and nothing but missing frames is between."""
+    if reference is None or not isinstance(following, Excerpt) or following.start <= missing:
         return None
+    last = following.start - missing - 1
     T_base, stamps_base = following.base.reference, following.base.stamps
-    if T_base is None or stamps_base[following.start - 1] != stamps[-1]:
+    if T_base is None or stamps_base[last] != stamps[-1]:
         return None
-    T_last_following = invert(T_base[following.start - 1]) @ T_base[following.start : following.stop]
-    T_first_camera: FloatArray = np.concatenate([reference, reference[-1] @ T_last_following])
+    T_last_later = invert(T_base[last]) @ T_base[last + 1 : following.stop]
+    T_first_camera: FloatArray = np.concatenate([reference, reference[-1] @ T_last_later])
     return T_first_camera

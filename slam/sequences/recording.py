@@ -1,6 +1,6 @@
 """A recording on disk: images from a file source and what lies beside them, as a ``Sequence``.
 
-Every kind of data set is opened by a function that returns a ``Recording``; only where the images
+Every kind of data set is opened by a function that returns a ``RecordedSequence``; only where the images
 come from (``ImageSource``) differs.
 """
 
@@ -13,16 +13,18 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
+from erfsfm.readers.numbering import NumberedFiles
 from slam import se3
-from slam.errors import SequenceError
+from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 10.0
-KITTI_CAMERA_HEIGHT_M = 1.65
+MAX_GAP_FRAMES, MAX_GAP_S = 100, 10.0
 
 
 class ImageSource(Protocol):
@@ -36,7 +38,7 @@ class ImageSource(Protocol):
         ...
 
     def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` where it cannot be read."""
+        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
         ...
 
 
@@ -73,7 +75,7 @@ def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
 
 
 @dataclass(eq=False)
-class Recording:
+class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``."""
 
     name: str
@@ -91,9 +93,15 @@ class Recording:
         return len(self.images)
 
     def frame(self, index: int) -> Frame:
-        """Read one frame; ``SequenceError`` where its image cannot be read."""
+        """Read one frame.
+
+        Raises:
+            MissingFrameError: if its number is missing from the files.
+            SequenceError: if its image cannot be read.
+        """
         require_frame(self.name, index, len(self))
-        return Frame(index, float(self.stamps[index]), self.images.read(index))
+        with sequence_errors():
+            return Frame(index, float(self.stamps[index]), self.images.read(index))
 
     def scan_path(self, index: int) -> Path | None:
         """The Velodyne ``.bin`` file taken with a frame, or None."""
@@ -134,18 +142,54 @@ def fallback_stamps(path: Path, frames: int) -> FloatArray:
     return uniform_stamps(frames, DEFAULT_FPS)
 
 
-def require_stamps(stamps: FloatArray, path: Path, frames: int) -> FloatArray:
-    """Stamps ``(frames,)`` in seconds read from a file, checked against the images.
+def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
+    """Stamps in seconds read from a file, one for each row of the numbered files it belongs to ``(len(files),)``.
+
+    Args:
+        stamps: one for each number from 0, one for each row, or one for each file; then those of missing files are
+            interpolated.
+        path: where they were read.
+        files: images, or packets of a GPS/INS.
 
     Raises:
-        SequenceError: if there is not one finite stamp an image, or they do not increase.
+        SequenceError: if there are as many as nothing has, one is not finite, or they do not increase.
     """
-    if len(stamps) != frames:
+    assigned = files.rows_of(len(stamps))
+    if assigned is None:
         raise SequenceError(
-            f"{path} has {len(stamps)} rows for {frames} images: it needs one stamp an image; "
+            f"{path} has {len(stamps)} rows for {len(files.paths)} images: it needs one stamp an image; "
             f"restore the missing images or cut the file to match"
         )
     if not np.isfinite(stamps).all() or (np.diff(stamps) <= 0).any():
         row = int(np.argmin(np.r_[True, np.diff(stamps) > 0] & np.isfinite(stamps))) + 1
         raise SequenceError(f"{path} row {row}: stamps must be numbers that increase; correct the row")
-    return stamps
+    rows, skipped = assigned
+    if len(rows) == len(files):
+        return stamps[skipped:]
+    spread: FloatArray = np.interp(np.arange(len(files)), rows, stamps)
+    return spread
+
+
+def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
+    """Warn once of missing images, and refuse gaps too long to be interpolated across.
+
+    Raises:
+        SequenceError: if a gap is longer than 100 frames or 10 seconds.
+    """
+    for first, last in files.gaps():
+        seconds = float(stamps[last + 1] - stamps[first - 1])
+        if last - first + 1 > MAX_GAP_FRAMES or seconds > MAX_GAP_S:
+            raise SequenceError(
+                f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
+                f"{last - first + 1} frames and {seconds:.1f} s is too long to interpolate; split the recording there"
+            )
+    if files.gaps():
+        logger.warning("%s: %s; the motion across gaps is interpolated", files.paths[0].parent, files.describe_gaps())
+
+
+def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
+    """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
+    times = np.clip(stamps, known[0], known[-1])
+    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
+    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
+    return se3.make(R, t)

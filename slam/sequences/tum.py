@@ -6,14 +6,13 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
-from slam import se3
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import CameraFile
 from slam.sequences.images import ImageFiles
-from slam.sequences.recording import Recording, Source, rebased, require_stamps
+from slam.sequences.recording import RecordedSequence, Source, interpolated_poses, rebased, require_stamps
 from slam.sequences.undistortion import calibrated
 from slam.trajectory import read_trajectory
 
@@ -23,20 +22,21 @@ INDEX_FILE = "rgb.txt"
 _MAX_GAP_S = 0.1
 
 
-def open_tum(folder: Path, camera: CameraFile) -> Recording:
+def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
     """Open a TUM folder; poses between two of the ground truth are interpolated.
 
     Raises:
         SequenceError: if ``rgb.txt`` is malformed or names images that are missing.
     """
     stamps, paths = _read_index(folder / INDEX_FILE)
-    images, intrinsics = calibrated(ImageFiles(paths), camera, str(folder))
+    files = NumberedFiles(tuple(paths), tuple(range(len(paths))))
+    images, intrinsics = calibrated(ImageFiles(files), camera, str(folder))
     name = folder.absolute().name
-    return Recording(
+    return RecordedSequence(
         name=name,
         images=images,
         intrinsics=intrinsics,
-        stamps=require_stamps(stamps, folder / INDEX_FILE, len(paths)),
+        stamps=require_stamps(stamps, folder / INDEX_FILE, files),
         sources=(Source(f"tum/{name}"),),
         reference=_reference(folder / "groundtruth.txt", stamps),
         camera_height_m=camera.height_or(None),
@@ -84,7 +84,4 @@ def _reference(path: Path, stamps: FloatArray) -> FloatArray | None:
             stamps[bad],
         )
         return None
-    times = np.clip(stamps, known[0], known[-1])
-    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
-    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
-    return rebased(se3.make(R, t))
+    return rebased(interpolated_poses(T_any_camera, known, stamps))

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
 from slam.frames import Image, Intrinsics
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import CameraFile, scaled_hint
 from slam.sequences.recording import ImageSource
 
 _ZOOM_STEP = 1.02
@@ -30,7 +30,7 @@ class Undistortion:
         Raises:
             SequenceError: if the coefficients fold the image over itself.
         """
-        self._K = camera.intrinsics.K
+        self._K = Intrinsics.of(camera.pinhole).K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._is_fisheye = camera.model == "fisheye"
         zoom = self._shortest_zoom(camera.width, camera.height)
@@ -108,12 +108,19 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
         raise SequenceError(
             f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
             f"{camera.width}x{camera.height}: resize the images, or if they were only resized, scale the "
-            f"file to {{{scaled_hint(camera.intrinsics, images.width, images.height)}}}"
+            f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
         )
     if not camera.is_distorted:
-        return images, camera.intrinsics
+        return images, Intrinsics.of(camera.pinhole)
     undistortion = Undistortion(camera)
     return UndistortedImages(images, undistortion), undistortion.intrinsics
+
+
+def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:
+    """What a camera file would say for images of another size, as YAML on one line."""
+    scaled = camera.pinhole.resized(width, height)
+    values = ", ".join(f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
+    return f"width: {width}, height: {height}, {values}"
 
 
 def _border(width: int, height: int) -> FloatArray:

@@ -1,7 +1,7 @@
-"""What was computed once is read the next time: arrays on disk, named by everything that they depend on.
+"""A cache of computed arrays on disk; each entry is named by everything that it depends on.
 
 An entry is a file with a checksum before its arrays. It appears whole or not at all, and a damaged one is computed
-again. Arrays are kept at their own precision, so that a run that remembers and one that does not give the same bytes.
+again. Arrays are kept at their own precision, so that a run with the cache and one without give the same bytes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LENGTH_BYTES = 4
 
 
 def without_cache(kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
-    """A ``GetOrCompute`` without memory."""
+    """A ``GetOrCompute`` that always computes."""
     return compute()
 
 
@@ -79,12 +79,13 @@ class DiskCache:
         return _unpacked(content)
 
     def write(self, key: str, answer: Answer) -> None:
-        """Keep an entry; a full disk ends the keeping and not the run."""
+        """Write an entry; after a failure (a full disk) no more are written, and the run goes on."""
         if not self._is_writable:
             return
         content = _packed(answer)
         try:
-            write_atomically(self._path(key), lambda file: file.write_bytes(_checksum(content) + content))
+            entry = _checksum(content) + content  # the checksum finds what the disk lost: no need to wait for it
+            write_atomically(self._path(key), lambda file: file.write_bytes(entry), sync=False)
         except SlamError as error:
             logger.warning("the cache keeps nothing more: %s", error)
             self._is_writable = False
@@ -94,48 +95,40 @@ class DiskCache:
 
 
 class CacheNamespace:
-    """A memory as one of its users sees it: no other user's entries are mistaken for its own."""
+    """The entries of one user of a cache: no other user's entries are mistaken for them."""
 
-    def __init__(self, memory: DiskCache, identity: str) -> None:
-        """See a memory.
+    def __init__(self, cache: DiskCache, identity: str) -> None:
+        """Use a cache.
 
         Args:
-            memory: shared.
-            identity: everything that decides the answers beside what is given with the question.
+            cache: shared with others.
+            identity: everything that decides the answers beside the arguments of each question.
         """
-        self._memory = memory
+        self._cache = cache
         self._identity = identity.encode()
         self.found = 0
         self.asked = 0
 
     def get_or_compute(self, kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
-        """The arrays that ``compute`` gives, read where they are known.
+        """The arrays that ``compute`` gives, read where they are in the cache.
 
         Args:
             kind: names the question.
-            given: all that the answer depends on, of fixed types for a kind.
-            compute: answers it.
+            given: all arguments that the answer depends on, of fixed types for a kind.
+            compute: computes the answer.
         """
         named = hashlib.sha256(b"\0".join((_FORMAT, self._identity, kind.encode())))
         for each in given:
             named.update(_digest(each))
         key = named.hexdigest()
-        known = self._memory.read(key)
+        known = self._cache.read(key)
         if known is not None:
             self.found += 1
             return known
         self.asked += 1
         answer = compute()
-        self._memory.write(key, answer)
+        self._cache.write(key, answer)
         return answer
-
-
-def fingerprint(*sources: Path) -> str:
-    """Of some files: answers of other code are other answers."""
-    digest = hashlib.sha256()
-    for path in sources:
-        digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()
 
 
 def _digest(given: Given) -> bytes:

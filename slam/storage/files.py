@@ -9,13 +9,15 @@ from erfsfm import files
 from slam.errors import SlamError
 
 
-def write_atomically(path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError) -> None:
+def write_atomically(
+    path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
+) -> None:
     """`erfsfm.files.write_atomically` for those who catch a `SlamError`.
 
     Raises:
         SlamError: (or the given kind) the file cannot be written.
     """
     try:
-        files.write_atomically(path, fill)
+        files.write_atomically(path, fill, sync)
     except OSError as cause:
         raise error(f"{path}: cannot be written ({cause.strerror or cause})") from cause

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-import zlib
 from collections.abc import Iterable
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import RunError
+from slam.storage.archive import reading_archive
 
 _FORMAT = 2
 Tree = Any  # of JSON
@@ -56,16 +56,13 @@ class Serialiser:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        try:
-            with zipfile.ZipFile(path) as file:
-                head = json.loads(file.read("tree.json"))
-                if head["format"] != _FORMAT:
-                    raise RunError(f"{path} has format {head['format']}, this version reads {_FORMAT}: run again")
-                with file.open("arrays.bin") as content:
-                    arrays = [_array(content.read, *described) for described in head["arrays"]]
+        with reading_archive(path), zipfile.ZipFile(path) as file:
+            head = json.loads(file.read("tree.json"))
+            if head["format"] != _FORMAT:
+                raise RunError(f"{path} has format {head['format']}, this version reads {_FORMAT}: run again")
+            with file.open("arrays.bin") as content:
+                arrays = [_array(content.read, *described) for described in head["arrays"]]
             return self._unpacked(head["value"], arrays)
-        except _DAMAGE as error:
-            raise RunError(f"{path} is missing or damaged ({type(error).__name__}): run the sequence again") from error
 
     def _unpacked(self, tree: Tree, arrays: list[NDArray[Any]]) -> Any:
         if isinstance(tree, list):
@@ -83,12 +80,6 @@ class Serialiser:
             return {self._unpacked(key, arrays): self._unpacked(value, arrays) for key, value in content}
         name, values = content
         return self._kinds[name](**{key: self._unpacked(value, arrays) for key, value in values.items()})
-
-
-_DAMAGE = (
-    *(OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RecursionError),
-    *(zipfile.BadZipFile, zlib.error, NotImplementedError),
-)
 
 
 class _Packing:

@@ -1,4 +1,4 @@
-"""Arrays that wait on disk until they are wanted again, so that a long drive does not fill the memory."""
+"""Arrays kept in a temporary file until they are needed again, so that a long drive does not fill the memory."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from slam.errors import SlamError
 
 
 class SpillFile:
-    """A nameless file among the temporary ones: it is gone with the process, however that ends."""
+    """An unnamed temporary file; the operating system removes it when the process ends, however that ends."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the spool
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
         self._end = 0
 
     def put(self, array: NDArray[Any]) -> SpilledArray:
@@ -40,16 +40,29 @@ class SpillFile:
         return spilled
 
     def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An array that was put at ``start``."""
+        """An array that was put at ``start``.
+
+        Raises:
+            SlamError: the file cannot be read, or is shorter than what was put there.
+        """
         array = np.empty(shape, dtype)
-        self._file.seek(start)
-        self._file.readinto(array.data)  # type: ignore[attr-defined]
+        try:
+            self._file.seek(start)
+            found = self._file.readinto(array.data)  # type: ignore[attr-defined]
+        except OSError as error:
+            reason = error.strerror or error
+            raise SlamError(f"keyframes in {tempfile.gettempdir()} cannot be read ({reason})") from error
+        if found != array.nbytes:
+            raise SlamError(
+                f"keyframes in {tempfile.gettempdir()} are cut short ({found} of {array.nbytes} bytes): "
+                "something shortened the temporary file; run again"
+            )
         return array
 
 
 @dataclass(frozen=True)
 class SpilledArray:
-    """Where an array waits."""
+    """An array in a spill file: its place, shape and type."""
 
     spill_file: SpillFile
     start: int

@@ -119,8 +119,8 @@ def write_raw() -> Callable[..., Path]:
         home = root / drive[:10] / f"{drive}_sync"
         height, width = size
         rows = [
-            f"S_rect_{camera}: {width} {height}\nP_rect_{camera}: 60 0 {cx} 0 0 62 30 0 0 0 1 0\n"
-            for camera, cx in (("00", 47), ("02", 47), ("03", 46))
+            f"S_rect_{camera}: {width} {height}\nP_rect_{camera}: 60 0 {cx} 0 0 62 {height // 2 - 2} 0 0 0 1 0\n"
+            for camera, cx in (("00", width // 2 - 1), ("02", width // 2 - 1), ("03", width // 2 - 2))
         ]
         scene = Plane(Camera(width, height, 60.0, 62.0, 47.0, 30.0), 6.0)
         for camera in ("image_02", "image_03"):

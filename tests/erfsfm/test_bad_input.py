@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
 from erfsfm.cli import main
@@ -66,6 +67,57 @@ def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: Writ
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_half_an_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, suffix: str) -> None:
+    root = write_root(tmp_path / "root", frames=5, suffix=suffix)
+    image = root / f"sequences/00/image_2/000002{suffix}"
+    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
+    wanted = f"000002{suffix} is truncated at {image.stat().st_size} bytes: copy it again"
+    assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
+    assert wanted in refusal("predict", image.parent, "--weights", weights, "--output", tmp_path / "depth")
+    assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
+
+
+def test_twelve_bits_in_sixteen(refusal: Refusal, tmp_path: Path, weights: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 64, 3), 4095, np.uint16))
+    error = refusal("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth")
+    assert "a.png has 16 bits, but no value above 4095: it looks like 12-bit data" in error
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [("fx: 100", "key 'fx' stands twice"), ("camera_height: 1", "key camera_height is unknown")],
+)
+def test_a_camera_file_that_says_too_much(refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str) -> None:
+    camera = trip / "camera.yaml"
+    camera.write_text(f"{camera.read_text()}{line}\n")
+    assert words in refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
+
+
+def test_brackets_in_a_name(
+    refusal: Refusal,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    write_root: WriteRoot,
+) -> None:
+    """A folder is trained on and predicted from, and its leak is known by name."""
+    root = write_root(tmp_path / "r[o]ot", frames=6)
+    (root / "sequences/00").rename(root / "sequences/s[0]")
+    (root / "poses/00.txt").rename(root / "poses/s[0].txt")
+    run, images = tmp_path / "r[u]n", root / "sequences/s[0]/image_2"
+    small = [*SMALL[:4], "--set", "training.batch=2", "--set", "network.sources=4"]
+    for command in (
+        [*TRAIN, *small, "--set", "network.height=64", "--set", "network.width=96", "--dataset", root, "--output", run],
+        ["predict", images, "--weights", run, "--output", tmp_path / "d[e]pth"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["erfsfm", *map(str, command)])
+        with pytest.raises(SystemExit, match="0"):
+            main()
+    assert len(list((tmp_path / "d[e]pth").iterdir())) == 12
+    error = refusal("evaluate", "pose", "--dataset", root, "--sequence", "s[0]", "--weights", run)
+    assert "leak: these weights were trained on kitti_odometry/s[0][0:6]" in error
+
+
 def test_intrinsics_of_another_resolution(refusal: Refusal, tmp_path: Path) -> None:
     drive = tmp_path / "drive"
     (drive / "images").mkdir(parents=True)
@@ -80,8 +132,8 @@ def test_calibration_of_another_resolution(refusal: Refusal, tmp_path: Path, wri
     """Raw images may be shrunk, never cropped: their camera knows its own shape."""
     write_raw(tmp_path, stored=(48, 48), speeds=[9] * 6)
     error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
-    assert "0000000000.png is 48 x 48, but camera 02 in" in error
-    assert "is 96 x 64: the images were cropped or are of another camera" in error
+    assert "the images are 48x48, but camera 02 in" in error
+    assert "is 96x64: the images were cropped or are of another camera" in error
 
 
 def test_a_raw_drive_shorter_than_a_snippet(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
@@ -113,7 +165,7 @@ def test_a_damaged_video(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
     path = trip / "drive.mp4"
     path.write_bytes(path.read_bytes()[:600])
     error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "drive.mp4 cannot be read as a video: it is damaged or of an unknown format; copy it again" in error
+    assert "drive.mp4 cannot be opened: it is damaged or of an unknown format; copy it again" in error
 
 
 def test_a_video_of_another_resolution(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
@@ -197,4 +249,96 @@ def test_a_preset_of_the_other_kind(
 def test_a_misspelt_key(refusal: Refusal, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("network:\n  hieght: 128\n")
     error = refusal("train", "--config", tmp_path / "mine.yaml", "--dataset", tmp_path)
-    assert f"unknown key 'network.hieght' in {tmp_path}/mine.yaml; did you mean 'height'?" in error
+    assert f"unknown key 'network.hieght' in {tmp_path}/mine.yaml; did you mean 'network.height'?" in error
+
+
+def spoil(path: Path, value: float) -> None:
+    """Put a number that is none into the first tensor of a weights file."""
+    tensors = load_file(path)
+    next(iter(tensors.values())).view(-1)[0] = value
+    save_file(tensors, path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", ["depth", "pose"])
+def test_weights_that_are_not_finite(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, kind: str, value: float
+) -> None:
+    spoil(weights / f"{kind}.safetensors", value)
+    root = write_root(tmp_path / "root", frames=6, depth=True)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
+    for arguments in (
+        ["predict", tmp_path / "a.png", "--output", tmp_path / "depth"],
+        ["evaluate", "depth", "--dataset", root],
+        ["evaluate", "pose", "--dataset", root, "--sequence", "00"],
+    ):
+        error = refusal(*arguments, "--weights", weights)
+        assert f"{kind}.safetensors: '" in error
+        assert "holds NaN or infinite values" in error
+    assert not (tmp_path / "depth").exists()
+
+
+def test_networks_that_overflow(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:
+    """Finite weights so large that a forward pass overflows, and infinity minus infinity is no number."""
+    for kind in ("depth", "pose"):
+        path = weights / f"{kind}.safetensors"
+        save_file({name: 1e30 * torch.randn_like(value) for name, value in load_file(path).items()}, path)
+    root = write_root(tmp_path / "root", frames=6, depth=True)
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 64, 3), 200, np.uint8))
+    for kind, arguments in (
+        ("depth", ["predict", tmp_path / "a.png", "--output", tmp_path / "depth"]),
+        ("depth", ["evaluate", "depth", "--dataset", root]),
+        ("pose", ["evaluate", "pose", "--dataset", root, "--sequence", "00"]),
+    ):
+        error = refusal(*arguments, "--weights", weights)
+        assert f"the {kind} network of {weights} gives NaN or infinite values" in error
+
+
+@pytest.mark.parametrize("text", ["data.validation=[nope]", "data.validation=[kitti_odometry/07, simulated/3]"])
+def test_a_validation_that_is_not_among_the_data(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, text: str
+) -> None:
+    root = write_root(tmp_path / "root", frames=5)
+    error = refusal(*TRAIN, *SMALL, "--set", text, "--dataset", root, "--output", tmp_path / "run")
+    assert f"nothing to validate on: data.validation and data.split name {text[17:-1]}; found kitti_odom" in error
+    assert not (tmp_path / "run").exists()
+
+
+FOREIGN = {
+    "a configuration": {"config.yaml": "model: {layers: 3}\n"},
+    "an empty configuration": {"config.yaml": ""},
+    "an experiment written by hand": {"config.yaml": "training: {steps: 3}\n"},
+    "a note": {"notes.txt": "mine"},
+    "logs of another tool": {"logs/a.csv": "1,2"},
+    "our configuration and a note": {"config.yaml": dump_yaml(load_experiment("tiny")), "notes.txt": "mine"},
+}
+
+
+@pytest.mark.parametrize("files", FOREIGN.values(), ids=FOREIGN.keys())
+def test_an_output_with_other_peoples_files(
+    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, files: dict[str, str]
+) -> None:
+    output = tmp_path / "mine"
+    for name, text in files.items():
+        (output / name).parent.mkdir(parents=True, exist_ok=True)
+        (output / name).write_text(text)
+    missing = tmp_path / "missing"  # the output is looked at before the data
+    error = refusal(*TRAIN, *SMALL, "--dataset", missing, "--output", output)
+    assert f"{output} holds files that 'erfsfm train' did not write" in error
+    assert {str(path.relative_to(output)): path.read_text() for path in output.rglob("*") if path.is_file()} == files
+
+
+def test_an_output_that_is_a_file(refusal: Refusal, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    assert "is a file, not a folder" in refusal(*TRAIN, "--dataset", tmp_path, "--output", tmp_path / "mine")
+
+
+def test_a_checkpoint_of_another_project(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
+    root, run = write_root(tmp_path / "root", frames=5), tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    state = {"global_step": 1, "state_dict": {"encoder.w": torch.zeros(1)}, "optimizer_states": [], "loops": {}}
+    torch.save(state, run / "checkpoints/last.ckpt")
+    (run / "config.yaml").write_text("")
+    error = refusal("train", "--config", "default", "--dataset", root, "--output", run, "--resume")
+    assert "last.ckpt is damaged or no checkpoint of erfsfm" in error
+    assert (run / "config.yaml").read_text() == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+import erfsfm
 from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
 from erfsfm.cli import main
 from erfsfm.config import NetworkConfig
@@ -105,10 +107,10 @@ def test_usage(run: Run, arguments: list[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["train", "--config", "nothing"], "no configuration 'nothing'"),
+        (["train", "--config", "nothing"], "no configuration file or name 'nothing'"),
         (["train", "--config", "tiny"], "--dataset"),
         (["train", "--config", "tiny", "--dataset", "nowhere"], "does not exist"),
-        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'steps'"),
+        (["train", "--config", "tiny", "--set", "training.stepz=1"], "did you mean 'training.steps'"),
         (["train", "--config", "tiny", "--seed", "-1"], "training.seed"),
         (["predict", "nowhere.png"], "no weights 'default'"),
         (["predict", "nowhere.png", "--weights", "{weights}"], "nowhere.png"),
@@ -315,3 +317,43 @@ def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Pa
     record = (tmp_path / "run" / "model.yaml").read_text()
     assert "step: 3" in record
     assert "command: erfsfm train --config tiny" in record.replace("\n  ", " ")
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"erfsfm {erfsfm.__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [("erfsfm ev", {"evaluate"}), ("erfsfm evaluate ", {"depth", "pose"}), ("erfsfm tr", {"train"})],
+)
+def test_shells_complete(words: str, offered: set[str]) -> None:
+    program = "import sys; sys.argv = ['erfsfm']; from erfsfm.cli import main; main()"
+    asked = {"_ERFSFM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    finished = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=os.environ | asked
+    )
+    assert (finished.returncode, set(finished.stdout.split())) == (0, offered), finished.stderr
+
+
+@pytest.mark.parametrize(
+    ("verb", "seeded"),
+    [
+        ("train", True),
+        ("receptive-field", True),
+        ("export", True),
+        ("predict", False),
+        ("calibrate-noise", False),
+        ("evaluate depth", False),
+        ("evaluate pose", False),
+    ],
+)
+def test_a_seed_is_offered_where_numbers_are_random(run: Run, verb: str, seeded: bool) -> None:
+    _, out, _ = run(*verb.split(), "--help")
+    assert ("--seed" in out) == seeded
+
+
+def test_a_seed_is_still_accepted_where_nothing_is_random(run: Run, weights: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
+    given = ["predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth", "--seed", 3]
+    assert run(*given)[0] == 0

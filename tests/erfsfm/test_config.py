@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from erfsfm.config import ExperimentConfig, NetworkConfig, config_folders, dump_yaml, find_config, load_experiment
+from erfsfm.config import ExperimentConfig, NetworkConfig, config_folders, dump_yaml, load_experiment
 from erfsfm.errors import ConfigError
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
@@ -33,7 +33,6 @@ def test_there_are_shipped_configurations() -> None:
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_configurations_load_by_name_and_by_path(path: Path) -> None:
     assert load_experiment(path.stem) == load_experiment(path)
-    assert find_config(path.stem).name == path.name
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -90,9 +89,9 @@ def test_the_last_override_counts() -> None:
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("training.stepz=3", "did you mean 'steps'"),
+        ("training.stepz=3", "did you mean 'training.steps'"),
         ("trainning.steps=3", "did you mean 'training'"),
-        ("network.zzz=3", "known keys: depth, pose"),
+        ("network.zzz=3", "known keys of network: depth, pose"),
         ("training.steps=0", "greater than or equal to 1; got 0"),
         ("training.steps=many", "got 'many'"),
         ("training.learning_rate=-1", "greater than 0"),
@@ -107,7 +106,7 @@ def test_the_last_override_counts() -> None:
         ("training.steps", "section.key=value"),
         ("=3", "section.key=value"),
         ("training.steps.deep=3", "not a section"),
-        ("data.roots=[a", "not a YAML value"),
+        ("data.roots=[a", "not YAML"),
     ],
 )
 def test_bad_overrides(override: str, words: str) -> None:
@@ -120,7 +119,7 @@ def test_bad_overrides(override: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("training: {stepz: 3}", "did you mean 'steps'"),
+        ("training: {stepz: 3}", "did you mean 'training.steps'"),
         ("training: [1]", "training"),
         ("- 1", "sections"),
         ("words", "sections"),

@@ -1,4 +1,4 @@
-"""The whole system on a real drive: everything there, everything finite."""
+"""The whole system on a real drive: every file, every number, and errors of at most twice what was measured."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
     metrics = check_run(run.path)
     assert (metrics["sequence"]["name"], metrics["sequence"]["frames"]) == ("00", 40)
     assert metrics["scale"]["mode"] == "camera-height"
-    for name in ("network", "odometry", "optimised"):
-        assert metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] < 0.1 * metrics["sequence"]["length_m"]
+    for name, measured_m in (("network", 0.382), ("odometry", 0.216), ("optimised", 0.227)):
+        assert metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] < 2 * measured_m
     assert metrics["map"]["accuracy_median_m"] is None and (metrics["map"]["triangles"] or 0) > 0

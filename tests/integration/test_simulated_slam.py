@@ -1,4 +1,7 @@
-"""The whole system on the simulated street, where every truth is known: first an oracle, then the shipped networks."""
+"""The whole system on the simulated street with its exact ground truth: first an oracle, then the shipped networks.
+
+Errors may be twice what was measured; the measured figure is the other factor of each limit.
+"""
 
 from __future__ import annotations
 
@@ -73,8 +76,9 @@ def test_images_and_graph_cut_the_noise_of_the_network(round_trip: SlamResult) -
     assert len(round_trip.optimised) == 250
     sources = [factor.source for factor in round_trip.observations.geometric]
     assert sources.count(ESSENTIAL_SOURCE) > 200
-    assert ate(round_trip.optimised, round_trip) < 0.6 * ate(round_trip.network, round_trip)
-    assert ate(round_trip.optimised, round_trip) < 0.01 * 250
+    assert ate(round_trip.network, round_trip) == pytest.approx(1.2, rel=0.2)
+    assert ate(round_trip.odometry, round_trip) < 2 * 0.64
+    assert ate(round_trip.optimised, round_trip) < 2 * 0.109
 
 
 def test_the_camera_height_gives_metres(street: Rendered, round_trip: SlamResult) -> None:
@@ -92,8 +96,8 @@ def test_the_map_lies_on_the_street(street: Rendered, round_trip: SlamResult) ->
     fit = pose_similarity(round_trip.reference.T_world_camera, round_trip.optimised.T_world_camera)
     points = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
     distance = street.street.distance_to_surface(points)
-    assert np.median(distance) < 0.2  # a voxel
-    assert np.percentile(distance, 90) < 1.0
+    assert np.median(distance) < 2 * 0.034
+    assert np.percentile(distance, 90) < 2 * 0.20
 
 
 def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
@@ -136,10 +140,12 @@ def test_shipped_networks_turn_where_the_road_turns(learned: Path, check_run: Ca
     assert (network[:, 2, 3] > 0).mean() > 0.95  # forward
 
 
-def test_the_system_is_not_worse_than_its_networks(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
+def test_the_system_is_better_than_its_networks(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     metrics = check_run(learned)
-    errors = {name: metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] for name in ("network", "optimised")}
-    assert errors["optimised"] <= errors["network"]
-    assert errors["optimised"] < 0.05 * metrics["sequence"]["length_m"]
+    errors = {name: metrics["trajectories"][name]["align"] for name in ("network", "odometry", "optimised")}
+    assert errors["network"]["7dof"]["ate_rmse_m"] < 2 * 0.738
+    assert errors["odometry"]["7dof"]["ate_rmse_m"] < 2 * 0.117
+    assert errors["optimised"]["7dof"]["ate_rmse_m"] < 2 * 0.108
+    assert errors["optimised"]["6dof"]["ate_rmse_m"] < 2 * 0.367
     assert metrics["scale"]["mode"] == "camera-height"
-    assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"]["accuracy_median_m"] < 1.0
+    assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"]["accuracy_median_m"] < 2 * 0.153

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -14,10 +15,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import typer
 
+import erfsfm
+import slam
 import slam.run
-from slam.cli import main
+from slam.cli import app, main
 from slam.config import load_config
+from slam.errors import SlamError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.results.folder import RunFolder
 from slam.trajectory import read_trajectory
@@ -57,7 +62,8 @@ for verb in verbs:
     result = CliRunner().invoke(app, [verb, "--help"])
     assert result.exit_code == 0 and "Example: erfsfm-slam " + verb in result.output, (verb, result.output)
     print(verb)
-heavy = {"torch", "lightning", "cv2", "gtsam", "open3d", "evo", "matplotlib", "scipy", "numpy"} & set(sys.modules)
+libraries = {"torch", "lightning", "cv2", "gtsam", "open3d", "evo", "matplotlib", "scipy", "numpy", "rich"}
+heavy = libraries & set(sys.modules)
 assert not heavy, heavy
 """
 
@@ -66,6 +72,93 @@ def test_help_of_every_verb_is_light() -> None:
     finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
     assert set(finished.stdout.split()) >= VERBS
+
+
+def verbs() -> dict[str, Any]:
+    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("verb", sorted(verbs()))
+def test_help_shows_every_word_and_bracket(call: Call, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A markup would swallow ``<stamp>`` or ``[extra]``."""
+    monkeypatch.setenv("COLUMNS", "300")
+    shown = " ".join(call(verb, "--help")[1].split())
+    command = verbs()[verb]
+    texts = [command.help, *(getattr(each, "help", None) for each in command.params if not getattr(each, "hidden", 0))]
+    for text in filter(None, texts):
+        assert " ".join(text.split()) in shown
+
+
+def test_the_version(call: Call) -> None:
+    assert call("--version") == (0, f"erfsfm-slam {erfsfm.__version__}\n", "")
+
+
+def test_seed_and_device_are_offered_only_where_they_do_something(call: Call) -> None:
+    offered = {}
+    for verb in verbs():
+        text = call(verb, "--help")[1]
+        offered[verb] = {option for option in ("--seed", "--device") if option in text}
+    assert {verb: options for verb, options in offered.items() if options} == {
+        "run": {"--seed", "--device"},
+        "simulate": {"--seed"},
+    }
+
+
+def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run: MakeRun) -> None:
+    old = ("--seed", 3, "--device", "cpu")
+    run = make_run()
+    assert call("evaluate", *files_of(run), *old)[0] == 0
+    assert call("export", run.path, "--what", "cloud", "--output", "map.ply", *old)[0] == 0
+    assert call("plot", run.path, *old)[0] == 0
+    assert "no such" in call("localize", "nowhere.png", "--map", run.path, *old)[2]
+    size = ("--width", 104, "--height", 32, "--frames", 5, "--route", "straight")
+    assert call("simulate", "world", *size, *old)[0] == 0
+
+
+@pytest.mark.parametrize(("typed", "wanted"), [("erfsfm-slam ev", "evaluate"), ("erfsfm-slam run --wei", "--weights")])
+def test_shells_complete(typed: str, wanted: str) -> None:
+    words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
+    finished = subprocess.run(
+        [sys.executable, "-m", "slam"],
+        env=os.environ | words | {"_ERFSFM_SLAM_COMPLETE": "complete_bash"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.stdout.split() == [wanted], finished.stderr
+
+
+def in_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        f"{shlex.quote(sys.executable)} -m slam {arguments}",
+        shell=True,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(Path(slam.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("arguments", ["config", "evaluate estimate.txt estimate.txt", "evaluate --help"])
+@pytest.mark.parametrize("end", ["| true", ">&-"])
+def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
+    (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    finished = in_shell(f"{arguments} {end}", tmp_path)
+    assert finished.stderr == "" and finished.stdout == ""
+
+
+def test_a_closed_stderr_stops_nothing(tmp_path: Path) -> None:
+    finished = in_shell("simulate world --route straight --frames 5 --width 104 --height 32 2>&-", tmp_path)
+    assert finished.returncode == 0 and "5 frames in world" in finished.stdout
+
+
+def test_an_error_of_several_lines_is_told_in_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**_: Any) -> None:
+        raise SlamError("first line\nsecond line")
+
+    monkeypatch.setattr(slam.run, "run_slam", fail)
+    assert call("run") == (1, "", "erfsfm-slam: first line second line\n")
 
 
 @pytest.mark.parametrize(
@@ -164,9 +257,8 @@ def test_a_run_that_breaks_off_is_one_line_and_a_failed_folder(
     for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[4:]:
         image.write_bytes(b"no image")
     code, out, err = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
-    last = err.strip().splitlines()[-1]
-    assert code == 1 and out == "" and last.startswith("erfsfm-slam: ") and "000004.png" in last
-    assert "Traceback" not in err
+    assert code == 1 and out == "" and err.startswith("erfsfm-slam: ") and "000004.png" in err
+    assert err.count("\n") == 1
     assert RunFolder.open(Path("run")).metrics()["status"] == "failed"
 
 

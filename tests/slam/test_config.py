@@ -1,9 +1,11 @@
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
 from slam.config import SlamConfig, dump_yaml, load_config
+from slam.config_file import OLD_NAMES
 from slam.errors import ConfigError
 
 DEFAULT = Path(__file__).parents[2] / "configs" / "slam" / "default.yaml"
@@ -45,7 +47,7 @@ def test_sections_are_frozen():
     [
         ("pose_graph.hubber_k=1", ["pose_graph.hubber_k", "did you mean 'pose_graph.huber_k'"]),
         ("huber_k=1", ["huber_k", "did you mean 'pose_graph.huber_k'"]),
-        ("mapping.zzzz=1", ["mapping.zzzz", "allowed in mapping", "voxel_size_m"]),
+        ("mapping.zzzz=1", ["mapping.zzzz", "known keys of mapping", "voxel_size_m"]),
         ("pose_graph.huber_k=-1", ["pose_graph.huber_k", "greater than 0", "-1"]),
         ("pose_graph.huber_k=.nan", ["pose_graph.huber_k", "nan"]),
         ("pose_graph.kernel=tukey", ["pose_graph.kernel", "'huber'", "tukey"]),
@@ -89,3 +91,41 @@ def test_unknown_name_lists_the_known_ones(tmp_path):
         load_config("defalt")
     with pytest.raises(ConfigError, match="folder"):
         load_config(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("geometry.foresight=false", "'geometry.foresight' is now 'geometry.predicted_flow'"),
+        ("scale.road_top_share=0.4", "'scale.road_top_share' is now 'scale.road_top_ratio'"),
+        ("bridging.min_likeness=0.1", "'bridging.min_likeness' is now 'gaps.min_correlation'"),
+        ("bridging.enabled=false", "'bridging.enabled' is now 'gaps.enabled'"),
+        ("frontend.use=bridge", "'frontend.use: bridge' is now 'frontend.use: gaps'"),
+    ],
+)
+def test_an_old_key_is_refused_with_its_new_name(tmp_path, override, words):
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        load_config(None, [override])
+    section, key, value = re.split(r"[.=]", override, maxsplit=2)
+    path = tmp_path / "old.yaml"
+    path.write_text(f"{section}: {{{key}: {value}}}\n")
+    with pytest.raises(ConfigError, match=rf"old\.yaml: {re.escape(words)}"):
+        load_config(path)
+
+
+def test_every_new_name_of_an_old_key_exists():
+    tree = SlamConfig().model_dump()
+    for old, new in OLD_NAMES.keys.items():
+        section, _, key = new.partition(".")
+        assert section in tree and (not key or key in tree[section]), new
+        section, _, key = old.partition(".")
+        assert section not in tree or key not in tree[section], old
+
+
+@pytest.mark.parametrize("text", ["[" * 3000, "a: &a [*a]"])
+def test_an_endless_file_is_one_line(tmp_path, text):
+    path = tmp_path / "endless.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"endless\.yaml is not YAML") as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)

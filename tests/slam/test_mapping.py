@@ -6,9 +6,11 @@ import pytest
 from slam import se3
 from slam.config import MappingConfig
 from slam.errors import SlamError
-from slam.frames import Intrinsics
+from slam.frames import Frame, Intrinsics
 from slam.mapping import TsdfMap
+from slam.pipeline.observations import Keyframe
 from slam.runtime.imports import import_open3d
+from slam.storage.spill import SpillFile
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
@@ -76,10 +78,13 @@ def test_slanted_surfaces_have_no_pixel_bias():
     assert abs(np.median(road[:, 1]) - 1.65) < 0.02
 
 
-def test_thinning_keeps_the_geometry():
-    tsdf_map = TsdfMap(MappingConfig(width_px=70, min_weight=2, min_component_triangles=10), CAMERA)
-    for z in (0.0, 0.5, 1.0):
-        tsdf_map.integrate(plate(8.0 - z), GREY, pose(1.0, 0.0, z))
+def test_thinned_keyframes_keep_the_geometry():
+    config, spill_file = MappingConfig(width_px=70, min_weight=2, min_component_triangles=10), SpillFile()
+    thinned = CAMERA.resized(70, round(CAMERA.height * 70 / CAMERA.width))
+    tsdf_map = TsdfMap(config, thinned)
+    for k, z in enumerate((0.0, 0.5, 1.0)):
+        keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file, config)
+        tsdf_map.integrate(keyframe.depth_unscaled, keyframe.image, pose(1.0, 0.0, z))
     vertices = tsdf_map.mesh().vertices_world
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
     assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15

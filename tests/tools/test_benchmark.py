@@ -55,17 +55,17 @@ def page(tools: Callable[[str], ModuleType]) -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def quantities(tools: Callable[[str], ModuleType]) -> ModuleType:
+def metric_definitions(tools: Callable[[str], ModuleType]) -> ModuleType:
     return tools("benchmarking.metric_definitions")
 
 
 @pytest.fixture(scope="module")
-def judgement(tools: Callable[[str], ModuleType]) -> ModuleType:
+def derived_metrics(tools: Callable[[str], ModuleType]) -> ModuleType:
     return tools("benchmarking.derived_metrics")
 
 
 @pytest.fixture(scope="module")
-def marks(tools: Callable[[str], ModuleType]) -> ModuleType:
+def summary(tools: Callable[[str], ModuleType]) -> ModuleType:
     return tools("benchmarking.summary")
 
 
@@ -96,10 +96,10 @@ def job(plan: ModuleType, tmp_path: Path) -> Any:
     return plan.Job(tmp_path / "runs", drive, "sim", plan.EVERYTHING, 0)
 
 
-def outcomes_of(plan: ModuleType, work: ModuleType, job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
+def results_of(plan: ModuleType, work: ModuleType, job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
     """Outcomes of configurations, one a seed."""
     return [
-        work.Outcome(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
+        work.JobResult(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
         for name, values in ates.items()
         for seed, ate in enumerate(values)
     ]
@@ -153,10 +153,10 @@ def test_recordings_are_all_sequences_or_those_named(
     assert (only.sequence, only.frames) == ("09", "0:60")
 
 
-def test_rows_hold_numbers_stages_and_reasons(quantities: ModuleType, work: ModuleType, job: Any) -> None:
-    ok = work.Outcome(job, metrics(0.25, graph=2.0), "abc")
-    failed = work.Outcome(replace(job, seed=1), {}, "abc", "no such weights")
-    first, second = quantities.rows([ok, failed])
+def test_rows_hold_numbers_stages_and_reasons(metric_definitions: ModuleType, work: ModuleType, job: Any) -> None:
+    ok = work.JobResult(job, metrics(0.25, graph=2.0), "abc")
+    failed = work.JobResult(replace(job, seed=1), {}, "abc", "no such weights")
+    first, second = metric_definitions.rows([ok, failed])
     assert (first["status"], first["ate_7dof_optimised_m"], first["seconds_graph"]) == ("ok", 0.25, 2.0)
     assert (second["status"], second["reason"], second["ate_7dof_optimised_m"]) == ("failed", "no such weights", None)
     assert list(first) == list(second)
@@ -165,33 +165,33 @@ def test_rows_hold_numbers_stages_and_reasons(quantities: ModuleType, work: Modu
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
 ) -> None:
-    outcomes = outcomes_of(plan, work, job, {"default": [1.0, 3.0]})
-    outcomes.append(work.Outcome(replace(job, seed=2), {}, "abc", "out of memory"))
-    text = page.accuracy_tables(outcomes)
+    results = results_of(plan, work, job, {"default": [1.0, 3.0]})
+    results.append(work.JobResult(replace(job, seed=2), {}, "abc", "out of memory"))
+    text = page.accuracy_tables(results)
     *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
     assert row[head.index("scale")] == "1.100"
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_shares_of_path_and_network(judgement: ModuleType, tmp_path: Path) -> None:
+def test_shares_of_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     run = metrics(ate=0.9)
     run["trajectories"]["network"] = {"align": {"7dof": {"ate_rmse_m": 3.6}}}
-    judged = judgement.judged(tmp_path, run)
-    shares = judged["network_percent"], judged["optimised_percent"], judged["of_network"]
+    derived = derived_metrics.derive_metrics(tmp_path, run)
+    shares = derived["network_percent"], derived["optimised_percent"], derived["of_network"]
     assert shares == pytest.approx((4.0, 1.0, 0.25))
-    assert judged["false_loops"] is None
-    assert judged["false_loops_reason"] == "the sequence has no true poses"
+    assert derived["false_loops"] is None
+    assert derived["false_loops_reason"] == "the sequence has no true poses"
     run["sequence"] = {"length_m": None, "length_m_reason": "no truth"}
-    assert judgement.judged(tmp_path, run)["optimised_percent_reason"] == "no truth"
+    assert derived_metrics.derive_metrics(tmp_path, run)["optimised_percent_reason"] == "no truth"
 
 
 @pytest.mark.parametrize(
     ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
 )
 def test_loops_are_sorted_by_the_truth(
-    judgement: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
+    derived_metrics: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
 ) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
@@ -201,24 +201,24 @@ def test_loops_are_sorted_by_the_truth(
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
-    judged = judgement.judged(tmp_path, metrics())
-    assert (judged["true_loops"], judged["false_loops"]) == (1 - false, false)
+    derived = derived_metrics.derive_metrics(tmp_path, metrics())
+    assert (derived["true_loops"], derived["false_loops"]) == (1 - false, false)
     in_heights = metrics() | {"scale": {"mode": "none", "value": 1.0}}
-    assert judgement.judged(tmp_path, in_heights)["true_loops"] is None
+    assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
 
 
 def test_marks_count_drives_and_pair_hazards_with_their_clean_twins(
-    marks: ModuleType, plan: ModuleType, work: ModuleType, job: Any, tmp_path: Path
+    summary: ModuleType, plan: ModuleType, work: ModuleType, job: Any, tmp_path: Path
 ) -> None:
     drives = plan.worlds(tmp_path, ["loop"], [620, 621], 800, ["clean", "hazards"])
     ates, true_loops = (1.0, 2.0, 1.5, 5.0), (4, 0, 2, 1)
-    outcomes = []
+    results = []
     for drive, ate, loops in zip(drives, ates, true_loops):
-        judged = {"optimised_percent": ate, "network_percent": 8.0, "of_network": ate / 8}
-        judged |= {"true_loops": loops, "false_loops": 1}
-        outcomes.append(work.Outcome(replace(job, drive=drive), metrics(ate) | {"judgement": judged}, "abc"))
-    outcomes.append(work.Outcome(replace(job, drive=drives[3], seed=1), {}, "abc", "killed"))
-    head, clean, hard = cells(marks.marks(outcomes))
+        derived = {"optimised_percent": ate, "network_percent": 8.0, "of_network": ate / 8}
+        derived |= {"true_loops": loops, "false_loops": 1}
+        results.append(work.JobResult(replace(job, drive=drive), metrics(ate) | {"derived": derived}, "abc"))
+    results.append(work.JobResult(replace(job, drive=drives[3], seed=1), {}, "abc", "killed"))
+    head, clean, hard = cells(summary.summary_table(results))
     for row, drive, runs, failed, ate, over_clean, found, false in (
         (clean, "loop", "2", "0", "1.50 (2.00)", "–", "1 of 2", "2"),
         (hard, "loop, hazards", "3", "1", "3.25 (5.00)", "2.00 (2.50)", "2 of 3", "2"),
@@ -231,14 +231,14 @@ def test_marks_count_drives_and_pair_hazards_with_their_clean_twins(
 
 
 def test_a_leak_is_told(page: ModuleType, work: ModuleType, job: Any) -> None:
-    assert "LEAK" not in page.accuracy_tables([work.Outcome(job, metrics(), "abc")])
+    assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
     leaky = metrics() | {"provenance": {"leak": True}}
-    assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.Outcome(job, leaky, "abc")])
+    assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.JobResult(job, leaky, "abc")])
 
 
 def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
-    outcomes = outcomes_of(plan, work, job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
-    text = page.ablation_tables(outcomes)
+    results = results_of(plan, work, job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
+    text = page.ablation_tables(results)
     table = cells(text)
     assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
     assert table[-2:] == [["everything on", "1.50"], ["no loops", "3.00"]]
@@ -248,18 +248,18 @@ def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType
 def test_ablation_without_the_whole_has_no_ratio(
     page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
 ) -> None:
-    table = cells(page.ablation_tables(outcomes_of(plan, work, job, {"no loops": [4.0]})))
+    table = cells(page.ablation_tables(results_of(plan, work, job, {"no loops": [4.0]})))
     assert table[1][:2] == ["no loops", "–"]
 
 
 def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
     asked = replace(job, configuration=plan.SPEED[0])
     grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
-    outcomes = [
-        work.Outcome(asked, metrics(seconds=20.0, read=5.0, map=10.0), "abc"),
-        work.Outcome(grown, metrics(seconds=10.0, loops=1.0, read=4.0), "abc"),
+    results = [
+        work.JobResult(asked, metrics(seconds=20.0, read=5.0, map=10.0), "abc"),
+        work.JobResult(grown, metrics(seconds=10.0, loops=1.0, read=4.0), "abc"),
     ]
-    table = cells(page.speed_tables(outcomes))
+    table = cells(page.speed_tables(results))
     assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
     assert ["loop 610", "sim", "networks asked", "25.0", "50.0", "25.0"] in table
     assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
@@ -278,9 +278,9 @@ def test_a_section_takes_the_place_of_its_older_self(page: ModuleType) -> None:
 
 
 def test_a_section_names_commit_and_seeds(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
-    outcomes = outcomes_of(plan, work, job, {"default": [1.0, 3.0]})
-    outcomes.append(work.Outcome(replace(job, seed=7), {}, "def", "why"))
-    text = page.section("accuracy", "the command", outcomes, "1")
+    results = results_of(plan, work, job, {"default": [1.0, 3.0]})
+    results.append(work.JobResult(replace(job, seed=7), {}, "def", "why"))
+    text = page.section("accuracy", "the command", results, "1")
     assert "Commit abc, def; seeds 0, 1, 7; 3 runs, 1 failed" in text
     assert "    the command\n" in text
 
@@ -293,7 +293,7 @@ def test_no_cache_no_measurement_from_it(
     monkeypatch.setattr(work, "revision", lambda: "abc")
     from_cache = replace(job, configuration=plan.SPEED[2])
     work.perform(from_cache)
-    assert work.outcome(from_cache).reason.startswith("there is no cache in ")
+    assert work.job_result(from_cache).reason.startswith("there is no cache in ")
 
 
 def test_only_what_ended_well_with_the_same_sources_is_kept(
@@ -314,10 +314,10 @@ def test_only_what_ended_well_with_the_same_sources_is_kept(
     monkeypatch.setattr(work.subprocess, "run", run)
     monkeypatch.setattr(work, "fingerprint", lambda weights: "first")
     work.perform(job)
-    assert work.outcome(job).reason == "killed by SIGKILL"
+    assert work.job_result(job).reason == "killed by SIGKILL"
     work.perform(job)
     work.perform(job)
-    assert (len(runs), work.outcome(job).reason) == (2, "")
+    assert (len(runs), work.job_result(job).reason) == (2, "")
     work.perform(replace(job, device="cuda"))
     assert len(runs) == 3
     monkeypatch.setattr(work, "fingerprint", lambda weights: "second")

@@ -1,59 +1,59 @@
-"""Markdown tables: groups of outcomes and what a cell says of a group."""
+"""Markdown tables: results grouped into rows, and the text of a cell for a group."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean, median, stdev
 
-from benchmarking.metric_definitions import Quantity
-from benchmarking.work import Outcome
+from benchmarking.metric_definitions import MetricDefinition
+from benchmarking.work import JobResult
 
 from slam.results.comparison import MISSING, lookup
 
-Label = Callable[[Outcome], str]
-Cell = Callable[[Sequence[Outcome]], str]
+Label = Callable[[JobResult], str]
+Cell = Callable[[Sequence[JobResult]], str]
 
 
-def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], outcomes: Sequence[Outcome]) -> str:
-    """Markdown: one row for each group of outcomes that share their labels."""
+def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]) -> str:
+    """Markdown: one row for each group of results that share their labels."""
     lines = ["| " + " | ".join([*rows, *columns]) + " |", "|" + "---|" * len(rows) + "---:|" * len(columns)]
-    for label, group in grouped(outcomes, *rows.values()).items():
+    for label, group in grouped(results, *rows.values()).items():
         lines.append("| " + " | ".join([*label, *(cell(group) for cell in columns.values())]) + " |")
     return "\n".join(lines)
 
 
-def grouped(outcomes: Sequence[Outcome], *labels: Label) -> dict[tuple[str, ...], list[Outcome]]:
+def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:
     """Outcomes by what they share, in order of appearance."""
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
-    for o in outcomes:
+    groups: dict[tuple[str, ...], list[JobResult]] = {}
+    for o in results:
         groups.setdefault(tuple(label(o) for label in labels), []).append(o)
     return groups
 
 
-def over_seeds(quantity: Quantity) -> Cell:
-    """Mean and, where it is more than nothing, sample standard deviation."""
+def over_seeds(definition: MetricDefinition) -> Cell:
+    """Mean and, where it is not zero, sample standard deviation."""
 
-    def cell(group: Sequence[Outcome]) -> str:
-        found = values(group, quantity)
-        deviation = round(stdev(found), quantity.decimals) if len(found) > 1 else 0.0
-        return mean(found, quantity.decimals) + (f" ± {deviation:.{quantity.decimals}f}" if deviation else "")
+    def cell(group: Sequence[JobResult]) -> str:
+        found = values(group, definition)
+        deviation = round(stdev(found), definition.decimals) if len(found) > 1 else 0.0
+        return mean(found, definition.decimals) + (f" ± {deviation:.{definition.decimals}f}" if deviation else "")
 
     return cell
 
 
-def average(quantity: Quantity) -> Cell:
+def average(definition: MetricDefinition) -> Cell:
     """Mean over a group."""
-    return lambda group: mean(values(group, quantity), quantity.decimals)
+    return lambda group: mean(values(group, definition), definition.decimals)
 
 
-def average_among(quantity: Quantity, among: Sequence[Outcome]) -> Cell:
-    """Mean over those of a group that are among others too."""
-    return lambda group: mean(values([o for o in group if o in among], quantity), quantity.decimals)
+def average_among(definition: MetricDefinition, among: Sequence[JobResult]) -> Cell:
+    """Mean over the results of a group that are also in another one."""
+    return lambda group: mean(values([o for o in group if o in among], definition), definition.decimals)
 
 
-def middle_and_extreme(quantity: Quantity, extreme: Callable[[Sequence[float]], float]) -> Cell:
+def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:
     """Median and the largest or smallest value of a group."""
-    return lambda group: spread(values(group, quantity), quantity.decimals, extreme)
+    return lambda group: spread(values(group, definition), definition.decimals, extreme)
 
 
 def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]) -> str:
@@ -61,9 +61,9 @@ def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[fl
     return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else MISSING
 
 
-def values(outcomes: Sequence[Outcome], quantity: Quantity) -> list[float]:
-    """A number of all outcomes that have it."""
-    found = (lookup(o.metrics, *quantity.path)[0] for o in outcomes)
+def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
+    """The values of a metric, without the results that lack it."""
+    found = (lookup(o.metrics, *definition.path)[0] for o in results)
     return [value for value in found if value is not None]
 
 
@@ -72,16 +72,16 @@ def mean(found: Sequence[float], decimals: int) -> str:
     return f"{fmean(found):.{decimals}f}" if found else MISSING
 
 
-def drive(o: Outcome) -> str:
+def drive(o: JobResult) -> str:
     """Name of the recording."""
     return o.job.drive.name
 
 
-def weights(o: Outcome) -> str:
+def weights(o: JobResult) -> str:
     """Name of the weights."""
     return o.job.weights
 
 
-def configuration(o: Outcome) -> str:
+def configuration(o: JobResult) -> str:
     """Name of the configuration."""
     return o.job.configuration.name

@@ -1,4 +1,4 @@
-"""What a run is worth against the truth, beside the errors that it measures itself."""
+"""Metrics derived from those of a run: errors relative to the path and to the network, true and false loops."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from slam.se3 import FloatArray, invert, rotation_angle
 FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop that is farther off the truth is false
 
 
-def judged(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
+def derive_metrics(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Errors as shares, and the accepted loops sorted by the truth.
 
     ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's.

@@ -1,4 +1,4 @@
-"""Tables of outcomes in Markdown, and the page that holds them."""
+"""Tables of results in Markdown, and the page that holds them."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ from benchmarking.metric_definitions import (
     SCALE,
     TIME,
     TRIANGLES,
-    Quantity,
+    MetricDefinition,
     stages,
 )
 from benchmarking.picture import drawable
 from benchmarking.plan import EVERYTHING, GROWTH
-from benchmarking.summary import marks
-from benchmarking.work import Outcome
+from benchmarking.summary import summary_table
+from benchmarking.work import JobResult
 
 from slam.results.comparison import MISSING, lookup
 
@@ -57,52 +57,54 @@ PICTURE = "images/trajectories.png"  # beside the page
 PAGE = """# Benchmarks
 
 Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
-measured with. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale*
-is the factor that the optimised trajectory still needs.
+measured with. A seed is `--seed` of the run, which seeds its RANSAC draws and nothing else: images, worlds and weights
+are the same for every seed, and a standard deviation over seeds is that of the draws alone, neither of training nor of
+data. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale* is the
+factor that the optimised trajectory still needs.
 
 An experiment beside these runs, kiss-icp on the point clouds of learned depth, is told in
-[design/0012](design/0012-kiss-icp-on-learned-depth.md).
+[design/tried-without-success](design/tried-without-success.md).
 """
 
 
-def accuracy_tables(outcomes: Sequence[Outcome]) -> str:
+def accuracy_tables(results: Sequence[JobResult]) -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
-    quantities = (FRAMES, LENGTH, *ERRORS, PERCENT, OF_NETWORK, R_REL, SCALE)
-    quantities += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
-    columns = {q.title: over_seeds(q) for q in quantities}
-    picture = f"\n\n![every drive from above]({PICTURE})" if drawable(outcomes) else ""
+    definitions = (FRAMES, LENGTH, *ERRORS, PERCENT, OF_NETWORK, R_REL, SCALE)
+    definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
+    columns = {q.title: over_seeds(q) for q in definitions}
+    picture = f"\n\n![every drive from above]({PICTURE})" if drawable(results) else ""
     return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
 trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
-{marks(outcomes)}
+{summary_table(results)}
 
 Every drive:
 
-{table({"sequence": drive, "weights": weights}, columns, outcomes)}{picture}{notes(outcomes, quantities)}"""
+{table({"sequence": drive, "weights": weights}, columns, results)}{picture}{notes(results, definitions)}"""
 
 
-def ablation_tables(outcomes: Sequence[Outcome]) -> str:
-    """What each part brings: errors over those of everything on, then the errors themselves."""
+def ablation_tables(results: Sequence[JobResult]) -> str:
+    """Ablation: errors relative to those of everything on, then the errors themselves."""
     errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, TRIANGLES, MEMORY)
-    columns = {f"{q.title}: ratio (worst)": against_everything(q, outcomes) for q in errors}
+    columns = {f"{q.title}: ratio (worst)": against_everything(q, results) for q in errors}
     columns |= {q.title: average(q) for q in others}
-    drives = grouped(outcomes, drive, weights)
+    drives = grouped(results, drive, weights)
     by_drive = {", ".join(label): average_among(ATE_7, group) for label, group in drives.items()}
     rows = {"configuration": configuration}
     return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
 above 1, the part helps. The rest are means.
 
-{table(rows, columns, outcomes)}
+{table(rows, columns, results)}
 
 {ATE_7.title}, metres:
 
-{table(rows, by_drive, outcomes)}{notes(outcomes, (*errors, *others))}"""
+{table(rows, by_drive, results)}{notes(results, (*errors, *others))}"""
 
 
-def speed_tables(outcomes: Sequence[Outcome]) -> str:
+def speed_tables(results: Sequence[JobResult]) -> str:
     """Frames a second, shares of the stages, growth with the number of frames."""
-    growth = [o for o in outcomes if o.job.configuration.name == GROWTH.name]
-    whole = [o for o in outcomes if o not in growth]
+    growth = [o for o in results if o.job.configuration.name == GROWTH.name]
+    whole = [o for o in results if o not in growth]
     rows = {"sequence": drive, "weights": weights, "configuration": configuration}
     costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
     shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
@@ -118,26 +120,26 @@ Share of every stage, %:
 
 Growth with the number of frames, without fusion; stages in ms / frame:
 
-{table({"sequence": drive, "weights": weights}, by_stage, growth)}{notes(outcomes, (*costs, *grown))}"""
+{table({"sequence": drive, "weights": weights}, by_stage, growth)}{notes(results, (*costs, *grown))}"""
 
 
-TABLES: dict[str, Callable[[Sequence[Outcome]], str]] = {
+TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
     "ablation": ablation_tables,
     "speed": speed_tables,
 }
 
 
-def against_everything(quantity: Quantity, outcomes: Sequence[Outcome]) -> Cell:
+def against_everything(definition: MetricDefinition, results: Sequence[JobResult]) -> Cell:
     """Geometric mean and worst of the ratios to the runs with everything on."""
 
-    def key(o: Outcome) -> tuple[str, str, int]:
+    def key(o: JobResult) -> tuple[str, str, int]:
         return o.job.drive.name, o.job.weights, o.job.seed
 
-    base = {key(o): values([o], quantity) for o in outcomes if o.job.configuration.name == EVERYTHING.name}
+    base = {key(o): values([o], definition) for o in results if o.job.configuration.name == EVERYTHING.name}
 
-    def cell(group: Sequence[Outcome]) -> str:
-        pairs = [(value, *base.get(key(o), [])) for o in group for value in values([o], quantity)]
+    def cell(group: Sequence[JobResult]) -> str:
+        pairs = [(value, *base.get(key(o), [])) for o in group for value in values([o], definition)]
         ratios = [pair[0] / pair[1] for pair in pairs if len(pair) == 2 and min(pair) > 0]
         return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else MISSING
 
@@ -149,7 +151,7 @@ def stage_share(stage: str) -> Cell:
     return lambda group: mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
 
 
-def rest_share(group: Sequence[Outcome]) -> str:
+def rest_share(group: Sequence[JobResult]) -> str:
     """Per cent outside of every stage."""
     shares = [100 - 100 * sum(_stage(o, s) for s in stages([o])) / _seconds(o) for o in group if not o.reason]
     return mean(shares, 1)
@@ -162,33 +164,33 @@ def stage_ms(stage: str) -> Cell:
     )
 
 
-def notes(outcomes: Sequence[Outcome], quantities: Iterable[Quantity]) -> str:
-    """What a reader must know about the numbers, why some are missing and runs failed; a line each."""
+def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
+    """Leaks, reasons of missing numbers, and failed runs, a line each."""
     lines: dict[str, None] = {}
-    for o in (o for o in outcomes if not o.reason):
+    for o in (o for o in results if not o.reason):
         if lookup(o.metrics, "provenance", "leak")[0]:
             lines[f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."] = None
-        for quantity in quantities:
-            value, reason = lookup(o.metrics, *quantity.path)
+        for definition in definitions:
+            value, reason = lookup(o.metrics, *definition.path)
             if value is None:
-                lines[f"{MISSING} {quantity.title}, {o.job.drive.name}: {reason}."] = None
-    lines |= {f"Failed: {o.job.title}: {o.reason}": None for o in outcomes if o.reason}
+                lines[f"{MISSING} {definition.title}, {o.job.drive.name}: {reason}."] = None
+    lines |= {f"Failed: {o.job.title}: {o.reason}": None for o in results if o.reason}
     return "\n" + "".join(f"\n- {line}" for line in lines)
 
 
-def section(mode: str, command: str, outcomes: Sequence[Outcome], at_a_time: str) -> str:
-    """A section of the page: what was done, then its tables."""
-    commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in outcomes))
-    seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in outcomes))
-    failed = sum(bool(o.reason) for o in outcomes)
+def section(mode: str, command: str, results: Sequence[JobResult], at_a_time: str) -> str:
+    """A section of the page: command, commit and seeds, then its tables."""
+    commits = ", ".join(dict.fromkeys(o.commit or "unknown" for o in results))
+    seeds = ", ".join(dict.fromkeys(str(o.job.seed) for o in results))
+    failed = sum(bool(o.reason) for o in results)
     return f"""## {mode.capitalize()}
 
     {command}
 
-Commit {commits}; seeds {seeds}; {len(outcomes)} runs, {failed} failed; {at_a_time} at a time on
+Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_time} at a time on
 {os.cpu_count()} {platform.machine()} cores.
 
-{TABLES[mode](outcomes)}
+{TABLES[mode](results)}
 """
 
 
@@ -201,9 +203,9 @@ def with_section(page: str, new: str) -> str:
     return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
 
 
-def _stage(o: Outcome, stage: str) -> float:
+def _stage(o: JobResult, stage: str) -> float:
     return float(o.metrics["timing"]["stages"].get(stage, 0.0))
 
 
-def _seconds(o: Outcome) -> float:
+def _seconds(o: JobResult) -> float:
     return float(o.metrics["timing"]["seconds_total"])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmarking.cells import drive, grouped
-from benchmarking.work import Outcome
+from benchmarking.work import JobResult
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -22,21 +22,23 @@ DPI = 90
 COLOURS = 48  # a third of the bytes of a full palette, and no eye sees it
 
 
-def drawable(outcomes: Sequence[Outcome]) -> list[Outcome]:
+def drawable(results: Sequence[JobResult]) -> list[JobResult]:
     """The first run of every drive that ended well."""
-    return [runs[0] for runs in grouped([o for o in outcomes if not o.reason], drive).values()]
+    return [runs[0] for runs in grouped([o for o in results if not o.reason], drive).values()]
 
 
-def draw(outcomes: Sequence[Outcome], path: Path) -> None:
+def draw(results: Sequence[JobResult], path: Path) -> None:
     """Network, odometry and optimised trajectory over the truth, a panel a drive."""
-    chosen = drawable(outcomes)
+    chosen = drawable(results)
     columns = math.ceil(math.sqrt(1.6 * len(chosen)))
     rows = math.ceil(len(chosen) / columns)
     figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
     panels = figure.subfigures(rows, columns, squeeze=False).flat
     for o, panel in zip(chosen, panels):
         [axes] = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
-        axes.get_legend().remove()
+        legend = axes.get_legend()
+        if legend is not None:
+            legend.remove()
         axes.set(xlabel="", ylabel="")
         axes.set_title(drive(o), fontsize=8)
         axes.tick_params(labelsize=6)

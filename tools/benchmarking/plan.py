@@ -1,4 +1,4 @@
-"""What is to be measured: recordings, configurations and the runs that combine them."""
+"""The runs of a benchmark: recordings, configurations and their combinations."""
 
 from __future__ import annotations
 
@@ -29,41 +29,41 @@ class BenchmarkSequence:
 
 @dataclass(frozen=True)
 class Configuration:
-    """What a run is told; ``fill`` empties the cache of the networks' answers first, ``full`` wants it there."""
+    """Overrides of a run, and its cache of the networks' outputs: ``fill`` empties it first, ``full`` requires it."""
 
     name: str
     overrides: tuple[str, ...] = ()
     cache: Literal["none", "keep", "fill", "full"] = "none"
 
 
-_UNINFORMATIVE = 100.0  # sigma of a logarithm: nothing is learned from the measurement
+_UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that nothing reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("geometry.enabled=false",),
-    "corners followed as they are": ("geometry.predicted_flow=false",),
-    "turns of single steps alone": ("geometry.rotation_baseline_steps=1",),
-    "nothing moves by itself": ("geometry.dynamic_mask_sharpness=0",),
-    "no direction from turns": (f"geometry.heading_prior_sigma_deg={_NEVER}",),
-    "no lengths from the road's motion": ("road.enabled=false",),
+    "no predicted flow": ("geometry.predicted_flow=false",),
+    "no relative rotation over two steps": ("geometry.rotation_baseline_steps=1",),
+    "no dynamic mask": ("geometry.dynamic_mask_sharpness=0",),
+    "no heading prior": (f"geometry.heading_prior_sigma_deg={_NEVER}",),
+    "no lengths from the road homography": ("road.enabled=false",),
     "no ratios of neighbouring steps": (f"lengths.ratio_sigma={_UNINFORMATIVE}",),
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
-    "no noise from the drive": (
+    "no inflation of step sigmas": (
         "geometry.jitter_rotation_ratio=0",
         "geometry.jitter_direction_ratio=0",
         "geometry.turn_rotation_ratio=0",
         "geometry.neighbour_rotation_ratio=0",
         "geometry.neighbour_direction_ratio=0",
     ),
-    "no bridging": ("gaps.enabled=false",),
-    "network factors only where geometry has none": ("frontend.use=bridge",),
+    "no gap interpolation": ("gaps.enabled=false",),
+    "network factors only where image geometry fails": ("frontend.use=gaps",),
     "no loops": ("loops.enabled=false",),
-    "no support among loops": ("loops.min_support=0",),
-    "no robust noise": ("pose_graph.kernel=none",),
-    "no loop given up": (f"pose_graph.max_loop_residual={_NEVER}",),
+    "no consistency among loops": ("loops.min_support=0",),
+    "no robust kernel": ("pose_graph.kernel=none",),
+    "no loop dropped": (f"pose_graph.max_loop_residual={_NEVER}",),
     "no fusion": ("mapping.enabled=false",),
 }
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _PARTS.items()))

@@ -1,4 +1,4 @@
-"""Runs, each in a process of its own, one after another or through Dask, and what they leave."""
+"""Runs, each in a process of its own, one after another or through Dask, and their results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarking import plan
-from benchmarking.derived_metrics import judged
+from benchmarking.derived_metrics import derive_metrics
 from benchmarking.plan import BenchmarkSequence, Job
 
 from slam.results.comparison import failure
@@ -32,8 +32,8 @@ Spread = Callable[[Callable[[Any], None], Sequence[Any]], Iterable[None]]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a job: ``metrics.json`` with a few numbers more, or the reason of its failure."""
+class JobResult:
+    """``metrics.json`` of a job with its derived metrics, or the reason of its failure."""
 
     job: Job
     metrics: Mapping[str, Any]
@@ -42,7 +42,7 @@ class Outcome:
 
 
 def simulate(drive: BenchmarkSequence) -> None:
-    """Make a world where it is missing; what becomes of it is seen by looking for it."""
+    """Simulate a world where it is missing; whoever needs it checks that it is there."""
     if not drive.root.exists():
         subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)
 
@@ -51,7 +51,7 @@ def perform(job: Job) -> None:
     """Run a job and leave ``record.json`` in its place, unless the same job ended well before."""
     identity = {"arguments": job.arguments, "sources": fingerprint(job.weights)}
     kept = _read(job.place / "record.json")
-    if kept.get("identity") == identity and not _read_outcome(job, kept).reason:
+    if kept.get("identity") == identity and not _read_result(job, kept).reason:
         return
     shutil.rmtree(job.place, ignore_errors=True)
     job.place.mkdir(parents=True)
@@ -69,17 +69,17 @@ def perform(job: Job) -> None:
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
 
 
-def outcome(job: Job) -> Outcome:
-    """What a job left."""
-    return _read_outcome(job, _read(job.place / "record.json"))
+def job_result(job: Job) -> JobResult:
+    """The result of a job that was performed."""
+    return _read_result(job, _read(job.place / "record.json"))
 
 
-def _read_outcome(job: Job, record: Mapping[str, Any]) -> Outcome:
+def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
     metrics = _read(job.place / "run" / "metrics.json")
     reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was broken off")
     commit = record.get("commit", "")
     if reason:
-        return Outcome(job, {}, commit, reason)
+        return JobResult(job, {}, commit, reason)
     timing, frames = metrics["timing"], metrics["sequence"]["frames"]
     process = {
         "seconds": record["seconds"],
@@ -87,7 +87,7 @@ def _read_outcome(job: Job, record: Mapping[str, Any]) -> Outcome:
         "ms_per_frame": 1e3 * timing["seconds_total"] / frames,
         "cpu_ms_per_frame": 1e3 * timing["cpu_seconds"] / frames,
     }
-    return Outcome(job, metrics | {"process": process, "judgement": judged(job.place / "run", metrics)}, commit)
+    return JobResult(job, metrics | {"process": process, "derived": derive_metrics(job.place / "run", metrics)}, commit)
 
 
 def _slam(*arguments: str) -> list[str]:
@@ -128,7 +128,7 @@ def revision() -> str:
 
 @contextmanager
 def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
-    """A way to do one thing to many: one after another, or through Dask."""
+    """A ``map`` over jobs: one after another, or through Dask."""
     if count == 1 and scheduler is None:
         yield map
         return
@@ -155,7 +155,7 @@ def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
         yield spread
 
 
-def measured(jobs: Sequence[Job], spread: Spread) -> list[Outcome]:
+def measured(jobs: Sequence[Job], spread: Spread) -> list[JobResult]:
     """Make the worlds that are missing, run what was not run before.
 
     Raises:
@@ -169,7 +169,7 @@ def measured(jobs: Sequence[Job], spread: Spread) -> list[Outcome]:
         raise SystemExit(f"could not be simulated: {', '.join(missing)}")
     for done, _ in enumerate(spread(perform, jobs), 1):
         print(f"{done} of {len(jobs)} runs", file=sys.stderr)
-    return [outcome(job) for job in jobs]
+    return [job_result(job) for job in jobs]
 
 
 def _read(path: Path) -> dict[str, Any]:

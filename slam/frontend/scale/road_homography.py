@@ -1,9 +1,9 @@
-"""The length of a step in camera heights, from how the road before the car moves through the image.
+"""The length of a step in camera heights, by the homography of the road between two images.
 
 A plane ``n . X = h`` of the current camera moves by the homography ``R + t n^T / h`` to the previous one
 (Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
-``m = |t| n / h`` is what aligns both images of the road, and its norm is the length sought. Learned depth
-plays no part, so this length neither shares the networks' bias nor drifts.
+``m = |t| n / h`` that aligns both images of the road is estimated, and its norm is the length sought. Learned depth
+is not used, so this length neither shares the networks' bias nor drifts.
 """
 
 from __future__ import annotations
@@ -100,13 +100,15 @@ class RoadHomography:
         if correlation < self._config.min_correlation:
             return MeasurementFailure(f"the road looks different in both images (correlation {correlation:.2f})")
         if 1.0 - correlation > (1.0 - self._config.min_gain) * (1.0 - standing):
-            return MeasurementFailure(f"what is before the car stands still in the image (correlation {standing:.2f})")
+            return MeasurementFailure(
+                f"what is in front of the car stands still in the image (correlation {standing:.2f})"
+            )
         return RoadStep(length, float(np.hypot(strip.shape.relative_sigma, self._config.tilt_gain * deviation)), normal)
 
     def _aligned(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> tuple[FloatArray, float, float]:
-        """The plane ``m`` ``(3,)`` that aligns the road, how alike both views of it are then, and as they are."""
+        """The plane ``m`` ``(3,)`` that aligns the road, the correlation of both views then, and without alignment."""
         config = self._config
 
         def align() -> Answer:
@@ -127,7 +129,7 @@ class RoadHomography:
     def _expected(self) -> FloatArray:
         """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.
 
-        The images hardly tell pitch from length, and the direction of motion tells it well.
+        The images determine pitch and length poorly together; the direction of motion determines pitch well.
         """
         direction = np.median(self._directions, axis=0)
         along = direction / max(float(np.linalg.norm(direction)), 1e-9)

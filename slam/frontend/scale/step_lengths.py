@@ -1,12 +1,12 @@
-"""The lengths of all steps at once, from everything that measures them, with the networks' drifting unit as a state.
+"""The lengths of all steps, solved together, with the drifting unit of learned depth as a state.
 
-A monocular step has a direction and no length. Three things measure it: points triangulated on both sides
-of a frame fix it relative to the step before; the road gives it in camera heights; learned depth gives it in
-a unit that wanders. In logarithms all of them are linear in the lengths ``x`` and the unit's deviation ``b``:
+A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
+that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
+it in a unit that drifts. In logarithms all of them are linear in the lengths ``x`` and the unit's deviation ``b``:
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
 
-so that one robust sparse least squares holds the whole drive (``docs/design/0006-lengths-before-the-graph.md``).
+so one robust sparse least squares solves the whole drive (``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LEAST_COMMON = 12
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
-_MOST_ALIKE = 0.999
+_MOST_CORRELATED = 0.999
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class StepEvidence:
     """What was measured of S steps, logarithms and their sigmas ``(S,)`` each, NaN where nothing was.
 
     ``ratio`` is the length over that of the step before; ``absolute`` the length in the unit wanted; ``learned``
-    the length by learned depth, already in the unit that the networks are believed to have.
+    the length by learned depth, already in the prior unit of the networks.
     """
 
     ratio: FloatArray
@@ -146,8 +146,8 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         robust = 1.0 / (1.0 + (residual / config.outlier_sigmas) ** 2)
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     known = np.where(measured, 1.0, np.nan)
-    sigmas, alike = marginals(information, steps)
-    correlated_sigmas = config.correlated_widening * sigmas * np.sqrt((1.0 + alike) / (1.0 - alike))
+    sigmas, correlations = marginals(information, steps)
+    correlated_sigmas = config.correlated_widening * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * correlated_sigmas, np.exp(state[steps:]))
 
 
@@ -174,7 +174,7 @@ def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArra
         after[-k - 1] -= tie[-k - 1] @ np.linalg.inv(after[-k]) @ tie[-k - 1]
     sigmas = np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0])
     pairs = np.block([[before[:-1], tie[:-1]], [tie[:-1], after[1:]]])  # (S - 1, 4, 4)
-    alike = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_ALIKE)
+    alike = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED)
     ends = alike[:1], alike[-1:]
     return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], alike]) + np.concatenate([alike, ends[1]]))
 

@@ -1,7 +1,8 @@
 """Where in the image objects lately moved by themselves.
 
 A car ahead stays at one place of the image for minutes. Some of its corners fit the camera's motion by chance and bias
-it, but most do not: where many corners were outliers lately, the others are weighted down (``docs/design/0014``).
+it, but most do not: where many corners were outliers lately, the others are weighted down
+(``docs/design/visual-front-end.md``).
 """
 
 from __future__ import annotations

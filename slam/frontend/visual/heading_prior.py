@@ -2,9 +2,9 @@
 
 Corners determine the direction of translation and the rotation together: with few corners a camera that slides to the
 right is hard to tell from one that yaws to the left, and the errors of both have a correlation of 0.8
-(``docs/design/0013``). A vehicle moves where it is steered, so the direction follows from the rotation. This relation
-is a line fitted to the last steps of the drive; a Kalman update joins it with each measurement. On a camera that moves
-freely the line fits loosely and the update changes nothing.
+(``docs/design/visual-front-end.md``). A vehicle moves where it is steered, so the direction follows from the rotation.
+This relation is a line fitted to the last steps of the drive; a Kalman update joins it with each measurement. On a
+camera that moves freely the line fits loosely and the update changes nothing.
 """
 
 from __future__ import annotations

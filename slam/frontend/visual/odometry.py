@@ -188,7 +188,7 @@ class VisualOdometry:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, learned, self._state.dynamic_mask)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
-        # an essential matrix of a pure rotation invents a translation: only believe one that is needed
+        # the essential matrix of a pure rotation invents a translation: use one only where parallax needs it
         turned = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:

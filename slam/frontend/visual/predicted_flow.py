@@ -3,7 +3,7 @@
 From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
 Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
 single corners err by half a pixel, and those on the road all upwards, which looks like a camera that pitches
-(``docs/design/0013``). Warping the later image back by the predicted flow removes the stretch.
+(``docs/design/visual-front-end.md``). Warping the later image back by the predicted flow removes the stretch.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The covariance of corners holds for an ideal pinhole. On the road there is more: time stamps, the mount, lens errors. It
 grows with the camera's rotation jitter, with its rotation, and with how far a step lies from its neighbours. So the
 sigmas of each step are inflated by ratios of what of these the corners' own noise does not explain. The ratios in
-``GeometryConfig`` were fitted once (``docs/design/0009-noise-from-the-drive-itself.md``).
+``GeometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
 """
 
 from __future__ import annotations

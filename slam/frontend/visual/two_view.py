@@ -1,9 +1,9 @@
 """The motion between two views that corners, learned depth and the drive so far agree on.
 
 Corners alone can mislead: where most of them lie on a car that turns with the camera, its corners and distant ones lie
-on the epipolar lines of a motion that neither made (``docs/design/0010``). Two further measurements tell the motions
-apart. A motion predicts how far each corner shifts along its epipolar line, and so does learned depth; and a vehicle
-moves in the direction in which it has moved.
+on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further measurements tell
+the motions apart. A motion predicts how far each corner shifts along its epipolar line, and so does learned depth; and
+a vehicle moves in the direction in which it has moved.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CORNER_CORRELATION = 2.0
 class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
-    ``weights`` ``(M,)`` in (0, 1] say how far each is to be believed.
+    ``weights`` ``(M,)`` in (0, 1] are lower where objects move by themselves.
     """
 
     rays_previous: FloatArray

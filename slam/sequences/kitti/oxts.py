@@ -6,38 +6,15 @@ east, north, up in a Mercator projection scaled at the first latitude.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from erfsfm.readers.kitti_oxts import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP
 from slam import se3
-from slam.errors import SequenceError
 from slam.se3 import FloatArray
 
 _EARTH_RADIUS_M = 6378137.0
-_COLUMNS = 30
-_VELOCITY_NORTH, _VELOCITY_EAST, _VELOCITY_UP = 6, 7, 10
 _RATES = slice(17, 20)
-
-
-def read_packets(folder: Path) -> FloatArray:
-    """Every packet of ``oxts/data`` in order, ``(N, 30)``.
-
-    Raises:
-        SequenceError: if a packet is missing or has not 30 numbers.
-    """
-    paths = sorted(folder.glob("*.txt"))
-    rows = []
-    for path in paths:
-        try:
-            row = [float(word) for word in path.read_text(encoding="utf-8").split()]
-        except (OSError, ValueError) as error:
-            raise SequenceError(f"cannot read OXTS packet {path}: {error}") from error
-        if len(row) != _COLUMNS:
-            raise SequenceError(f"OXTS packet {path} has {len(row)} numbers, not {_COLUMNS}: copy it again")
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(-1, _COLUMNS)
 
 
 def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
@@ -53,7 +30,7 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
     scale = np.cos(latitude[0])
     east = scale * _EARTH_RADIUS_M * longitude
     north = scale * _EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
-    velocity = packets[:, [_VELOCITY_EAST, _VELOCITY_NORTH, _VELOCITY_UP]]
+    velocity = packets[:, [VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP]]
     positions = np.column_stack([east, north, altitude]) + velocity * ages_s[:, None]
     yaw_pitch_roll = packets[:, [5, 4, 3]]
     turn = Rotation.from_rotvec(packets[:, _RATES] * ages_s[:, None])

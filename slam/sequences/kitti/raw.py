@@ -3,143 +3,89 @@
 from __future__ import annotations
 
 import logging
-import re
 from pathlib import Path
 
 import numpy as np
 
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.images import has_images, list_images
+from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CAMERA_HEIGHT_M, IMU_TO_VELO, VELO_TO_CAM, CalibrationFile
+from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name
+from erfsfm.readers.kitti_oxts import read_packet
+from erfsfm.readers.numbering import NumberedFiles, by_number
 from slam import se3
 from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import CAMERA_FILE, CameraFile, read_camera_file
-from slam.sequences.images import ImageFiles, has_images, list_images, require_numbered
+from slam.sequences.camera_file import beside
+from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
-from slam.sequences.kitti.calibration import CalibrationFile, moved_to_camera
+from slam.sequences.kitti.calibration import moved_to_camera
 from slam.sequences.recording import (
-    KITTI_CAMERA_HEIGHT_M,
     ImageSource,
-    Recording,
+    RecordedSequence,
     Source,
     fallback_stamps,
+    interpolated_poses,
     rebased,
+    require_short_gaps,
     require_stamps,
 )
 from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
-CAMERAS = ("02", "03", "00", "01")
-_DRIVE = re.compile(r"(\d{4}_\d\d_\d\d_drive_\d{4})_(sync|extract)")
 _EPOCH = np.datetime64("2011-01-01", "ns")
-_DATE = re.compile(r"\d{4}_\d\d_\d\d")
-
-ODOMETRY_OF_DRIVE: dict[str, tuple[str, int, int]] = {
-    "2011_10_03_drive_0027": ("00", 0, 4540),
-    "2011_10_03_drive_0042": ("01", 0, 1100),
-    "2011_10_03_drive_0034": ("02", 0, 4660),
-    "2011_09_26_drive_0067": ("03", 0, 800),
-    "2011_09_30_drive_0016": ("04", 0, 270),
-    "2011_09_30_drive_0018": ("05", 0, 2760),
-    "2011_09_30_drive_0020": ("06", 0, 1100),
-    "2011_09_30_drive_0027": ("07", 0, 1100),
-    "2011_09_30_drive_0028": ("08", 1100, 5170),
-    "2011_09_30_drive_0033": ("09", 0, 1590),
-    "2011_09_30_drive_0034": ("10", 0, 1200),
-}
-"""Odometry sequence made from a drive, with the drive's first and last frame in it (odometry devkit)."""
 
 
-def find_drives(dataset: Path) -> dict[str, Path]:
-    """Drives by name (``2011_09_26_drive_0013``): the folder itself, those in it, or those in its dates.
-
-    Raises:
-        SequenceError: if the folder is an unrectified (``_extract``) drive.
-    """
-    own = _DRIVE.fullmatch(dataset.absolute().name)
-    if own is not None:
-        if own.group(2) == "extract":
-            raise SequenceError(f"{dataset} is not rectified: download the synced+rectified drive (_sync)")
-        return {own.group(1): dataset}
-    if not dataset.is_dir():
-        return {}
-    dates = [p for p in dataset.iterdir() if _DATE.fullmatch(p.name) and p.is_dir()]
-    drives = {}
-    for folder in [dataset, *dates]:
-        for path in folder.iterdir():
-            match = _DRIVE.fullmatch(path.name)
-            if match is not None and match.group(2) == "sync" and path.is_dir():
-                drives[match.group(1)] = path
-    return dict(sorted(drives.items()))
-
-
-def drive_name(text: str) -> str:
-    """A drive as the user writes it (with its date folder, with ``_sync``, or without) as we name it."""
-    return Path(text).name.removesuffix("_sync")
-
-
-def open_kitti_raw(drive: Path, camera: CameraFile | None) -> Recording:
+def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
     """Open one synced and rectified drive.
 
     The calibration is scaled to the images' true size. ``camera``, where given, takes its place.
 
     Raises:
-        SequenceError: if images, calibration or stamps are missing or do not match.
+        SequenceError, DataError: if images, calibration or stamps are missing or do not match.
     """
     drive = drive.absolute()
-    number = next((c for c in CAMERAS if has_images(drive / f"image_{c}" / "data")), None)
+    number = next((c for c in RAW_CAMERAS if has_images(drive / f"image_{c}" / "data")), None)
     if number is None:
-        looked = ", ".join(f"image_{c}/data" for c in CAMERAS)
+        looked = ", ".join(f"image_{c}/data" for c in RAW_CAMERAS)
         raise SequenceError(f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again")
-    paths = list_images(drive / f"image_{number}" / "data")
-    require_numbered(paths)
-    images: ImageSource = ImageFiles(paths)
-    cameras = _calibration(drive.parent / "calib_cam_to_cam.txt")
-    intrinsics = scaled_intrinsics(cameras, number, images.width, images.height)
+    files = by_number(list_images(drive / f"image_{number}" / "data"))
+    images: ImageSource = ImageFiles(files)
+    cameras = CalibrationFile(drive.parent / CAM_TO_CAM)
+    intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, images.width, images.height))
     if camera is not None:
         images, intrinsics = calibrated(images, camera, str(drive))
     times_path = drive / f"image_{number}" / "timestamps.txt"
-    image_times = _times(times_path, len(paths))
+    image_times = _times(times_path, files)
+    stamps = fallback_stamps(times_path, len(files)) if image_times is None else image_times - image_times[0]
+    require_short_gaps(files, stamps)
     T_camera_lidar = _T_camera_lidar(drive, cameras, number)
     name = drive_name(drive.name)
-    return Recording(
+    scans = (path for path in (drive / "velodyne_points/data").glob("*.bin") if path.stem.isdecimal())
+    return RecordedSequence(
         name=name,
         images=images,
         intrinsics=intrinsics,
-        stamps=fallback_stamps(times_path, len(paths)) if image_times is None else image_times - image_times[0],
-        sources=drive_sources(name),
-        reference=_reference(drive, len(paths), image_times, T_camera_lidar),
+        stamps=stamps,
+        sources=tuple(source.shifted(files.first) for source in drive_sources(name)),
+        reference=_reference(drive, files, stamps, image_times, T_camera_lidar),
         camera_height_m=_camera_height(drive, camera),
         T_camera_lidar=T_camera_lidar,
-        scans={int(p.stem): p for p in (drive / "velodyne_points/data").glob("*.bin") if p.stem.isdecimal()},
+        scans={int(path.stem) - files.first: path for path in scans},
     )
-
-
-def scaled_intrinsics(cameras: CalibrationFile, number: str, width: int, height: int) -> Intrinsics:
-    """A rectified camera's pinhole for images resized from ``S_rect`` to the given size."""
-    size = cameras.matrix(f"S_rect_{number}", (2,))
-    return cameras.intrinsics(f"P_rect_{number}", int(size[0]), int(size[1])).resized(width, height)
 
 
 def drive_sources(name: str) -> tuple[Source, ...]:
     """A drive's names in the leak record: its own, and that of the odometry sequence made from it."""
     own = Source(f"kitti_raw/{name}")
-    if name not in ODOMETRY_OF_DRIVE:
-        return (own,)
-    sequence, first, last = ODOMETRY_OF_DRIVE[name]
-    return own, Source(f"kitti_odometry/{sequence}", first=-first, length=last - first + 1)
+    cut = ((sequence, first, stop) for sequence, (drive, first, stop) in ODOMETRY_DRIVES.items() if drive == name)
+    return own, *(Source(f"kitti_odometry/{s}", first=-first, length=stop - first) for s, first, stop in cut)
 
 
-def _calibration(path: Path) -> CalibrationFile:
-    if not path.is_file():
-        raise SequenceError(
-            f"no {path.name} in {path.parent}: KITTI ships it as DATE_calib.zip; copy it beside the drives"
-        )
-    return CalibrationFile(path)
-
-
-def _times(path: Path, frames: int) -> FloatArray | None:
-    """Seconds since KITTI's year began, ``(frames,)``, or None without the file."""
+def _times(path: Path, files: NumberedFiles) -> FloatArray | None:
+    """Seconds since KITTI's year began, one for each row of files, or None without ``path``."""
     if not path.is_file():
         return None
     try:
@@ -148,12 +94,12 @@ def _times(path: Path, frames: int) -> FloatArray | None:
         raise SequenceError(f"{path} must hold a date and a time a row: {error}") from error
     stamps = stamps[~np.isnat(stamps)]
     seconds: FloatArray = (stamps - _EPOCH).astype(np.float64) * 1e-9
-    return require_stamps(seconds, path, frames)
+    return require_stamps(seconds, path, files)
 
 
 def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> FloatArray | None:
     """LiDAR to the rectified camera; None where ``calib_velo_to_cam.txt`` is missing."""
-    path = drive.parent / "calib_velo_to_cam.txt"
+    path = drive.parent / VELO_TO_CAM
     if not path.is_file():
         logger.warning("no %s: neither LiDAR nor GPS/INS can be related to the camera", path)
         return None
@@ -164,33 +110,42 @@ def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> Float
 
 
 def _reference(
-    drive: Path, frames: int, image_times: FloatArray | None, T_camera_lidar: FloatArray | None
+    drive: Path,
+    files: NumberedFiles,
+    stamps: FloatArray,
+    image_times: FloatArray | None,
+    T_camera_lidar: FloatArray | None,
 ) -> FloatArray | None:
     """``T_world_camera`` from the GPS/INS; None where it or its calibration is missing."""
-    folder, path = drive / "oxts" / "data", drive.parent / "calib_imu_to_velo.txt"
+    folder, path = drive / "oxts" / "data", drive.parent / IMU_TO_VELO
     if T_camera_lidar is None or not folder.is_dir():
         return None
     if not path.is_file():
         logger.warning("no %s: the drive has no reference poses", path)
         return None
-    packets = oxts.read_packets(folder)
-    if len(packets) != frames:
+    found = sorted(folder.glob("*.txt"))
+    packets = by_number(found) if found else None
+    paths = {} if packets is None else dict(zip((packets.first + row for row in packets.rows), packets.paths))
+    rows = range(len(files)) if all(files.first + row in paths for row in range(len(files))) else files.rows
+    if packets is None or not all(files.first + row in paths for row in rows):
         raise SequenceError(
-            f"{folder} has {len(packets)} packets for {frames} images: restore what is missing, or remove "
+            f"{folder} has {len(paths)} packets for {len(files.paths)} images: restore what is missing, or remove "
             f"oxts to run without a reference"
         )
-    packet_times = _times(drive / "oxts" / "timestamps.txt", frames)
-    ages_s = np.zeros(frames)
+    known = np.array(rows)
+    ages_s = np.zeros(len(known))
+    packet_times = _times(drive / "oxts" / "timestamps.txt", packets)
     if image_times is not None and packet_times is not None:
-        ages_s = image_times - packet_times
+        ages_s = image_times[known] - packet_times[known + files.first - packets.first]
+    content = np.array([read_packet(paths[files.first + row]) for row in rows])
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
-    return rebased(moved_to_camera(oxts.T_world_imu(packets, ages_s), T_camera_imu))
+    T_world_camera = moved_to_camera(oxts.T_world_imu(content, ages_s), T_camera_imu)
+    if len(known) < len(files):
+        T_world_camera = interpolated_poses(T_world_camera, stamps[known], stamps)
+    return rebased(T_world_camera)
 
 
 def _camera_height(drive: Path, camera: CameraFile | None) -> float | None:
     """1.65 m unless a camera file, given or in the drive, its date or the root, says otherwise."""
-    beside = (folder / CAMERA_FILE for folder in (drive, drive.parent, drive.parent.parent))
-    found = next((path for path in beside if path.is_file()), None)
-    if camera is None and found is not None:
-        camera = read_camera_file(found)
-    return KITTI_CAMERA_HEIGHT_M if camera is None else camera.height_or(KITTI_CAMERA_HEIGHT_M)
+    camera = camera or beside(drive, drive.parent, drive.parent.parent)
+    return CAMERA_HEIGHT_M if camera is None else camera.height_or(CAMERA_HEIGHT_M)

@@ -1,1 +1,1 @@
-"""The parts of the simulated street world: pure NumPy, no ray casting."""
+"""The simulated street world: plan, surfaces, textures, traffic, LiDAR, and the sequence rendered from it."""

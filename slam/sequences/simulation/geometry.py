@@ -1,4 +1,4 @@
-"""Triangle soup with materials: every surface of the simulated world is a patch, a bent grid of quads."""
+"""Triangle meshes with materials: every surface of the simulated world is a grid of quads, bent onto the terrain."""
 
 import functools
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ PARAMETERS = 6
 
 
 class Material(IntEnum):
-    """What a surface is made of; the key to its texture."""
+    """Material of a surface; selects its texture."""
 
     ASPHALT = 0
     JUNCTION = 1
@@ -37,10 +37,10 @@ class Material(IntEnum):
 
 @dataclass(frozen=True)
 class Mesh:
-    """A finished soup; coordinates in the street frame (x east, y north, z up, metres).
+    """A finished mesh in the street frame (x east, y north, z up, metres).
 
-    What pixels look up is stored with the triangles or instances last: gathering and arithmetic are
-    several times faster so.
+    Triangles and instances are the last axis of the tables that pixels look up: gathering is several times
+    faster so.
 
     Attributes:
         vertices: ``(V, 3)``.
@@ -51,8 +51,8 @@ class Mesh:
         instance: index into the tables below, ``(T,)``.
         material: of each triangle, ``(T,)``.
         colours: two base colours per instance, RGB in [0, 1], ``(2, 3, I)``.
-        parameters: what the texture of the material wants to know, ``(PARAMETERS, I)``.
-        offsets: where in the noise an instance lies, ``(2, I)``.
+        parameters: of the material's texture, ``(PARAMETERS, I)``.
+        offsets: of an instance in the noise texture, ``(2, I)``.
     """
 
     vertices: Float32Array
@@ -76,7 +76,7 @@ def _patch_triangles(rows: int, columns: int) -> IntArray:
 
 
 class Soup:
-    """Collects patches, then bends them onto the terrain in one go."""
+    """Collects patches, then bends all of them onto the terrain."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -91,7 +91,7 @@ class Soup:
 
     @property
     def instances(self) -> int:
-        """How many things are registered."""
+        """Number of registered instances."""
         return len(self._materials)
 
     def instance(
@@ -101,7 +101,7 @@ class Soup:
         colour2: FloatArray | None = None,
         parameters: tuple[float, ...] = (),
     ) -> int:
-        """Register one thing with its own look and return its number."""
+        """Register an instance with its colours and parameters; return its number."""
         row = np.zeros(PARAMETERS)
         row[: len(parameters)] = parameters
         self._materials.append(int(material))

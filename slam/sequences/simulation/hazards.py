@@ -1,4 +1,4 @@
-"""What makes a drive hard: moving cars, exposure, blur, a stop, rain."""
+"""Hazards of a simulated drive: moving cars, exposure jumps, motion blur, a stop, rain."""
 
 import dataclasses
 from typing import Literal
@@ -15,13 +15,13 @@ from slam.sequences.simulation.route import STEP, Route
 Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
 
 STILL_FRAMES = 30  # 3 s at 10 frames a second
-SHUTTER = 0.5  # share of the time between frames that a blurred picture is exposed
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
 BLUR_SAMPLES = 6
 _FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))
 
 
 def exposure_curve(seed: int, frames: int) -> FloatArray:
-    """Gain and gamma of every frame, constant for a while and then jumping, ``(N, 2)``."""
+    """Gain and gamma of every frame ``(N, 2)``, piecewise constant."""
     rng = np.random.default_rng([seed, 31])
     curve = np.empty((frames, 2))
     start = 0
@@ -38,7 +38,7 @@ def exposed(rgb: Float32Array, gain: float, gamma: float) -> Float32Array:
 
 
 def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
-    """Streaks and a veil of rain over an image ``(H, W, 3)`` about [0, 1]."""
+    """Rain streaks and reduced contrast over an image ``(H, W, 3)`` about [0, 1]."""
     rng = np.random.default_rng([seed, 32, index])
     height, width = rgb.shape[:2]
     drops = (rng.random((height, width)) < 0.005).astype(np.float32) * rng.uniform(0.4, 1.0)
@@ -67,7 +67,7 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
 
 
 class Traffic:
-    """Cars that drive: one ahead of the camera for a while, others that come towards it."""
+    """Moving cars: one ahead of the camera for a while, others oncoming."""
 
     def __init__(self, drive: Route, seed: int) -> None:
         rng = np.random.default_rng([seed, 33])

@@ -1,4 +1,4 @@
-"""The files of a simulated KITTI odometry root: pictures, and the small text files beside them."""
+"""The files of a simulated KITTI odometry root: images, depth maps, calibration and poses."""
 
 from pathlib import Path
 

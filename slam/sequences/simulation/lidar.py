@@ -18,8 +18,8 @@ T_CAMERA_LIDAR: FloatArray = np.array(
 def beam_directions(rng: np.random.Generator) -> Float32Array:
     """Unit directions of one spin in the LiDAR frame, ``(BEAMS * COLUMNS, 3)``.
 
-    Each spin starts at an angle of its own: were the rays the same in every scan, the rings on the ground
-    would repeat exactly and scan matching would believe that the car stands still.
+    Each spin starts at a random angle: with the same rays in every scan the rings on the ground would repeat
+    exactly, and scan matching would estimate zero motion.
     """
     azimuth = (np.arange(COLUMNS) + rng.uniform()) * (2.0 * np.pi / COLUMNS)
     elevation = np.deg2rad(np.linspace(HIGHEST_DEG, LOWEST_DEG, BEAMS))[:, None]

@@ -1,4 +1,4 @@
-"""Value noise on an integer lattice, and box-filtered stripes: patterns that fade before they alias."""
+"""Value noise on an integer lattice and box-filtered stripes, band-limited against aliasing."""
 
 import functools
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The things that stand in a street: buildings, trees, cars, poles, signs, hedges and fences."""
+"""Objects of a street: buildings, trees, cars, poles, signs, hedges and fences."""
 
 import numpy as np
 
@@ -160,7 +160,7 @@ def lamp(soup: Soup, rng: np.random.Generator, x: float, y: float, towards: Floa
 
 
 def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float) -> None:
-    """A traffic sign on a post; the plate is seen by whoever drives along ``facing``, an angle."""
+    """A traffic sign on a post; its plate faces traffic that drives along the angle ``facing``."""
     steel = soup.instance(Material.METAL, colour(rng, (0.55, 0.56, 0.57), spread=0.03))
     foot, height = np.array([x, y, 0.0]), float(rng.uniform(2.1, 2.7))
     tube(soup, foot, foot + (height + 0.3) * UP, (0.04, 0.04), steel)

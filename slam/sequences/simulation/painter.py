@@ -1,4 +1,4 @@
-"""Turns ray hits into colour: gathers what was hit, shades each material, lights it, adds the haze."""
+"""Shading of ray hits: texture of each material, light and haze."""
 
 from dataclasses import dataclass
 

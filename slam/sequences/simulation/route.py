@@ -32,7 +32,7 @@ FEWEST_LOOP_FRAMES = 250
 
 @dataclass(frozen=True)
 class Route:
-    """Where the camera is at each frame.
+    """The camera's trajectory through a street plan.
 
     Attributes:
         plan: the streets.
@@ -54,7 +54,7 @@ class Route:
 
 
 def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) -> Route:
-    """Lay out streets and drive over them in ``frames`` frames.
+    """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:
         route: ``loop`` drives its own start again, ``grid`` drives streets again both ways (given about
@@ -180,7 +180,7 @@ def _resample(path: FloatArray) -> FloatArray:
 
 
 def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> FloatArray:
-    """Frame number at each point of a lane: slow in corners, never harder on the brake than a car."""
+    """Frame number at each point of a lane: slow in corners, acceleration bounded as a car's."""
     points = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     tangent = np.gradient(points[:, :2], axis=0)
@@ -225,7 +225,7 @@ def _poses(
 
 
 def _shake(rng: np.random.Generator, frames: int) -> FloatArray:
-    """Pitch, yaw and roll about x, y, z in radians, and bounce in metres, correlated in time, ``(N, 4)``."""
+    """Suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, ``(N, 4)``."""
     white = rng.standard_normal((frames + 60, 4))
     slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
     mixed = (0.8 * slow + 0.6 * fast)[30:-30]

@@ -1,4 +1,4 @@
-"""The embedded sequence: a street rendered in memory, with its truth at hand."""
+"""The embedded sequence: a simulated street rendered in memory, with ground truth."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SimulatedSequence:
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        """Render one frame, or give it again from memory."""
+        """Render one frame; recent ones are kept in memory."""
         require_frame(self.name, index, len(self))
         return Frame(index, float(self.stamps[index]), self._cached(index).copy())
 

@@ -38,7 +38,7 @@ from slam.sequences.simulation.town import build_town
 
 VERSION = 1  # of the world: the same options give the same bytes as long as it stays
 FPS = 10.0
-FARTHEST_M = 200.0  # what lies beyond counts as nothing
+FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SimulationOptions:
     hazards: tuple[Hazard, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse options that mean nothing.
+        """Refuse invalid options.
 
         Raises:
             SequenceError: naming the option.
@@ -73,7 +73,7 @@ def parse_options(route: str, frames: int, seed: int, width: int, height: int, h
     """Options from a command line; ``hazards`` is a comma list.
 
     Raises:
-        SequenceError: if one of them means nothing.
+        SequenceError: if one of them is invalid.
     """
     names = tuple(name.strip() for name in hazards.split(",") if name.strip())
     return SimulationOptions(cast(RouteKind, route), frames, seed, width, height, cast(tuple[Hazard, ...], names))
@@ -172,7 +172,7 @@ class SimulatedStreet:
         return measured(directions, ranges, reflectance, rng)
 
     def distance_to_surface(self, points_world: NDArray[np.floating[Any]]) -> FloatArray:
-        """Distance in metres from points ``(M, 3)`` to the nearest still surface, ``(M,)``."""
+        """Distance in metres from points ``(M, 3)`` to the nearest static surface, ``(M,)``."""
         points = se3.apply(self._route.T_street_camera[0], np.asarray(points_world, dtype=np.float64))
         tensor = import_open3d().core.Tensor(points.astype(np.float32))
         return np.asarray(self._still.scene.compute_distance(tensor).numpy(), dtype=np.float64)
@@ -182,7 +182,7 @@ class SimulatedStreet:
         return _surface(build_town(self._route.plan, self._route.bend, self.options.seed))
 
     def _surfaces(self, index: int) -> list[_Surface]:
-        """What can be seen at a frame: the town, and the cars that drive."""
+        """The surfaces at a frame: the static town and the moving cars."""
         cars = self._traffic.placed(index) if self._traffic else None
         return [self._still] if cars is None else [self._still, _surface(cars)]
 
@@ -218,7 +218,7 @@ class SimulatedStreet:
     def _sunlit(
         self, surfaces: list[_Surface], rays: Float32Array, hits: Hits, pixels: NDArray[np.int64]
     ) -> Float32Array:
-        """How much of the sun reaches each hit, softened over the neighbouring pixels, ``(N,)``."""
+        """Visibility of the sun from each hit, smoothed over neighbouring pixels, ``(N,)``."""
         towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
         to_sun = np.take(rays, towards, axis=0)
         to_sun[:, :3] += to_sun[:, 3:] * hits.depth[towards, None] + 0.03 * hits.normals[:, towards].T
@@ -231,7 +231,7 @@ class SimulatedStreet:
         return np.asarray(np.take(soft, pixels), dtype=np.float32)
 
     def _develop(self, rgb: Float32Array, index: int) -> NDArray[np.uint8]:
-        """Rain, the lens's slight softness, exposure, and 8 bits."""
+        """Rain, lens blur, exposure, and quantisation to 8 bits."""
         rgb = rgb * np.float32(self._weather.exposure)
         if "rain" in self.options.hazards:
             rgb = effects.rained_on(rgb, self.options.seed, index)

@@ -1,4 +1,4 @@
-"""Procedural colour of every material, from texture coordinates and the size of a pixel on the surface."""
+"""Procedural textures of all materials, from texture coordinates and the pixel footprint."""
 
 from collections.abc import Callable
 
@@ -27,7 +27,7 @@ def shade(material: Material, texels: Texels, colours: Float32Array, parameters:
 
 
 def _mix(a: Lengths, b: Lengths, share: Lengths) -> Float32Array:
-    """Blend colours ``(3, N)`` by a share ``(N,)``."""
+    """Blend colours ``(3, N)`` by a weight ``(N,)``."""
     return np.asarray(a + share * (b - a), dtype=np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Fills a street plan: roads, pavements, lots, and everything that stands on them."""
+"""Surfaces of a street plan: roads, pavements, lots and the objects on them."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 
 def build_town(plan: StreetPlan, bend: Bend, seed: int) -> Mesh:
-    """Every still surface of the world, in street coordinates."""
+    """Every static surface of the world, in street coordinates."""
     rng = np.random.default_rng([seed, 10])
     town = _Town(plan, rng)
     town.ground()
@@ -24,7 +24,7 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int) -> Mesh:
 
 
 class _Town:
-    """The soup under construction, with the taste of one world."""
+    """The mesh under construction, with the colours and proportions of one world."""
 
     def __init__(self, plan: StreetPlan, rng: np.random.Generator) -> None:
         self.plan, self.rng, self.soup = plan, rng, Soup(rng)

@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from erfsfm.data.discovery import discover
-from erfsfm.data.images import image_files, resize_image
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 
@@ -161,12 +160,6 @@ def test_a_folder_called_images_has_its_parents_name(tmp_path: Path, monkeypatch
     assert one(Path()).name == "folder/my_drive"
 
 
-def test_natural_order(tmp_path: Path) -> None:
-    for name in ("10.png", "2.png", "1.png", "._1.png", "notes.txt"):
-        (tmp_path / name).write_bytes(b"")
-    assert [p.name for p in image_files(tmp_path)] == ["1.png", "2.png", "10.png"]
-
-
 def test_grey_images_have_three_channels(tmp_path: Path) -> None:
     write_camera(tmp_path)
     cv2.imwrite(str(tmp_path / "0.png"), np.full((32, 48), 77, np.uint8))
@@ -257,15 +250,67 @@ def test_calibration_of_larger_images(tmp_path: Path, write_root: Callable[..., 
     assert "of different sizes" in refusal(tmp_path)
 
 
-@pytest.mark.parametrize("damage", ["remove", "rename"])
-def test_gaps(tmp_path: Path, write_root: Callable[..., Path], damage: str) -> None:
+def test_calibration_of_images_that_were_two_thirds_smaller(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    """KITTI's P2 with the shipped images at two thirds: inside them, but off by the same factor along both axes."""
+    write_root(tmp_path, size=(250, 827), frames=1)
+    (tmp_path / "sequences/00/calib.txt").write_text("P2: 718.856 0 607.1928 45 0 718.856 185.2157 0 0 0 1 0\n")
+    assert "of different sizes" in refusal(tmp_path)
+
+
+def test_a_recording_is_split_at_its_gaps(
+    tmp_path: Path, write_root: Callable[..., Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    write_root(tmp_path, frames=9, depth=True, step=(0.0, 0.0, 0.5))
+    for number in (0, 3, 4):
+        (tmp_path / f"sequences/00/image_2/{number:06d}.png").unlink()
+    first, second = discover(tmp_path)
+    assert (first.frames_name, second.frames_name) == ("kitti_odometry/00[1:3]", "kitti_odometry/00[5:9]")
+    assert "2 of 8 frames have no image; the first gap is 000003.png to 000004.png" in caplog.text
+    for recording, places in ((first, [0.5, 1.0]), (second, [2.5, 3.0, 3.5, 4.0])):
+        T_world_camera, depth = recording.true_poses(), recording.true_depth(1)
+        assert T_world_camera is not None and depth is not None
+        np.testing.assert_allclose(T_world_camera[:, 2, 3], places)
+        assert float(depth[0, 0]) == pytest.approx(6.0 - places[1], abs=1 / 256)
+        assert recording.images[0].stem == f"{recording.start:06d}"
+    assert second.within(0, 6) == second.part(0, 1)
+    assert second.within(0, 5) is None and second.within(9, 12) is None
+
+
+def test_poses_of_the_images_that_exist(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    write_root(tmp_path, frames=6, step=(0.0, 0.0, 0.5))
+    (tmp_path / "sequences/00/image_2/000002.png").unlink()
+    poses = tmp_path / "poses/00.txt"
+    rows = poses.read_text().splitlines()
+    poses.write_text("\n".join(rows[:2] + rows[3:]) + "\n")
+    T_world_camera = discover(tmp_path)[1].true_poses()
+    assert T_world_camera is not None
+    np.testing.assert_allclose(T_world_camera[:, 2, 3], [1.5, 2.0, 2.5])
+
+
+def test_a_folder_is_split_at_its_gaps(tmp_path: Path) -> None:
+    write_images(write_camera(tmp_path / "drive"), count=7)
+    (tmp_path / "drive/0004.png").unlink()
+    assert [r.frames_name for r in discover(tmp_path / "drive")] == ["folder/drive[0:4]", "folder/drive[5:7]"]
+
+
+def test_an_image_that_is_no_frame(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path)
     frame = tmp_path / "sequences/00/image_2/000003.png"
-    if damage == "remove":
-        frame.unlink()
-    else:
-        frame.rename(frame.with_name("left.png"))
-    assert "no frame 000003" in refusal(tmp_path)
+    frame.rename(frame.with_name("left.png"))
+    assert "left.png is not named by its number" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_half_an_image(tmp_path: Path, write_root: Callable[..., Path], suffix: str) -> None:
+    write_root(tmp_path, suffix=suffix)
+    image = tmp_path / f"sequences/00/image_2/000002{suffix}"
+    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
+    assert f"000002{suffix} is truncated" in refusal(tmp_path)
+
+
+def test_a_folder_with_brackets_in_its_name(tmp_path: Path) -> None:
+    write_images(write_camera(tmp_path / "br[ack]ets"))
+    assert one(tmp_path / "br[ack]ets").frames_name == "folder/br[ack]ets[0:3]"
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '{"seed": null}', "{"])
@@ -310,12 +355,14 @@ def test_image_of_another_size(tmp_path: Path, write_root: Callable[..., Path]) 
     ("changes", "words"),
     [
         ({"fx": None}, "camera.yaml"),
+        ({"fx": 2.0}, "fx: 2 is no focal length"),
+        ({"cx": 60}, "lies outside the 48x32 image"),
         ({"fx": "wide"}, "wide"),
-        ({"fx": -3}, "positive"),
-        ({"width": 0}, "positive"),
+        ({"fx": -3}, "fx: input should be greater than 0"),
+        ({"width": 0}, "width: input should be greater than 0"),
         ({"model": "opencv", "distortion": [0.1, 0, 0, 0]}, "undistort"),
         ({"model": "fisheye", "distortion": [0, 0, 0, 0]}, "undistort"),
-        ({"distortion": [0.1, 0, 0, 0]}, "undistort"),
+        ({"distortion": [0.1, 0, 0, 0]}, "distortion: needs model opencv"),
     ],
 )
 def test_bad_camera_file(tmp_path: Path, changes: dict[str, object], words: str) -> None:
@@ -342,19 +389,6 @@ def test_folder_without_camera_file(tmp_path: Path) -> None:
 def test_broken_video(tmp_path: Path) -> None:
     (write_camera(tmp_path) / "x.mp4").write_bytes(b"no video")
     assert "x.mp4" in refusal(tmp_path)
-
-
-def test_resize_image_up_is_smooth() -> None:
-    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
-    grown = resize_image(ramp, 16, 64)
-    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
-    assert resize_image(ramp, 8, 16) is ramp
-
-
-def test_resize_image_down_averages() -> None:
-    image = np.zeros((8, 8, 3), np.uint8)
-    image[::2] = 100
-    assert (resize_image(image, 4, 4) == 50).all()
 
 
 def test_simulation_file_with_more_in_it(tmp_path: Path, write_root: Callable[..., Path]) -> None:

@@ -47,7 +47,7 @@ def coded(tmp_path: Path) -> Path:
     for code, name in enumerate("ab"):
         folder = tmp_path / name
         folder.mkdir()
-        camera = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5}
+        camera = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
         (folder / "camera.yaml").write_text(yaml.safe_dump(camera))
         for index in range(FRAMES):
             image = np.full((32, 48, 3), (0, 200 * code, 20 * index), np.uint8)
@@ -407,7 +407,7 @@ def test_no_root() -> None:
 
 def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
     street = SimulatedStreet(SimulationOptions(frames=250, seed=702))
-    camera = {"width": 416, "height": 128, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    camera = {"width": 416, "height": 128, "fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "fps": 10}
     camera |= dict(zip(("fx", "fy", "cx", "cy"), map(float, street.K[[0, 1, 0, 1], [0, 1, 2, 2]])))
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
     for index in range(3):

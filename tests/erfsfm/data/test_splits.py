@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from erfsfm.data.splits import ODOMETRY_RAW, FrameRange, merge, overlapping
+from erfsfm.data.splits import merge, overlapping
 from erfsfm.errors import ConfigError
+from erfsfm.readers.frame_range import FrameRange
+from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES
 
 
 @pytest.mark.parametrize(
@@ -39,9 +41,9 @@ def test_leaks(name: str, seen: str, leaks: bool) -> None:
     assert overlapping([seen], [name]) == ([seen] if leaks else []), "either way round"
 
 
-@pytest.mark.parametrize("sequence", sorted(ODOMETRY_RAW))
+@pytest.mark.parametrize("sequence", sorted(ODOMETRY_DRIVES))
 def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
-    drive, first, past_last = ODOMETRY_RAW[sequence]
+    drive, first, past_last = ODOMETRY_DRIVES[sequence]
     cut, whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"), FrameRange.parse(f"kitti_raw/{drive}")
     name = f"kitti_odometry/{sequence}"
     assert cut.counted_in(name) == whole.counted_in(name) == FrameRange(name, 0, past_last - first)
@@ -50,7 +52,7 @@ def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
 
 def test_frames_of_the_table() -> None:
     """The lengths of the benchmark."""
-    lengths = [stop - start for _, start, stop in ODOMETRY_RAW.values()]
+    lengths = [stop - start for _, start, stop in ODOMETRY_DRIVES.values()]
     assert lengths == [4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201]
 
 

@@ -12,6 +12,7 @@ import pytest
 from erfsfm.data import video as module
 from erfsfm.data.video import Video
 from erfsfm.errors import DataError
+from erfsfm.readers.video import VideoFrames
 
 FRAMES, SIZE = 40, (48, 32)
 
@@ -42,7 +43,13 @@ def test_any_frame_at_any_time(tmp_path: Path, suffix: str, codec: str) -> None:
 def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     video = Video(write(tmp_path / "a.mp4"))
     opened: list[Path] = []
-    monkeypatch.setattr(module, "_open", lambda path: opened.append(path) or cv2.VideoCapture(str(path)))
+
+    class Counted(VideoFrames):
+        def __init__(self, path: Path, counted_frames: int) -> None:
+            opened.append(path)
+            super().__init__(path, counted_frames)
+
+    monkeypatch.setattr(module, "VideoFrames", Counted)
     small = [video.image(index, 16, 24) for index in (9, 3, 9)]
     assert len(opened) == 1
     assert small[0].shape == (16, 24, 3)
@@ -65,7 +72,7 @@ def test_a_video_that_breaks_after_it_was_counted(tmp_path: Path) -> None:
     path = write(tmp_path / "a.avi", codec="MJPG")
     video = Video(path)
     write(path, 12, "MJPG")
-    with pytest.raises(DataError, match=r"frame 12 of .*a\.avi cannot be decoded"):
+    with pytest.raises(DataError, match=r"a\.avi breaks off at frame 12"):
         video.image(0, 32, 48)
 
 
@@ -74,6 +81,6 @@ def test_no_video(tmp_path: Path, content: bytes | str) -> None:
     """An mp4 keeps its index at the end: half of one cannot be read at all."""
     path = write(tmp_path / "a.mp4")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if isinstance(content, str) else content)
-    with pytest.raises(DataError, match=r"a\.mp4 cannot be read as a video: .*copy it again") as caught:
+    with pytest.raises(DataError, match=r"a\.mp4 cannot be opened: .*copy it again") as caught:
         Video(path)
     assert "\n" not in str(caught.value)

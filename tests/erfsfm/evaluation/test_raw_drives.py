@@ -116,7 +116,7 @@ def test_displacements_are_trapezoids(tmp_path: Path, write_drive: Write) -> Non
         ("velodyne_points/data/0000000003.bin", "true depth .* comes from the LiDAR"),
         ("oxts/data/0000000003.txt", "a packet of the GPS/IMU a frame"),
         ("oxts/timestamps.txt", "needs a date and a time a frame"),
-        ("../calib_cam_to_cam.txt", "calibration lies in the folder of the date"),
+        ("../calib_cam_to_cam.txt", "no calib_cam_to_cam.txt in .*: KITTI ships it as DATE_calib.zip"),
     ],
 )
 def test_missing_files(tmp_path: Path, write_drive: Write, gone: str, words: str) -> None:
@@ -136,7 +136,7 @@ def test_damaged_files(tmp_path: Path, write_drive: Write) -> None:
     with pytest.raises(DataError, match="four numbers a point"):
         lidar_depth(frame, (64, 96))
     (frame.folder.parent / "calib_velo_to_cam.txt").write_text("R: 1 2 3\nT: 0 0 0\n")
-    with pytest.raises(DataError, match="is incomplete"):
+    with pytest.raises(DataError, match="row R has 3 numbers: it needs 9"):
         lidar_depth(RawFrame(tmp_path, DRIVE, 2), (64, 96))
 
 

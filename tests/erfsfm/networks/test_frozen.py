@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -76,3 +78,21 @@ def test_a_network_that_refuses_goes_on_refusing() -> None:
     for _ in range(2):
         with pytest.raises(ValueError, match="no network here"):
             graph(torch.zeros(SIZE))
+
+
+def test_tracing_in_a_thread_warns_of_nothing_and_exchanges_no_filters() -> None:
+    """`warnings.catch_warnings` would replace the filters of every thread while the graph is traced."""
+    seen: list[object] = []
+
+    class Watching(nn.Module):
+        def forward(self, image: Tensor) -> Tensor:
+            seen.append(warnings.filters)
+            return image * bool(image.shape[0] > 0) if image.sum() < 1e9 else image
+
+    with warnings.catch_warnings(record=True) as warned:
+        graph = Frozen(Watching().eval())
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(graph, torch.zeros(SIZE)).result()
+        assert all(filters is warnings.filters for filters in seen)
+    assert isinstance(graph.network, torch.jit.ScriptModule)
+    assert not warned

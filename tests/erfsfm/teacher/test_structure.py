@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.teacher import structure as module
 from erfsfm.teacher.road import on_road, road_plane, under_road
-from erfsfm.teacher.structure import Structure, StructureCache, measure_structure
+from erfsfm.teacher.structure import StructureCache, TeacherStructure, measure_structure
 from erfsfm.teacher.two_view import rays, two_view
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
@@ -17,7 +17,7 @@ def street() -> SimulatedStreet:
 
 
 @pytest.fixture(scope="module")
-def measured(street) -> dict[int, Structure]:
+def measured(street) -> dict[int, TeacherStructure]:
     K = street.K.astype(np.float32)
     return {i: measure_structure([street.render(k).image for k in range(i - 2, i + 3)], K) for i in (40, 120, 200)}
 

@@ -17,7 +17,7 @@ from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig
 from erfsfm.errors import ConfigError
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
-from erfsfm.training.objective import Outcome, SnippetBatch, evaluate_objective
+from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective
 
 PLACES = [(-0.3, 0.05, -0.4), (0.2, -0.1, 0.35)]  # of the two sources; the target is at the origin
 
@@ -79,7 +79,7 @@ def batch(plane) -> SnippetBatch:
     return SnippetBatch(target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3))
 
 
-def judge(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> Outcome:
+def judge(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> ObjectiveResult:
     depth_net, pose_net = FixedDepth(disparity).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
     return evaluate_objective(depth_net, pose_net, batch, config)
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
-from erfsfm.errors import ConfigError, DataError, TrainingError
+from erfsfm.errors import CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.training.keeper import decisive, licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
@@ -397,6 +397,21 @@ def test_a_loss_that_is_no_number_stops_the_run(
     train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
 
 
+def test_weights_that_are_no_numbers_are_not_written(
+    small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The very last step spoils them, after which no loss is looked at."""
+
+    def spoil(self: SelfSupervision, *_: object) -> None:
+        if self.global_step == 3:
+            next(self.pose_net.parameters()).data.view(-1)[0] = float("nan")
+
+    monkeypatch.setattr(SelfSupervision, "on_before_optimizer_step", spoil)
+    with pytest.raises(TrainingError, match=r"weights are NaN or infinite at step 4: lower training\.learning_rate"):
+        train(configure(small, [world]), tmp_path / "run", device="cpu")
+    assert not (tmp_path / "run" / "model.yaml").exists()
+
+
 @pytest.mark.parametrize(("spoilt", "stops"), [((1, 2, 3), True), ((0, 1, 3), False)])
 def test_a_depth_that_stays_constant_stops_the_run(
     small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: tuple[int, ...], stops: bool
@@ -459,6 +474,29 @@ def test_weights_are_not_overwritten(small: Small, world: Path, tmp_path: Path) 
     assert not (tmp_path / "run" / "checkpoints").exists()
     with pytest.raises(TrainingError, match="choose another --output"):
         train(config, tmp_path / "run", device="cpu")
+
+
+def test_a_start_that_failed_may_be_repeated(small: Small, world: Path, tmp_path: Path) -> None:
+    """What it left is the complete configuration, and folders of ours."""
+    config = configure(small, [world], training={"steps": 1})
+    (tmp_path / "run" / "logs").mkdir(parents=True)
+    (tmp_path / "run" / "config.yaml").write_text(dump_yaml(config))
+    assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
+
+
+def test_no_validation_is_said_once(
+    small: Small, world: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    train(configure(small, [world], training={"steps": 1}), tmp_path / "run", device="cpu")
+    said = [record.message for record in caplog.records if "validation" in record.message]
+    assert said == ["training runs without validation: no recording of data.validation is among the data"]
+
+
+def test_a_failed_start_leaves_nothing(small: Small, world: Path, tmp_path: Path) -> None:
+    config = configure(small, [world]).model_copy(update={"initial_weights": "nowhere"})
+    with pytest.raises(CheckpointError):
+        train(config, tmp_path / "run", device="cpu")
+    assert not (tmp_path / "run").exists()
 
 
 def test_nothing_to_resume(small: Small, world: Path, tmp_path: Path) -> None:
@@ -600,6 +638,8 @@ def test_licence_of(seen: list[str], licence: str) -> None:
 
 @pytest.mark.parametrize("precision", ["bf16-mixed"])
 def test_mixed_precision_trains(small: Small, world: Path, held_out: Path, tmp_path: Path, precision: str) -> None:
+    # where a map of features is one pixel, PyTorch 2.13's gradients of its bfloat16 kernels on a CPU are uninitialised
+    small["network"] |= {"height": 64, "width": 128}
     config = configure(small, [world, held_out], training={"precision": precision, "steps": 2})
     output = train(config, tmp_path / "run", device="cpu")
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
@@ -610,7 +650,7 @@ def test_half_precision_on_a_cpu_is_announced(
 ) -> None:
     with caplog.at_level(logging.WARNING):
         train(configure(small, [world], training={"precision": "16-mixed", "steps": 1}), tmp_path / "run", device="cpu")
-    assert [r.message for r in caplog.records] == [
+    assert [r.message for r in caplog.records if "precision" in r.message] == [
         "training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU"
     ]
 
@@ -648,4 +688,4 @@ def test_two_processes_are_one_with_twice_the_batch(
     run("two", resume=True, batch=2, devices=2, steps=6)
     run("one", resume=True, batch=4, steps=6)
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
-        torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
+        torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import slam.evaluation.coverage as evaluation_of_coverage
 from slam import se3
 from slam.errors import SlamError
-from slam.evaluation.coverage import coverage, coverage_by_source, squared_bound
+from slam.evaluation.coverage import coverage, squared_bound
 from slam.frames import LOOP_SOURCE, RelativePose
 from slam.se3 import FloatArray
 
@@ -37,7 +38,7 @@ def factors(student_t_dof: float) -> list[RelativePose]:
 
 @pytest.mark.parametrize("student_t_dof", [math.inf, 12.0, 4.0])
 def test_noise_that_is_as_it_says_is_covered(student_t_dof: float) -> None:
-    shares = coverage(factors(student_t_dof), truth(), 1.0)
+    shares = coverage(factors(student_t_dof), truth(), 1.0).overall
     assert shares == {
         "50": pytest.approx(0.5, abs=0.03),
         "90": pytest.approx(0.9, abs=0.02),
@@ -46,9 +47,9 @@ def test_noise_that_is_as_it_says_is_covered(student_t_dof: float) -> None:
 
 
 def test_heavy_tails_that_are_not_told_are_seen() -> None:
-    shares = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0)
+    shares = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0).overall
     assert shares["50"] > 0.65 and shares["95"] < 0.94
-    shares = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0)
+    shares = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0).overall
     assert shares["50"] < 0.3
 
 
@@ -64,7 +65,7 @@ def test_the_scale_is_known() -> None:
     shares = coverage(edges, metric, 1.0)
     metric[:, :3, 3] *= 4.0
     assert coverage(edges, metric, 0.25) == shares
-    assert coverage(edges, metric, 1.0)["95"] < 0.1
+    assert coverage(edges, metric, 1.0).overall["95"] < 0.1
     for bad in (([], 1.0), (edges, 0.0)):
         with pytest.raises(SlamError):
             coverage(bad[0], metric, bad[1])
@@ -73,14 +74,26 @@ def test_the_scale_is_known() -> None:
 def test_the_kind_of_factor_that_is_not_honest_is_told() -> None:
     honest = factors(math.inf)
     boasting = [replace(f, sigmas=f.sigmas / 10, source=LOOP_SOURCE) for f in honest[:100]]
-    kinds = coverage_by_source(honest + boasting, truth(), 1.0)
+    kinds = coverage(honest + boasting, truth(), 1.0).by_source
     assert kinds.keys() == {"network", LOOP_SOURCE}
     assert kinds[LOOP_SOURCE]["factors"] == 100 and kinds[LOOP_SOURCE]["95"] < 0.2
-    assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0)}
+    assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0).overall}
 
 
 def test_each_factor_is_judged_by_its_own_law() -> None:
     normal, heavy = factors(math.inf), [replace(f, source="essential") for f in factors(4.0)]
-    together, apart = coverage(normal + heavy, truth(), 1.0), coverage_by_source(normal + heavy, truth(), 1.0)
-    for level, share in together.items():
-        assert share == pytest.approx(np.mean([kind[level] for kind in apart.values()]))
+    covered = coverage(normal + heavy, truth(), 1.0)
+    for level, ratio in covered.overall.items():
+        assert ratio == pytest.approx(np.mean([kind[level] for kind in covered.by_source.values()]))
+
+
+def test_each_factor_is_whitened_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    whiten, counts = evaluation_of_coverage.whitened_squared, []
+
+    def counting(relative_poses: list[RelativePose], T_world_camera: FloatArray) -> FloatArray:
+        counts.append(len(relative_poses))
+        return whiten(relative_poses, T_world_camera)
+
+    monkeypatch.setattr(evaluation_of_coverage, "whitened_squared", counting)
+    coverage(factors(math.inf), truth(), 1.0)
+    assert counts == [COUNT - 1]

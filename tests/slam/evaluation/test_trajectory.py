@@ -162,6 +162,23 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
     assert errors["7dof"] is None
     assert (errors["first"] or 0.0) > 1.0
     assert metrics["align"]["first"]["rpe_trans_m"] == pytest.approx(1.0)
+    snippets = metrics["snippet5"]
+    assert snippets["ate_mean"] is None and snippets["ate_std"] is None
+    assert "the reference does not move" in snippets["ate_mean_reason"]
+    assert snippets["re_mean"] > 0 and snippets["count"] == 16  # rotations have no scale
+    direct = trajectory_metrics(
+        trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))), SnippetErrors(0.0, 0.0, 0.3, 0.4, 5)
+    )
+    assert direct["snippet5"]["ate_mean"] is None and direct["snippet5"]["re_mean"] == 0.3
+
+
+def test_two_trajectories_that_stand_still() -> None:
+    still = trajectory(np.tile(drive(3)[2], (20, 1, 1)))
+    metrics = trajectory_metrics(still, still)
+    check_shape(metrics)
+    assert metrics["align"]["6dof"]["ate_rmse_m"] == pytest.approx(0.0, abs=1e-12)
+    assert metrics["align"]["7dof"]["ate_rmse_m"] is None and metrics["snippet5"]["ate_mean"] is None
+    assert metrics["evo"]["difference"] is None
 
 
 def test_a_straight_line_is_measured_though_evo_refuses_it() -> None:

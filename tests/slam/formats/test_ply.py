@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError
-from slam.formats.ply import read_ply_points
+from slam.formats.ply import coloured_ply, read_ply, read_ply_points, rotated, write_ply
 from slam.runtime.imports import import_open3d
 
 POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])
@@ -30,7 +30,14 @@ def test_what_open3d_writes(tmp_path: Path, text: bool) -> None:
 def test_text_with_faces_and_no_colours(tmp_path: Path) -> None:
     lines = ["ply", "format ascii 1.0", "comment by hand", "element vertex 2"]
     lines += [f"property float {axis}" for axis in "xyz"]
-    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", "0 0.5 1", "1.25 -2 3", "2 0 1"]
+    lines += [
+        "element face 1",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "0 0.5 1",
+        "1.25 -2 3",
+        "3 0 1 1",
+    ]
     (tmp_path / "c.ply").write_text("\n".join(lines) + "\n")
     points, colours = read_ply_points(tmp_path / "c.ply")
     np.testing.assert_allclose(points, POINTS)
@@ -50,3 +57,55 @@ def test_a_cloud_that_breaks_off_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "c.ply").write_bytes(header.encode() + POINTS.tobytes())
     with pytest.raises(RunError, match="no PLY that can be read"):
         read_ply_points(tmp_path / "c.ply")
+
+
+TRIANGLES = np.array([[0, 1, 0]])
+NORMALS = np.tile([0.0, 0.6, 0.8], (2, 1))
+
+
+@pytest.mark.parametrize("triangles", [None, TRIANGLES])
+def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles: np.ndarray | None) -> None:
+    path = tmp_path / "c.ply"
+    write_ply(path, coloured_ply(POINTS, NORMALS, COLOURS / 255, triangles))
+    ply = read_ply(path)
+    np.testing.assert_array_equal(ply.columns(("x", "y", "z")), POINTS)
+    np.testing.assert_array_equal(ply.columns(("nx", "ny", "nz")), NORMALS)
+    np.testing.assert_array_equal(read_ply_points(path)[1], COLOURS)
+    o3d = import_open3d()
+    if triangles is None:
+        assert ply.triangles is None
+        np.testing.assert_array_equal(np.asarray(o3d.io.read_point_cloud(str(path)).points), POINTS)
+    else:
+        np.testing.assert_array_equal(ply.triangles, triangles)
+        np.testing.assert_array_equal(np.asarray(o3d.io.read_triangle_mesh(str(path)).triangles), triangles)
+
+
+def test_turning_turns_points_and_normals_and_keeps_the_rest() -> None:
+    R = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    ply = coloured_ply(POINTS, NORMALS, COLOURS / 255, TRIANGLES)
+    turned = rotated(ply, R)
+    np.testing.assert_allclose(turned.columns(("x", "y", "z")), POINTS @ R.T)
+    np.testing.assert_allclose(turned.columns(("nx", "ny", "nz")), NORMALS @ R.T)
+    assert turned.triangles is TRIANGLES and (turned.vertices["green"] == ply.vertices["green"]).all()
+    np.testing.assert_array_equal(ply.columns(("x", "y", "z")), POINTS)
+
+
+@pytest.mark.parametrize("triangles", [None, TRIANGLES])
+def test_no_shorter_and_no_longer_file_is_whole(tmp_path: Path, triangles: np.ndarray | None) -> None:
+    path = tmp_path / "c.ply"
+    write_ply(path, coloured_ply(POINTS, NORMALS, COLOURS / 255, triangles))
+    whole = path.read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(RunError, match="no PLY that can be read"):
+            read_ply(path)
+    path.write_bytes(whole + b"1")
+    with pytest.raises(RunError, match="more in it than its header says"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("triangles", [[[0, 1, 2]], [[0, -1, 1]]])
+def test_triangles_of_vertices_that_are_not_there_are_refused(tmp_path: Path, triangles: list[list[int]]) -> None:
+    write_ply(tmp_path / "c.ply", coloured_ply(POINTS, NORMALS, COLOURS / 255, np.array(triangles)))
+    with pytest.raises(RunError, match="a vertex that does not exist"):
+        read_ply(tmp_path / "c.ply")

@@ -169,7 +169,7 @@ def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun
         go_on(continues=tmp_path)
     bare = Path(shutil.copytree(begun.path, tmp_path / "bare"))
     (bare / DRIVE).write_bytes((bare / DRIVE).read_bytes()[:-1000])
-    with pytest.raises(SlamError, match=r"drive.zip is missing or damaged"):
+    with pytest.raises(SlamError, match=r"drive.zip is damaged"):
         go_on(continues=bare)
     (bare / DRIVE).unlink()
     with pytest.raises(SlamError, match=r"cannot be continued: it has no drive.zip"):
@@ -242,5 +242,5 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")
-    with pytest.raises(SlamError, match="missing or damaged"):
+    with pytest.raises(SlamError, match="is missing"):
         live(kitti_root).resume(tmp_path / "none.zip")

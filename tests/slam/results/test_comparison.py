@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
 from slam.errors import RunError
+from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
 from slam.results.folder import RunFolder
 
 MakeRun = Callable[..., RunFolder]
@@ -45,6 +45,14 @@ def test_a_failed_run_keeps_its_place(make_run: MakeRun) -> None:
     text = printed([make_run("good"), make_run("bad", failed)])
     assert "bad failed: no motion [bold]between[/bold] frames" in text
     assert "0.870" in text
+
+
+@pytest.mark.parametrize(("status", "word"), [("failed", "failed"), ("estimated", "did not end")])
+def test_numbers_of_a_run_that_did_not_end_are_shown_with_its_reason(
+    make_run: MakeRun, make_metrics: MakeMetrics, status: str, word: str
+) -> None:
+    text = printed([make_run("early", make_metrics() | {"status": status, "reason": "no space left"})])
+    assert "0.870" in text and word in text and f"early {word}: no space left" in text
 
 
 def test_json_holds_the_objects_of_metrics_json(make_run: MakeRun, make_metrics: MakeMetrics) -> None:

@@ -9,23 +9,14 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError
-from slam.results.export import R_UP_WORLD, export
+from slam.formats.ply import read_ply_points
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
+from slam.results.export import R_UP_WORLD, export
 from slam.results.folder import RunFolder
-from slam.se3 import FloatArray
 from slam.trajectory import read_trajectory
 
 MakeRun = Callable[..., RunFolder]
-
-
-def rotate_ply(source: Path, target: Path, R_up_world: FloatArray) -> None:
-    """Turns the vertex lines of the fixture's ASCII PLY."""
-    lines = source.read_text().splitlines()
-    start = lines.index("end_header") + 1
-    vertices = np.array([[float(word) for word in line.split()] for line in lines[start : start + 3]])
-    turned = [" ".join(f"{value:g}" for value in row) for row in vertices @ R_up_world.T]
-    target.write_text("\n".join([*lines[:start], *turned, *lines[start + 3 :]]) + "\n")
 
 
 def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> None:
@@ -41,17 +32,18 @@ def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> Non
 def test_ply_is_copied_or_turned_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
-    copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down", rotate_ply)
+    copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
     assert copied.read_bytes() == source.read_bytes()
-    turned = export(folder, what, tmp_path / "new" / "b.ply", "z", rotate_ply)
-    assert "0 1 2" in turned.read_text().splitlines()  # the vertex 2 m above the road, (0, -2, 1)
+    turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
+    points, _ = read_ply_points(turned)
+    np.testing.assert_allclose(points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
 
 
 @pytest.mark.parametrize(("name", "format"), [("t.txt", "kitti"), ("t.tum", "tum"), ("t.tum.txt", "tum")])
 def test_trajectory_format_follows_the_name(make_run: MakeRun, tmp_path: Path, name: str, format: str) -> None:
     folder = make_run()
-    written = export(folder, "trajectory", tmp_path / name, "y-down", rotate_ply)
+    written = export(folder, "trajectory", tmp_path / name, "y-down")
     source = folder.path / f"trajectory_optimised.{format}.txt"
     read, original = read_trajectory(written), read_trajectory(source)
     np.testing.assert_allclose(read.T_world_camera, original.T_world_camera, atol=1e-6)
@@ -60,15 +52,15 @@ def test_trajectory_format_follows_the_name(make_run: MakeRun, tmp_path: Path, n
 
 def test_trajectory_with_z_up_turns_the_world_only(make_run: MakeRun, tmp_path: Path) -> None:
     folder = make_run()
-    down = read_trajectory(export(folder, "trajectory", tmp_path / "a.tum", "y-down", rotate_ply))
-    up = read_trajectory(export(folder, "trajectory", tmp_path / "b.tum", "z", rotate_ply))
+    down = read_trajectory(export(folder, "trajectory", tmp_path / "a.tum", "y-down"))
+    up = read_trajectory(export(folder, "trajectory", tmp_path / "b.tum", "z"))
     np.testing.assert_allclose(up.positions[:, 1], down.positions[:, 2], atol=1e-6)
     np.testing.assert_allclose(up.T_world_camera[0, :3, :3], R_UP_WORLD, atol=1e-6)
 
 
 def test_graph_is_copied(make_run: MakeRun, tmp_path: Path) -> None:
     folder = make_run()
-    written = export(folder, "graph", tmp_path / "g.g2o", "y-down", rotate_ply)
+    written = export(folder, "graph", tmp_path / "g.g2o", "y-down")
     assert written.read_bytes() == (folder.path / "graph.g2o").read_bytes()
 
 
@@ -81,7 +73,7 @@ def keep_places(folder: RunFolder) -> None:
 def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up: str) -> None:
     folder = make_run()
     keep_places(folder)
-    written = export(folder, "colmap", tmp_path / "new" / "model", up, rotate_ply)
+    written = export(folder, "colmap", tmp_path / "new" / "model", up)
     assert (written / "cameras.txt").read_text().splitlines()[1] == "1 PINHOLE 416 128 230.0 230.0 207.5 63.5"
     assert len((written / "images.txt").read_text().splitlines()) == 1 + 2 * 300
     third = (written / "points3D.txt").read_text().splitlines()[3]
@@ -96,7 +88,7 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     folder = make_run()
     keep_places(folder)
     (folder.path / "map_cloud.ply").unlink()
-    written = export(folder, "colmap", tmp_path / "model", "y-down", rotate_ply)
+    written = export(folder, "colmap", tmp_path / "model", "y-down")
     assert len((written / "points3D.txt").read_text().splitlines()) == 1
 
 
@@ -120,7 +112,7 @@ def test_errors_are_clear_and_leave_nothing(
     target.mkdir()
     (target / "file").write_text("in the way")
     with pytest.raises(RunError, match=why):
-        export(folder, what, target / name, up, rotate_ply)
+        export(folder, what, target / name, up)
     assert [path.name for path in target.iterdir()] == ["file"]
 
 
@@ -137,4 +129,36 @@ def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: 
     keep_places(folder)
     (folder.path / missing).unlink()
     with pytest.raises(RunError, match=f"has no {missing}"):
-        export(folder, what, tmp_path / "out.ply", "y-down", rotate_ply)
+        export(folder, what, tmp_path / "out.ply", "y-down")
+
+
+def cut(path: Path, at: int) -> None:
+    path.write_bytes(path.read_bytes()[:at])
+
+
+@pytest.mark.parametrize("up", ["y-down", "z"])
+@pytest.mark.parametrize("what", ["mesh", "cloud"])
+def test_a_map_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path, what: str, up: str) -> None:
+    folder = make_run()
+    cut(folder.path / f"map_{what}.ply", -12)
+    with pytest.raises(RunError, match=rf"map_{what}\.ply is no PLY that can be read"):
+        export(folder, what, tmp_path / "out.ply", up)
+    assert not (tmp_path / "out.ply").exists()
+
+
+@pytest.mark.parametrize("at", [-3, -20, 30])
+def test_a_graph_that_is_cut_short_is_not_exported(make_run: MakeRun, tmp_path: Path, at: int) -> None:
+    folder = make_run()
+    cut(folder.path / "graph.g2o", at)
+    with pytest.raises(RunError, match=r"graph\.g2o is no pose graph"):
+        export(folder, "graph", tmp_path / "out.g2o", "y-down")
+    assert not (tmp_path / "out.g2o").exists()
+
+
+def test_a_trajectory_that_lacks_rows_is_not_exported(make_run: MakeRun, tmp_path: Path) -> None:
+    folder = make_run()
+    path = folder.path / "trajectory_optimised.tum.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:200]) + "\n")
+    with pytest.raises(RunError, match=r"trajectory_optimised\.tum\.txt is damaged: it has 199 rows for 300 frames"):
+        export(folder, "trajectory", tmp_path / "out.txt", "y-down")
+    assert not (tmp_path / "out.txt").exists()

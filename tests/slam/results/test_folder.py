@@ -11,6 +11,7 @@ import pytest
 
 from slam.errors import RunError
 from slam.results.folder import RunFolder
+from slam.trajectory import Trajectory
 
 MakeRun = Callable[..., RunFolder]
 
@@ -23,11 +24,88 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
     assert (tmp_path / "results" / "latest").resolve() == second.path.resolve()
 
 
-def test_output_is_used_itself_and_an_old_run_in_it_is_cleared(make_run: MakeRun) -> None:
-    old = make_run("mine")
-    new = RunFolder.create(old.path, old.path.parent, "sim")
-    assert new.path == old.path
-    assert list(new.path.iterdir()) == []
+def begin(output: Path) -> RunFolder:
+    """A new run into ``output``, as far as it goes before it has a trajectory."""
+    folder = RunFolder.create(output, output.parent, "sim")
+    folder.write_metrics({"schema": 1, "status": "running", "provenance": {}})
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_an_earlier_run_stays_until_the_new_one_takes_its_place(make_run: MakeRun) -> None:
+    old = make_run("mine").path
+    (old / "notes.txt").write_text("what I saw")
+    before = contents(old)
+    new = begin(old)
+    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    assert new.path == old / "unfinished" and contents(old) == before
+    new.publish()
+    assert new.path == old and RunFolder.open(old).metrics()["status"] == "running"
+    own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
+    assert {path.name for path in old.iterdir()} == {*own, "notes.txt"}
+    new.publish()
+    assert {path.name for path in old.iterdir()} == {*own, "notes.txt"}
+
+
+def test_a_run_without_trajectories_is_replaced_at_once_with_what_was_half_written(tmp_path: Path) -> None:
+    begin(tmp_path / "mine")
+    (tmp_path / "mine" / ".12.34.partial.map_mesh.ply").write_text("ply")
+    (tmp_path / "mine" / ".12.34.partial.thesis.tex").write_text("of somebody else")
+    new = RunFolder.create(tmp_path / "mine", tmp_path, "sim")
+    assert new.path == tmp_path / "mine"
+    assert [path.name for path in new.path.iterdir()] == [".12.34.partial.thesis.tex"]
+
+
+def test_an_unfinished_run_goes_with_the_run_beside_it(make_run: MakeRun) -> None:
+    old = make_run("mine").path
+    assert begin(old).path == begin(old).path == old / "unfinished"
+    for path in old.glob("trajectory_*"):
+        path.unlink()
+    assert begin(old).path == old and [path.name for path in old.iterdir()] == ["metrics.json"]
+
+
+def test_something_else_called_unfinished_is_left_alone(make_run: MakeRun) -> None:
+    old = make_run("mine").path
+    (old / "unfinished").mkdir()
+    (old / "unfinished" / "thesis.tex").write_text("years of work")
+    before = contents(old)
+    with pytest.raises(RunError, match="unfinished is not empty and holds no run"):
+        begin(old)
+    assert contents(old) == before and (old / "unfinished" / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("config.yaml", "mine: true"),
+        ("metrics.json", '{"accuracy": 0.9}'),
+        ("metrics.json", '{"schema": '),
+        ("metrics.json", "[1]"),
+        ("map_mesh.ply", "ply"),
+        ("run.log", "..."),
+    ],
+)
+def test_files_of_other_programs_are_not_replaced(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RunError, match=r"not empty and holds no run of erfsfm-slam: choose another --output"):
+        RunFolder.create(tmp_path, tmp_path, "sim")
+    assert contents(tmp_path) == {name: text.encode()}
+
+
+def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplog: pytest.LogCaptureFixture) -> None:
+    folder = make_run()
+    RunFolder.open(folder.path)
+    assert caplog.records == []
+    folder.write_metrics({"schema": 1, "status": "failed", "reason": "no space", "provenance": {}})
+    RunFolder.open(folder.path)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{folder.path}: no space: files that are there are whole"
+    ]
+    (folder.path / "metrics.json").unlink()
+    assert RunFolder.open(folder.path).metrics()["status"] == "running"
 
 
 def test_output_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:

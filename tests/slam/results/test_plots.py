@@ -13,8 +13,9 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from slam.evaluation.drift import aligned, segment_drifts
 from slam.errors import RunError
+from slam.evaluation.drift import aligned, segment_drifts
+from slam.results.folder import RunFolder
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -24,7 +25,6 @@ from slam.results.plots import (
     trajectories_of,
     trajectory_figure,
 )
-from slam.results.folder import RunFolder
 from slam.se3 import Similarity, from_rotation_vector
 from slam.trajectory import Trajectory
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from slam.results.report import DepthExample, write_report
 from slam.results.folder import RunFolder
+from slam.results.report import DepthExample, write_report
 from slam.trajectory import Trajectory
 
 MakeRun = Callable[..., RunFolder]

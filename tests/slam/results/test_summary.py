@@ -12,8 +12,8 @@ import pytest
 from slam.results.summary import (
     Provenance,
     as_json,
-    describe_failure,
     describe_sequence,
+    describe_start,
     describe_timing,
     finite,
     null,
@@ -53,12 +53,11 @@ def test_timing() -> None:
     assert timing["stages"] == watch.stages and timing["stages"] is not watch.stages
 
 
-def test_failure_keeps_the_provenance_where_known() -> None:
+def test_a_run_begins_as_running_with_its_provenance() -> None:
     known = Provenance("1", "abc", "erfsfm-slam run", 0, "cpu", "sim", "9f", "MIT", ["simulated/1"], False)
-    failed = describe_failure(known, "no frame 7")
-    assert (failed["status"], failed["reason"], failed["schema"]) == ("failed", "no frame 7", 1)
-    assert failed["provenance"]["trained_on"] == ["simulated/1"]
-    assert describe_failure(None, "x")["provenance"] is None
+    begun = describe_start(known)
+    assert (begun["status"], begun["schema"]) == ("running", 1) and "has not ended" in begun["reason"]
+    assert begun["provenance"]["trained_on"] == ["simulated/1"]
 
 
 def test_not_finite_becomes_null_with_a_reason_at_any_depth() -> None:

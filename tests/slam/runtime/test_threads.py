@@ -1,29 +1,12 @@
-"""A run's libraries compute in the thread that asks, and get their threads back."""
+"""Reading ahead in another thread."""
 
 from __future__ import annotations
 
 from threading import Event
 
-import cv2
 import pytest
-from threadpoolctl import threadpool_info
 
-from slam.runtime.threads import limit_library_threads, read_ahead
-
-
-def test_threads_are_taken_and_given_back_also_after_an_error() -> None:
-    blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(3)
-    try:
-        with pytest.raises(ZeroDivisionError), limit_library_threads():
-            assert cv2.getNumThreads() == 1
-            assert all(pool["num_threads"] == 1 for pool in threadpool_info() if pool["user_api"] == "blas")
-            _ = 1 / 0
-        assert cv2.getNumThreads() == 3
-        assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == blas
-    finally:
-        cv2.setNumThreads(before)
+from slam.runtime.threads import read_ahead
 
 
 def test_one_is_read_while_another_is_used() -> None:

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
+from slam.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
 
 
@@ -38,13 +38,59 @@ def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
     assert sequence.intrinsics.fx < 30 and (sequence.frame(1).image == 10).all()
 
 
+def test_a_gap_in_the_numbers_is_a_gap_in_time(
+    tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    images(tmp_path, ["f17.png", "f18.png", "f21.png", "f22.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == 6
+    assert sequence.stamps == pytest.approx(np.arange(6) / 5)
+    assert [sequence.frame(index).image[0, 0, 0] for index in (0, 1, 4, 5)] == [0, 10, 20, 30]
+    for index, name in ((2, "f19"), (3, "f20")):
+        with pytest.raises(MissingFrameError, match=rf"no image {name}\.png in "):
+            sequence.frame(index)
+    (warning,) = caplog.records
+    assert "2 of 6 frames have no image; the first gap is f19.png to f20.png" in warning.getMessage()
+    with pytest.raises(MissingFrameError):
+        open_sequence(tmp_path, frames="1:4").frame(1)
+
+
+def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
+    images(tmp_path, ["0.png", "1.png", "3.png", "4.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
+    with pytest.raises(MissingFrameError):
+        open_sequence(tmp_path).frame(2)
+
+
+@pytest.mark.parametrize("fps, last", [(50, 202), (5, 60)], ids=["frames", "seconds"])
+def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
+    images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml.replace("fps: 5", f"fps: {fps}"))
+    with pytest.raises(SequenceError, match=rf"no images 5\.png to {last - 1}\.png .*split the recording") as caught:
+        open_sequence(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_brackets_in_a_name(tmp_path: Path, images, camera_yaml: str) -> None:
+    folder = tmp_path / "br[ack]ets"
+    images(folder, ["0.png", "1.png"])
+    (folder / "camera.yaml").write_text(camera_yaml)
+    assert open_sequence(folder).provenance() == ("folder/br[ack]ets[0:2]",)
+
+
+def test_an_unreadable_image_is_heard_as_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
+    images(tmp_path, ["0.png", "1.png", "2.png"])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    (tmp_path / "1.png").write_bytes(b"no image")
+    with pytest.raises(SequenceError, match=r"1\.png cannot be decoded") as caught:
+        open_sequence(tmp_path).frame(1)
+    assert not isinstance(caught.value, MissingFrameError)
+
+
 def test_errors(tmp_path: Path, images, camera_yaml: str) -> None:
     folder = tmp_path / "drive"
-    images(folder / "images", ["0.png", "1.png", "2.png", "4.png"])
-    with pytest.raises(SequenceError, match=r"no image 3\.png"):
-        (folder / "camera.yaml").write_text(camera_yaml)
-        open_sequence(folder, None, None, None)
-    (folder / "images/4.png").unlink()
+    images(folder / "images", ["0.png", "1.png", "2.png"])
     (folder / "camera.yaml").write_text(camera_yaml.replace("width: 40", "width: 44"))
     with pytest.raises(SequenceError, match="are 40x24, but the camera file is for 44x24"):
         open_sequence(folder, None, None, None)

@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
-from slam.sequences.camera_file import CameraFile
+from slam.frames import Intrinsics
 from slam.sequences.undistortion import Undistortion, calibrated
 
 WIDTH, HEIGHT = 320, 240
@@ -25,7 +26,7 @@ def lens(name: str) -> CameraFile:
 def seen_by_lens(points_camera: np.ndarray, camera: CameraFile) -> np.ndarray:
     """Project with OpenCV's own lens model, independently of the code under test."""
     project = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
-    K, D, zero = camera.intrinsics.K, np.array(camera.distortion), np.zeros(3)
+    K, D, zero = Intrinsics.of(camera.pinhole).K, np.array(camera.distortion), np.zeros(3)
     points = points_camera[:, None] if camera.model == "fisheye" else points_camera
     pixels, _ = project(points, zero, zero, K, D)
     return pixels.reshape(-1, 2)
@@ -113,7 +114,7 @@ def test_pinhole_images_pass_untouched() -> None:
     camera = CameraFile(width=40, height=24, fx=30, fy=30, cx=19.5, cy=11.5, fps=5)
     blank = Blank(40, 24)
     images, intrinsics = calibrated(blank, camera, "here")
-    assert images is blank and intrinsics == camera.intrinsics
+    assert images is blank and intrinsics == Intrinsics.of(camera.pinhole)
 
 
 def test_distorted_images_are_read_flat() -> None:

@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 
 from slam.errors import SequenceError
-from slam.sequences import video
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.video import VideoFrames
 
 FRAMES = 90
 FORMATS = {".mp4": "mp4v", ".avi": "MJPG", ".mov": "mp4v", ".mkv": "MJPG"}
@@ -39,35 +37,6 @@ def write_video(path: Path, frames: int = FRAMES) -> Path:
 @pytest.fixture
 def camera_64(camera_yaml: str) -> str:
     return camera_yaml.replace("width: 40", "width: 64").replace("height: 24", "height: 48")
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str) -> None:
-    frames = VideoFrames(write_video(tmp_path / f"a{suffix}"))
-    assert (len(frames), frames.width, frames.height) == (FRAMES, 64, 48)
-    for index in [0, 1, 2, 80, 3, 79, 89, 10, 11, 0, 45]:
-        assert decoded(frames.read(index)) == index
-
-
-def test_uncounted_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video, "_COUNTED_FRAMES", 10)
-    frames = VideoFrames(write_video(tmp_path / "a.avi"))
-    assert len(frames) == FRAMES
-    for index in [70, 3, 60, 89, 0]:
-        assert decoded(frames.read(index)) == index
-
-
-def test_a_seek_that_lands_elsewhere_is_noticed(tmp_path: Path) -> None:
-    frames = VideoFrames(write_video(tmp_path / "a.avi"))
-    frames._times_ms = [time + 1 for time in frames._times_ms]
-    assert decoded(frames.read(50)) == 50
-    assert decoded(frames.read(5)) == 5
-
-
-def test_returned_images_may_be_written(tmp_path: Path) -> None:
-    frames = VideoFrames(write_video(tmp_path / "a.avi"))
-    frames.read(5)[:] = 255
-    assert decoded(frames.read(5)) == 5
 
 
 @pytest.mark.parametrize("by_folder", [False, True])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.storage.cache import Answer, CacheNamespace, DiskCache, fingerprint
+from slam.storage.cache import Answer, CacheNamespace, DiskCache
 
 
 def never() -> Answer:
@@ -48,13 +48,3 @@ def test_every_difference_is_computed(
     other = CacheNamespace(memory, identity)
     (answer,) = other.get_or_compute(kind, given, lambda: (np.ones(1),))
     assert answer == 1 and (other.asked, other.found) == (1, 0)
-
-
-def test_other_code_has_another_fingerprint(tmp_path: Path) -> None:
-    source = tmp_path / "module.py"
-    source.write_text("a = 1")
-    before = fingerprint(source)
-    source.write_text("a = 2")
-    assert fingerprint(source) != before
-    source.write_text("a = 1")
-    assert fingerprint(source) == before

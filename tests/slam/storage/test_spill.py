@@ -28,3 +28,11 @@ def test_a_full_disk_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.TemporaryFile", lambda: Path("/dev/full").open("wb"))  # noqa: SIM115
     with pytest.raises(SlamError, match=r"keyframes cannot be kept in .*No space left.*set TMPDIR"):
         SpillFile().put(np.zeros(100_000))
+
+
+def test_a_file_that_was_cut_short_is_an_error_and_no_garbage() -> None:
+    spill_file = SpillFile()
+    kept = spill_file.put(np.ones((100, 100)))
+    spill_file._file.truncate(5000)
+    with pytest.raises(SlamError, match="cut short \\(5000 of 80000 bytes\\)"):
+        kept.read()

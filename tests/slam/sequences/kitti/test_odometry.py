@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError, SlamError
+from slam.errors import MissingFrameError, SequenceError, SlamError
 from slam.sequences.catalogue import open_sequence
 
 
@@ -104,8 +104,10 @@ def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml
 
 def broken(folder: Path, base: Path, what: str) -> None:
     match what:
-        case "gap":
-            (folder / "image_2/000002.png").unlink()
+        case "unnumbered":
+            (folder / "image_2/000002.png").rename(folder / "image_2/left.png")
+        case "of another size":
+            (folder / "calib.txt").write_text("P2: 45 0 30 0 0 45 18 0 0 0 1 0")
         case "no calib":
             (folder / "calib.txt").unlink()
         case "bad calib":
@@ -130,7 +132,8 @@ def broken(folder: Path, base: Path, what: str) -> None:
 @pytest.mark.parametrize(
     "what, message",
     [
-        ("gap", r"no image 000002\.png in .*image_2"),
+        ("unnumbered", r"left\.png is not named by its number"),
+        ("of another size", r"principal point \(30, 18\) in row P2 is far .* 40x24 images: .*of different sizes"),
         ("no calib", r"no calib\.txt in "),
         ("bad calib", "row P2 has 3 numbers"),
         ("short poses", r"00\.txt has 4 poses for 6 images: .*cut the poses"),
@@ -159,3 +162,50 @@ def test_damage_further_on_is_heard_when_read(tmp_path: Path, odometry) -> None:
         sequence.frame(4)
     with pytest.raises(SequenceError, match="no frame 6 in sequence 00: it has frames 0 to 5"):
         sequence.frame(6)
+
+
+@pytest.fixture
+def gap(tmp_path: Path, odometry) -> Path:
+    """A sequence of frames 1 to 9 without 3, 4 and 8; it drives 1 m a frame, and starts with frame 0 in its files."""
+    folder = odometry(tmp_path, frames=10)
+    for number in (0, 3, 4, 8):
+        (folder / f"image_2/{number:06d}.png").unlink()
+    (folder / "velodyne").mkdir()
+    (folder / "velodyne/000005.bin").write_bytes(b"")
+    return folder
+
+
+def kept(path: Path, numbers: list[int]) -> None:
+    rows = path.read_text().splitlines()
+    path.write_text("".join(f"{rows[number]}\n" for number in numbers))
+
+
+@pytest.mark.parametrize("times", [range(10), range(1, 10), [1, 2, 5, 6, 7, 9], None])
+@pytest.mark.parametrize("poses", [range(10), range(1, 10), [1, 2, 5, 6, 7, 9]])
+def test_missing_numbers_are_missing_frames(
+    tmp_path: Path, gap: Path, caplog: pytest.LogCaptureFixture, times: list[int] | None, poses: list[int]
+) -> None:
+    if times is None:
+        (gap / "times.txt").unlink()
+    else:
+        kept(gap / "times.txt", times)
+    kept(tmp_path / "poses/00.txt", poses)
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == len(sequence.stamps) == 9
+    assert np.diff(sequence.stamps) == pytest.approx(0.1)
+    assert sequence.reference is not None
+    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(9), [0, 0, 1]), abs=1e-9)
+    assert [sequence.frame(row).image[0, 0, 0] for row in (0, 1, 4, 8)] == [10, 20, 50, 90]
+    assert sequence.provenance() == ("kitti_odometry/00[1:10]",)
+    assert sequence.scan_path(4) == gap / "velodyne/000005.bin"
+    with pytest.raises(MissingFrameError, match=r"no image 000008\.png in .*image_2"):
+        sequence.frame(7)
+    said = [record.getMessage() for record in caplog.records if "no image" in record.getMessage()]
+    assert len(said) == 1
+    assert "3 of 9 frames have no image; the first gap is 000003.png to 000004.png" in said[0]
+
+
+def test_other_counts_than_any_numbering_has(tmp_path: Path, gap: Path) -> None:
+    kept(gap / "times.txt", [1, 2, 5, 6, 7])
+    with pytest.raises(SequenceError, match=r"times\.txt has 5 rows for 6 images"):
+        open_sequence(tmp_path)

@@ -1,0 +1,105 @@
+"""``camera.yaml``: the calibration of one's own camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from erfsfm.errors import DataError, ErfsfmError
+from erfsfm.readers.pinhole import Pinhole, impossible, require_plausible
+from erfsfm.yaml_file import read_yaml
+
+CAMERA_FILE = "camera.yaml"
+_COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+
+
+class CameraFile(BaseModel):
+    """The keys of ``camera.yaml``; (0, 0) is the centre of the top-left pixel."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    width: int = Field(gt=0, description="image width, pixels")
+    height: int = Field(gt=0, description="image height, pixels")
+    fx: float = Field(gt=0, description="focal length along u, pixels")
+    fy: float = Field(gt=0, description="focal length along v, pixels")
+    cx: float = Field(description="principal point u, pixels")
+    cy: float = Field(description="principal point v, pixels")
+    fps: float = Field(gt=0, description="frames a second")
+    camera_height_m: float | Literal["unknown"] | None = Field(
+        default=None, description="height of the camera above the road, metres, or unknown"
+    )
+    model: Literal["pinhole", "opencv", "fisheye"] = "pinhole"
+    distortion: tuple[float, ...] = Field(
+        default=(), description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4"
+    )
+    source: str | None = Field(default=None, description="a note on where the numbers come from")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not isinstance(self.camera_height_m, str | None) and not self.camera_height_m > 0:
+            raise ValueError(f"camera_height_m: must be greater than 0 or 'unknown', is {self.camera_height_m}")
+        problem = impossible(self.pinhole)
+        if problem is not None:
+            raise ValueError(problem)
+        allowed = _COEFFICIENTS.get(self.model)
+        if allowed is None and any(self.distortion):
+            raise ValueError("distortion: needs model opencv or fisheye; a pinhole has none")
+        if allowed is not None and len(self.distortion) not in allowed:
+            counts = " or ".join(map(str, allowed))
+            raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
+        return self
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The camera matrix as written, before any undistortion."""
+        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether images must be undistorted (a fisheye without coefficients still is)."""
+        return self.model == "fisheye" or any(self.distortion)
+
+    def height_or(self, default: float | None) -> float | None:
+        """The camera's height in metres: None where unknown, ``default`` where the file does not say."""
+        if self.camera_height_m is None:
+            return default
+        return None if isinstance(self.camera_height_m, str) else self.camera_height_m
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Read and check a ``camera.yaml``; an unlikely camera is warned of.
+
+    Raises:
+        DataError: naming the file and the key that is missing, unknown, written twice or wrong.
+    """
+    try:
+        content = read_yaml(path)
+    except ErfsfmError as error:
+        raise DataError(str(error)) from error
+    if not isinstance(content, dict):
+        keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
+        raise DataError(f"{path} holds no keys: a camera file needs {keys}")
+    try:
+        camera = CameraFile.model_validate(content)
+    except ValidationError as error:
+        raise DataError(f"{path}: {_complaints(error)}") from error
+    require_plausible(camera.pinhole, str(path))
+    return camera
+
+
+def _complaints(error: ValidationError) -> str:
+    """Every complaint of a validation, on one line, key first."""
+    lines = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"][:1])
+        if item["type"] == "missing":
+            lines.append(f"key {key} is missing")
+        elif item["type"] == "extra_forbidden":
+            lines.append(f"key {key} is unknown (known: {', '.join(CameraFile.model_fields)})")
+        elif not key:
+            lines.append(str(item["ctx"]["error"]))
+        else:
+            lines.append(f"{key}: {item['msg'][0].lower() + item['msg'][1:]}, is {item['input']!r}")
+    return "; ".join(dict.fromkeys(lines))

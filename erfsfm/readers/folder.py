@@ -1,0 +1,31 @@
+"""Folders of a user's own images: where in them the images are, and what the recording is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from erfsfm.errors import DataError
+from erfsfm.readers.images import has_images
+
+IMAGE_FOLDERS = ("images", "image_2", "image_02", "image_0", "image_00", "rgb", "data")  # never a name of a drive
+
+
+def image_folder(folder: Path) -> Path | None:
+    """The folder that holds the images: itself, or its one sub-folder of a usual name.
+
+    Raises:
+        DataError: several sub-folders qualify.
+    """
+    if has_images(folder):
+        return folder
+    found = [folder / name for name in IMAGE_FOLDERS if has_images(folder / name)]
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise DataError(f"{folder} has images in {names}: give one of these folders as --dataset")
+    return found[0] if found else None
+
+
+def recording_name(folder: Path) -> str:
+    """The folder's name, or its parent's where the folder is only called ``images`` or the like."""
+    folder = folder.absolute()
+    return folder.parent.name if folder.name in IMAGE_FOLDERS and folder.parent.name else folder.name

@@ -1,0 +1,126 @@
+"""Image files: which a folder holds, read completely or not at all, and the one way of resizing them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.errors import DataError
+
+Image = NDArray[np.uint8]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+_PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
+_TWELVE_BITS = 4096
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``).
+
+    Raises:
+        DataError: two files differ in their suffix alone.
+    """
+    if not folder.is_dir():
+        return []
+    paths = [path for path in folder.iterdir() if _is_image(path)]
+    doubles = [stem for stem, count in Counter(p.stem for p in paths).items() if count > 1]
+    if doubles:
+        raise DataError(f"{folder} has image {min(doubles)} in two formats: keep one file a frame")
+    return sorted(paths, key=natural_key)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether a folder holds an image file, without listing all of it."""
+    return folder.is_dir() and any(_is_image(path) for path in folder.iterdir())
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """A sort key that compares runs of digits as numbers; ``img2`` comes before ``img10``."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+
+
+def read_image(path: Path) -> Image:
+    """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
+
+    16-bit images keep their upper eight bits. Where all their values lie under 4096 they are refused: cameras of 12
+    bits are often stored so, and the upper eight bits of that are nearly black.
+
+    Raises:
+        DataError: missing, empty, truncated, no image, or 12-bit data in 16 bits; one line.
+    """
+    data = _complete_bytes(path)
+    if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH] == 16:
+        most = int(_decode(path, data, cv2.IMREAD_UNCHANGED).max())
+        if 0 < most < _TWELVE_BITS:
+            raise DataError(
+                f"image {path} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
+                f"8 bits; convert the images to 8 bits, or multiply their values by 16"
+            )
+    return np.asarray(cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_values(path: Path) -> NDArray[Any]:
+    """An image's values as stored, such as a 16-bit depth map ``(H, W)``.
+
+    Raises:
+        DataError: missing, empty, truncated or no image; one line.
+    """
+    return _decode(path, _complete_bytes(path), cv2.IMREAD_UNCHANGED)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Height and width of an image file; raises as `read_image`."""
+    height, width = read_image(path).shape[:2]
+    return height, width
+
+
+def resize_image(image: Image, height: int, width: int) -> Image:
+    """An image ``(H, W, 3)`` at ``height x width``, without crop: the one way in training and in inference."""
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = image.shape[0] >= height and image.shape[1] >= width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width, height), interpolation=method))
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def _complete_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"cannot read image {path}: {error.strerror}") from error
+    if not data:
+        raise DataError(f"image {path} is empty: copy it again")
+    if not _is_complete(data):
+        raise DataError(f"image {path} is truncated at {len(data)} bytes: copy it again")
+    return data
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey."""
+    if data.startswith(_JPEG_START):
+        return data.rfind(_JPEG_END) > data.rfind(_JPEG_SCAN)
+    if data.startswith(_PNG_START):
+        return data.rfind(_PNG_END) > 0
+    return True
+
+
+def _decode(path: Path, data: bytes, flags: int) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise DataError(f"image {path} cannot be decoded: {error.err or error}") from error
+    if image is None:
+        raise DataError(f"image {path} cannot be decoded: it is damaged or not an image; copy it again")
+    return np.asarray(image)

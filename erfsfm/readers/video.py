@@ -1,0 +1,117 @@
+"""The frames of a video file: decoded in order, with exact access to any of them."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from erfsfm.errors import DataError
+from erfsfm.readers.images import Image
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
+_COUNTED_FRAMES = 3000
+_CACHED_FRAMES = 32
+_SKIPPED_FRAMES = 30
+
+
+class VideoFrames:
+    """The frames of a video, in any order.
+
+    A seek in compressed video may land beside the frame asked for, so where it lands is checked against
+    the time at which that frame was seen before; else the video is decoded again from its start. The last
+    frames stay in memory. Not for use from several threads.
+    """
+
+    def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
+        """Open a video; one that announces no more than ``counted_frames`` is decoded once to count them.
+
+        Raises:
+            DataError: it cannot be decoded.
+        """
+        self._path = path
+        self._next = 0
+        self._times_ms: list[float] = []
+        self._capture = _capture(path)
+        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self._frames = announced if announced > counted_frames else self._count()
+        if self._frames <= 0:
+            raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
+        if 0 < announced != self._frames:
+            logger.warning("video %s announces %d frames and has %d: it may be cut off", path, announced, self._frames)
+        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
+        self.height, self.width = self._cached(0).shape[:2]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self._frames
+
+    def read(self, index: int) -> Image:
+        """One frame ``(height, width, 3)`` uint8 RGB.
+
+        Raises:
+            DataError: the video breaks off before it.
+        """
+        return self._cached(index).copy()
+
+    def _count(self) -> int:
+        while self._grab():
+            pass
+        return self._next
+
+    def _decode(self, index: int) -> Image:
+        if not 0 <= index - self._next <= _SKIPPED_FRAMES and not self._seek(index):
+            self._rewind()
+        while self._next <= index:
+            if not self._grab():
+                raise DataError(
+                    f"video {self._path} breaks off at frame {self._next} of {self._frames}: use the frames "
+                    f"0:{self._next}, or copy it again"
+                )
+        read, image = self._capture.retrieve()
+        if not read:
+            raise DataError(f"video {self._path} frame {index} cannot be decoded: copy it again")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def _grab(self) -> bool:
+        """Go to the next frame and note its time."""
+        if not self._capture.grab():
+            return False
+        if self._next == len(self._times_ms):
+            self._times_ms.append(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        self._next += 1
+        return True
+
+    def _seek(self, index: int) -> bool:
+        """Go to just before a frame seen before; False where the seek landed elsewhere."""
+        if not 0 < index < len(self._times_ms):
+            return False
+        self._capture.set(cv2.CAP_PROP_POS_FRAMES, index - 1)
+        if not self._capture.grab() or self._capture.get(cv2.CAP_PROP_POS_MSEC) != self._times_ms[index - 1]:
+            return False
+        self._next = index
+        return True
+
+    def _rewind(self) -> None:
+        self._capture.release()
+        self._capture, self._next = _capture(self._path), 0
+
+
+def list_videos(folder: Path) -> list[Path]:
+    """The video files directly in a folder."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file())
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise DataError(
+            f"video {path} cannot be opened: it is damaged or of an unknown format; copy it again, or convert it to "
+            f"mp4 (H.264)"
+        )
+    return capture

@@ -1,0 +1,96 @@
+"""The output folder of a training run: whose it is, and what of a run it holds already."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import torch
+
+from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
+from erfsfm.errors import ConfigError, TrainingError
+from erfsfm.files import write_atomically
+
+CONFIG = "config.yaml"
+_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # what a run leaves that failed before its first weights
+
+
+class OutputFolder:
+    """Where one run writes; a folder that holds anything but a run of ours is never touched."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoint = path / "checkpoints" / "last.ckpt"
+
+    def require_free(self) -> None:
+        """Accept a folder that is new, empty, or of a run that failed before its first checkpoint.
+
+        Raises:
+            TrainingError: a run with weights, or files that no training wrote; one line.
+        """
+        if not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise TrainingError(f"--output {self.path} is a file, not a folder: choose another --output")
+        if self.checkpoint.is_file() or (self.path / "model.yaml").is_file():
+            raise TrainingError(f"{self.path} holds a run already: go on with --resume or choose another --output")
+        names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name}
+        foreign = sorted(names - _BEGUN)
+        if not foreign and names and not self._has_our_config():
+            foreign = [CONFIG if CONFIG in names else min(names)]
+        if foreign:
+            raise TrainingError(
+                f"{self.path} holds files that 'erfsfm train' did not write ({foreign[0]}): choose a new or empty "
+                "--output; nothing was changed"
+            )
+
+    def resumable_steps(self, config: ExperimentConfig) -> int:
+        """Steps done at the last checkpoint.
+
+        Raises:
+            TrainingError: nothing to resume, or a damaged checkpoint; one line.
+            ConfigError: the run began with another network or optimiser; one line.
+        """
+        written = self.path / CONFIG
+        for needed in (self.checkpoint, written):
+            if not needed.is_file():
+                raise TrainingError(
+                    f"nothing to resume in {self.path}: no {needed.relative_to(self.path)}; start without --resume"
+                )
+        steps = _steps_of(self.checkpoint)
+        begun = load_experiment(written)
+        if begun.network != config.network:
+            raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
+        if begun.training.optimiser != config.training.optimiser:
+            raise ConfigError(
+                f"{written} began with training.optimiser {begun.training.optimiser}, whose state another cannot take "
+                f"over; got {config.training.optimiser}: resume with the same one, or start anew from its weights"
+            )
+        return steps
+
+    def write_config(self, config: ExperimentConfig) -> None:
+        """Write the complete configuration of the run."""
+        write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
+
+    def _has_our_config(self) -> bool:
+        """Whether ``config.yaml`` is what `write_config` writes: complete, which nobody writes by hand."""
+        try:
+            return dump_yaml(load_experiment(self.path / CONFIG)) == (self.path / CONFIG).read_text()
+        except ConfigError:
+            return False
+
+
+def _steps_of(checkpoint: Path) -> int:
+    """Steps done at a checkpoint. Only tensors and plain values are read: no code in it can run."""
+    try:
+        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        missing = {"global_step", "state_dict", "optimizer_states", "loops"} - set(state)
+        if missing:
+            raise KeyError(*sorted(missing))
+        if {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
+            raise KeyError("depth_net")
+        return int(state["global_step"])
+    except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise TrainingError(
+            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew in another --output"
+        ) from error

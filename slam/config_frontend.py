@@ -1,0 +1,277 @@
+"""Settings of the front end: the pose network's factors, image geometry, gaps, step lengths, LiDAR and scale."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, PositiveInt, model_validator
+
+from erfsfm.config_tree import Section
+
+ScaleMode = Literal["none", "camera-height", "lidar", "reference"]
+
+
+class FrontendConfig(Section):
+    """Factors from the pose network's snippet poses and their noise, see ``frontend/network_factors.py``."""
+
+    use: Literal["calibrated", "gaps", "always"] = Field(
+        default="calibrated",
+        description="gaps: only where image geometry fails; calibrated: always with a noise.yaml, else gaps",
+    )
+    rotation_sigma_deg: float = Field(
+        default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step, degrees, without noise.yaml"
+    )
+    translation_relative_sigma: float = Field(
+        default=0.1, gt=0, le=10, description="translation sigma over the length of the step, without noise.yaml"
+    )
+    translation_floor_ratio: float = Field(
+        default=0.05,
+        gt=0,
+        le=10,
+        description="least translation sigma over the median one-frame step, without noise.yaml",
+    )
+    noise_steps: int = Field(
+        default=20,
+        ge=1,
+        description="steps measured by image geometry too, from which on the noise is estimated on this sequence",
+    )
+    student_t_dof: float = Field(
+        default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
+    )
+
+
+class GeometryConfig(Section):
+    """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
+
+    enabled: bool = Field(default=True, description="measure relative poses by image geometry, beside the pose network")
+    steps: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1, description="frame distances to measure")
+    max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
+    corner_quality: float = Field(
+        default=0.003, gt=0, lt=1, description="least corner strength over that of the strongest corner"
+    )
+    corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
+    window_px: int = Field(default=11, ge=5, le=63, description="side of the Lucas-Kanade window, pixels")
+    wide_window_px: int = Field(
+        default=31, ge=5, le=63, description="side of the window after most tracks were lost, pixels"
+    )
+    few_corners: int = Field(
+        default=60,
+        ge=0,
+        description="number of tracks below which tracking is repeated with the wide window and equalised exposure",
+    )
+    pyramid_levels: int = Field(default=4, ge=0, le=8, description="image pyramid levels above the full image")
+    predicted_flow: bool = Field(
+        default=True,
+        description="start tracking at the optical flow predicted from learned depth and the previous motion",
+    )
+    rotation_baseline_steps: int = Field(
+        default=2,
+        ge=1,
+        le=3,
+        description="frames between which relative rotation is also measured directly; 1: neighbours alone",
+    )
+    dynamic_mask_sharpness: float = Field(
+        default=4.0,
+        ge=0,
+        description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
+    )
+    forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward tracking error, pixels")
+    inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier, pixels")
+    reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier, pixels")
+    along_px: float = Field(
+        default=0.4, gt=0, description="corner noise along the epipolar line, pixels, besides that of learned depth"
+    )
+    early_exit_inlier_ratio: float = Field(
+        default=0.75, ge=0, le=1, description="inlier ratio at which RANSAC stops early"
+    )
+    depth_relative_sigma: float = Field(
+        default=0.2, gt=0, description="least relative sigma of learned depth along an epipolar line"
+    )
+    direction_prior_sigma_deg: float = Field(
+        default=8.0, gt=0, description="least sigma of the motion prior on the translation direction, degrees"
+    )
+    heading_prior_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the heading prior, degrees")
+    min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
+    still_flow_px: float = Field(
+        default=0.3, ge=0, description="median optical flow below which the camera stands still, pixels"
+    )
+    min_parallax_px: float = Field(
+        default=0.8, gt=0, description="least median optical flow that remains after rotation is removed, pixels"
+    )
+    min_point_parallax_px: float = Field(
+        default=2.0, gt=0, description="least parallax of a point used for step lengths, pixels"
+    )
+    max_depth_heights: float = Field(default=30.0, gt=0, description="largest depth used, in camera heights")
+    rotation_floor_deg: float = Field(default=0.002, gt=0, description="least rotation sigma, degrees")
+    direction_floor_deg: float = Field(
+        default=0.045, gt=0, description="least sigma of the translation direction, degrees"
+    )
+    jitter_rotation_ratio: float = Field(
+        default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
+    )
+    jitter_direction_ratio: float = Field(
+        default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
+    )
+    turn_rotation_ratio: float = Field(
+        default=0.015, ge=0, description="rotation sigma over the rotation angle of the step"
+    )
+    neighbour_rotation_ratio: float = Field(
+        default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
+    )
+    neighbour_direction_ratio: float = Field(
+        default=1.0, ge=0, description="sigma of the translation direction over the difference to neighbouring steps"
+    )
+    student_t_dof: float = Field(
+        default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
+    )
+
+
+class RoadConfig(Section):
+    """Step lengths from the homography of the ground plane, see ``frontend/scale/road_homography.py``."""
+
+    enabled: bool = Field(
+        default=True, description="measure steps by the homography of the ground plane, in camera heights"
+    )
+    far_heights: float = Field(default=9.0, gt=0, description="farthest ground used, in camera heights")
+    half_width_heights: float = Field(
+        default=1.0, gt=0, description="half the width of the strip of ground used, in camera heights"
+    )
+    near_heights: float = Field(
+        default=4.5,
+        gt=0,
+        description="farthest ground of the short strip, used behind a vehicle ahead, in camera heights",
+    )
+    near_half_width_heights: float = Field(
+        default=2.0, gt=0, description="half the width of the short strip, in camera heights"
+    )
+    near_relative_sigma: float = Field(
+        default=0.1, gt=0, description="least relative sigma of a length from the short strip"
+    )
+    points: int = Field(default=4000, ge=100, description="approximate number of aligned pixels")
+    min_points: int = Field(default=300, ge=50, description="least number of aligned pixels of a measurement")
+    tilt_sigma_deg: float = Field(
+        default=0.1, gt=0, description="sigma of the ground plane's tilt against the direction of motion, degrees"
+    )
+    max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="largest tilt of the ground plane, degrees")
+    min_correlation: float = Field(default=0.3, ge=0, le=1, description="least correlation of the aligned pixels")
+    min_gain: float = Field(
+        default=0.25,
+        ge=0,
+        le=1,
+        description="least part of the photometric error without motion that the alignment removes",
+    )
+    relative_sigma: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
+    tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma of a length per radian of estimated tilt")
+
+
+class LengthConfig(Section):
+    """Joint estimation of all step lengths, see ``frontend/scale/step_lengths.py``; sigmas are of logarithms."""
+
+    ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of the ratio of two consecutive steps")
+    ratio_widening: float = Field(
+        default=1.5, gt=0, description="factor on the sigma of a ratio measured by triangulated points"
+    )
+    learned_sigma: float = Field(default=0.1, gt=0, description="sigma of a length by learned depth")
+    unit_walk_sigma: float = Field(
+        default=0.003, gt=0, description="sigma per step of the random walk of learned depth's scale"
+    )
+    unit_sigma: float = Field(default=0.2, gt=0, description="sigma of that scale as the learned ground plane gives it")
+    max_contradiction: float = Field(
+        default=2.5, gt=1, description="largest factor between a measured length and that by learned depth"
+    )
+    outlier_sigmas: float = Field(
+        default=2.0, gt=0, description="residual at which the robust weight of a measurement is one half, sigmas"
+    )
+    correlated_widening: float = Field(
+        default=1.5, gt=0, description="factor on the sigmas in the pose graph, for errors correlated along the road"
+    )
+
+
+class GapsConfig(Section):
+    """Gap interpolation over unusable frames, see ``frontend/gap_interpolation.py`` and ``frontend/image_gate.py``."""
+
+    enabled: bool = Field(
+        default=True,
+        description="interpolate over unusable frames; false: they are measured like others and may end a run",
+    )
+    blank_contrast: float = Field(
+        default=3.0, ge=0, description="standard deviation of grey levels below which a frame is blank"
+    )
+    noise_contrast: float = Field(
+        default=0.3,
+        ge=0,
+        lt=1,
+        description="contrast after blurring over contrast before, below which a frame is noise",
+    )
+    min_correlation: float = Field(default=0.2, ge=-1, le=1, description="least correlation with the frames before")
+    repeat_difference: float = Field(
+        default=0.1,
+        ge=0,
+        description="largest difference of a copy encoded again from its image, over the mean image gradient",
+    )
+    max_unread_frames: int = Field(
+        default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
+    )
+    rotation_sigma_deg: float = Field(
+        default=2.0, gt=0, le=90, description="rotation sigma of an interpolated step, degrees"
+    )
+    translation_relative_sigma: float = Field(
+        default=0.5, gt=0, le=10, description="translation sigma over the length of an interpolated step"
+    )
+
+
+class LidarConfig(Section):
+    """LiDAR odometry, see ``frontend/lidar_odometry.py``; without factors it is only compared with."""
+
+    factors: bool = Field(
+        default=False, description="add kiss-icp's odometry to the pose graph; scale.mode lidar fits the scale to it"
+    )
+    rotation_sigma_deg: float = Field(default=0.1, gt=0, description="rotation sigma of a step, degrees")
+    translation_sigma_m: float = Field(default=0.03, gt=0, description="translation sigma of a step, metres")
+
+
+class ScaleConfig(Section):
+    """Metric scale, see ``frontend/scale/road_plane.py``."""
+
+    mode: Literal["auto", "none", "camera-height", "lidar", "reference"] = Field(
+        default="auto", description="auto: camera-height where a height is known, else none"
+    )
+    reference_frames: int = Field(default=50, ge=2, description="number of first frames that mode reference compares")
+    min_frames: int = Field(default=5, ge=1, description="least number of usable frames of a scale")
+    rejection_mads: float = Field(
+        default=3.0,
+        gt=0,
+        description="distance from the median beyond which a frame is left out, median absolute deviations",
+    )
+    smoothing_frames: int = Field(
+        default=41, ge=1, description="window over which the scale of a frame is averaged, frames"
+    )
+    road_top_ratio: float = Field(
+        default=0.35,
+        ge=0,
+        lt=1,
+        description="top edge of the road trapezoid, from horizon (0) to image bottom (1)",
+    )
+    road_bottom_ratio: float = Field(
+        default=0.97, gt=0, le=1, description="bottom edge of the road trapezoid, from horizon (0) to image bottom (1)"
+    )
+    road_top_width: float = Field(default=0.16, gt=0, le=1, description="width of the top edge over that of the image")
+    road_bottom_width: float = Field(
+        default=0.5, gt=0, le=1, description="width of the bottom edge over that of the image"
+    )
+    max_tilt_deg: float = Field(
+        default=12.0,
+        gt=0,
+        lt=90,
+        description="largest angle between the plane's normal and the camera's y axis, degrees",
+    )
+    inlier_relative_depth: float = Field(
+        default=0.05, gt=0, lt=1, description="largest relative depth error of a plane inlier"
+    )
+    min_inlier_ratio: float = Field(default=0.5, gt=0, le=1, description="least inlier ratio of a usable frame")
+
+    @model_validator(mode="after")
+    def _top_above_bottom(self) -> Self:
+        if self.road_top_ratio >= self.road_bottom_ratio:
+            raise ValueError("a road trapezoid with road_top_ratio < road_bottom_ratio")
+        return self

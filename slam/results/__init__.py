@@ -1,0 +1,1 @@
+"""A run folder and everything that is written to it or made from it."""

@@ -1,0 +1,140 @@
+"""Where a run writes: ``--output`` itself, or a folder in it while it still holds an earlier run.
+
+Only files of a run are ever removed, and only from a folder whose ``metrics.json`` says that a run wrote them.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from erfsfm.files import unfinished_name
+from slam.errors import RunError
+
+logger = logging.getLogger(__name__)
+
+METRICS = "metrics.json"
+UNFINISHED = "unfinished"
+TRAJECTORIES = ("network", "odometry", "optimised", "lidar")
+ESTIMATE = "trajectory_optimised.tum.txt"
+_STEMS = ("reference", *(f"trajectory_{name}" for name in TRAJECTORIES))
+_OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "tum")) | {
+    "config.yaml",
+    METRICS,
+    "graph.g2o",
+    "loops.json",
+    "places.npz",
+    "drive.zip",
+    "keyframes.npz",
+    "map_mesh.ply",
+    "map_cloud.ply",
+    "report.html",
+    "run.log",
+}
+
+
+def check_output(output: Path) -> None:
+    """Make sure that a run may write to ``output``: it is new, empty, or holds an earlier run.
+
+    Raises:
+        RunError: it is a file, or holds something that no run wrote.
+    """
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise RunError(f"{output} is a file: give a folder as --output")
+    if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
+        raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
+
+
+def claim(output: Path) -> Path:
+    """The folder to write a new run to, made and without files of a run.
+
+    It is ``output``, or ``output/unfinished`` where the trajectories of an earlier run are whole: they stay until
+    `replace_run` puts the new run in their place.
+
+    Raises:
+        RunError: as `check_output`.
+        OSError: the folder cannot be made.
+    """
+    check_output(output)
+    place = output / UNFINISHED if (output / ESTIMATE).is_file() else output
+    check_output(place)
+    place.mkdir(parents=True, exist_ok=True)
+    _clear(place)
+    return place
+
+
+def replace_run(output: Path, place: Path) -> None:
+    """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
+
+    ``metrics.json`` goes first and old files go before new ones come: no reader ever sees parts of both as one run.
+    """
+    (place / METRICS).replace(output / METRICS)
+    for path in _files(output):
+        if path.name != METRICS:
+            path.unlink()
+    for path in _files(place):
+        path.replace(output / path.name)
+    with suppress(OSError):  # it holds a file of another kind
+        place.rmdir()
+
+
+def stamped(results: Path, sequence: str) -> Path:
+    """A new ``<stamp>_<sequence>`` in ``results``, with ``latest`` pointing to it."""
+    safe = re.sub(r"[^\w.-]+", "-", sequence)
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = results / f"{stamp}_{safe}"
+    number = 1
+    while path.exists():
+        number += 1
+        path = results / f"{stamp}-{number}_{safe}"
+    path.mkdir(parents=True)
+    _link(results / "latest", path)
+    return path
+
+
+def _is_run(metrics: Path) -> bool:
+    """Whether a ``metrics.json`` is that of a run, however it ended."""
+    try:
+        content: Any = json.loads(metrics.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and {"schema", "status", "provenance"} <= set(content)
+
+
+def _is_rest(path: Path) -> bool:
+    """Whether a killed run left it half written."""
+    return unfinished_name(path) in _OWN
+
+
+def _files(folder: Path) -> list[Path]:
+    """Files of a run, whole or half written."""
+    return [path for path in folder.iterdir() if path.name in _OWN or _is_rest(path)]
+
+
+def _clear(folder: Path) -> None:
+    """Remove an earlier run and what it left unfinished; files of other kinds stay."""
+    check_output(folder / UNFINISHED)
+    for path in _files(folder):
+        path.unlink()
+    if (folder / UNFINISHED).is_dir():
+        _clear(folder / UNFINISHED)
+        (folder / UNFINISHED).rmdir()
+
+
+def _link(link: Path, target: Path) -> None:
+    """Point ``link`` to a sibling; a file system without links keeps the folders and loses the shortcut."""
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    try:
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(target.name, target_is_directory=True)
+        temporary.replace(link)
+    except OSError as error:
+        logger.warning("could not link %s to %s: %s", link, target, error)

@@ -1,0 +1,72 @@
+"""``run.log``: the log of the package from the first check of a run to its end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+LOG = "run.log"
+
+
+class RunLog(logging.Handler):
+    """Keeps records until there is a file for them, then writes each at once.
+
+    On a full disk lines are lost, and nothing is printed about it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._kept: list[logging.LogRecord] = []
+        self._file: _QuietFile | None = None
+
+    def begin(self, path: Path) -> None:
+        """Write what was kept, and from now on everything, to a file."""
+        self._file = _QuietFile(path, encoding="utf-8")
+        self._file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        for record in self._kept:
+            self._file.emit(record)
+        self._kept.clear()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write or keep a record."""
+        if self._file is None:
+            self._kept.append(record)
+        else:
+            self._file.emit(record)
+
+    def failed(self, reason: str) -> None:
+        """Write why the run failed here and nowhere else: its caller hears of it as an exception."""
+        message = f"the run failed: {reason}"
+        self.handle(logging.LogRecord("slam.run", logging.ERROR, __file__, 0, message, None, None))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+        super().close()
+
+
+class _QuietFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+    def close(self) -> None:
+        with suppress(OSError):  # what a full disk did not take is written once more
+            super().close()
+
+
+@contextmanager
+def run_log() -> Iterator[RunLog]:
+    """The package's log, beside wherever it goes already."""
+    log, root = RunLog(), logging.getLogger("slam")
+    level = root.level
+    root.addHandler(log)
+    root.setLevel(logging.INFO)
+    try:
+        yield log
+    finally:
+        root.removeHandler(log)
+        root.setLevel(level)
+        log.close()

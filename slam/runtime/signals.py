@@ -1,0 +1,52 @@
+"""SIGTERM and SIGHUP as exceptions, so that a run that is told to end can say so."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+_NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+
+
+class Terminated(SystemExit):
+    """A signal asked the process to end; the exit code is 128 and the signal's number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.signal_name = signal.Signals(number).name
+
+    def __str__(self) -> str:
+        return f"ended by {self.signal_name}"
+
+
+@contextmanager
+def raising_on_termination() -> Iterator[Callable[[], None]]:
+    """Raise `Terminated` in the block when the process is told to end.
+
+    Only in the main thread, and only for signals that nobody handles or ignores already.
+
+    Yields:
+        A function that ignores these signals for the rest of the block: ``timeout`` and shells send the same one
+        several times, and what the first one makes the block write must become whole.
+    """
+    numbers: list[int] = []
+    if threading.current_thread() is threading.main_thread():
+        known = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+        numbers = [number for number in known if signal.getsignal(number) is signal.SIG_DFL]
+
+    def end(number: int, _: object) -> None:
+        raise Terminated(number)
+
+    def ignore() -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+
+    for number in numbers:
+        signal.signal(number, end)
+    try:
+        yield ignore
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)

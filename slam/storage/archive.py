@@ -1,0 +1,29 @@
+"""Archives (zip, npz) that may be damaged: every way in which reading them fails is one `RunError`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from slam.errors import RunError, SlamError
+
+
+@contextmanager
+def reading_archive(path: Path) -> Iterator[None]:
+    """Turn whatever fails inside the block into one line about ``path``; a `SlamError` passes as it is.
+
+    Raises:
+        RunError: the file is missing, unreadable or damaged.
+    """
+    try:
+        yield
+    except SlamError:
+        raise
+    except FileNotFoundError as error:
+        raise RunError(f"{path} is missing: run the sequence again") from error
+    # Damaged bytes raise almost anything in zipfile, zlib, json, tokenize and NumPy: no list of types is complete.
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120]
+        detail = f"{type(error).__name__}: {reason}" if reason else type(error).__name__
+        raise RunError(f"{path} is damaged ({detail}): run the sequence again") from error

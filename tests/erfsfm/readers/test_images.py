@@ -1,0 +1,110 @@
+"""Image files: complete or refused, in natural order, of a known range of values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.errors import DataError
+from erfsfm.readers.images import has_images, image_size, list_images, read_image, read_values, resize_image
+
+
+def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[..., 2] = 200  # red in OpenCV's order
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    read = read_image(tmp_path / "a.png")
+    assert read.shape == (4, 6, 3) and read.dtype == np.uint8 and read.flags.c_contiguous
+    assert read[0, 0].tolist() == [200, 0, 0]
+    assert image_size(tmp_path / "a.png") == (4, 6)
+
+
+@pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
+def test_grey_and_deep_images_become_three_channels(tmp_path: Path, dtype: type, value: int) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 6), value, dtype))
+    assert (read_image(tmp_path / "a.png") == 77).all()
+    assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "a.png"
+    values = np.random.default_rng(0).integers(0, 4000, (24, 32, channels)).astype(np.uint16)
+    values[0, 0] = 3999
+    cv2.imwrite(str(path), values)
+    with pytest.raises(DataError, match=r"a\.png has 16 bits, but no value above 3999: it looks like 12-bit") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+    cv2.imwrite(str(path), values * 16)
+    assert read_image(path).mean() > 100
+    cv2.imwrite(str(path), np.zeros_like(values))
+    assert read_image(path).max() == 0, "a black image is what it says"
+
+
+def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
+
+
+@pytest.mark.parametrize("read", [read_image, read_values, image_size])
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.97])
+def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float, read: Callable[[Path], object]) -> None:
+    path = tmp_path / f"000000{suffix}"
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    cv2.imwrite(str(path), noise)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+    with pytest.raises(DataError, match=rf"000000{suffix} is (empty|truncated)"):
+        read(path)
+
+
+def test_a_preallocated_copy_that_broke_off(tmp_path: Path) -> None:
+    """A copy that fills the file's length first leaves zeros where the rest should be."""
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(DataError, match="truncated"):
+        read_image(path)
+
+
+def test_not_an_image(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("hello")
+    with pytest.raises(DataError, match=r"a\.png cannot be decoded"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(DataError, match=r"cannot read image .*b\.png"):
+        read_image(tmp_path / "b.png")
+
+
+def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
+    for name in ("img10.png", "img2.png", "img1.PNG", ".hidden.png", "ins.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [p.name for p in list_images(tmp_path)] == ["img1.PNG", "img2.png", "img10.png"]
+    assert list_images(tmp_path / "nowhere") == []
+    assert has_images(tmp_path) and not has_images(tmp_path / "nowhere")
+
+
+def test_two_formats_of_one_image(tmp_path: Path) -> None:
+    for name in ("0.png", "0.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match="image 0 in two formats"):
+        list_images(tmp_path)
+
+
+def test_resize_up_is_smooth() -> None:
+    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
+    grown = resize_image(ramp, 16, 64)
+    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
+    assert resize_image(ramp, 8, 16) is ramp
+
+
+def test_resize_down_averages() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[::2] = 100
+    assert (resize_image(image, 4, 4) == 50).all()

@@ -1,0 +1,65 @@
+"""The frames of a video, in any order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.readers.video import VideoFrames
+
+FRAMES = 90
+FORMATS = {".mp4": "mp4v", ".avi": "MJPG", ".mov": "mp4v", ".mkv": "MJPG"}
+
+
+def coded(number: int) -> np.ndarray:
+    """An image whose eight upright stripes are the bits of a number."""
+    bits = np.array([255 * (number >> bit & 1) for bit in range(8)], np.uint8)
+    return np.repeat(np.tile(np.repeat(bits, 8), (48, 1))[..., None], 3, axis=2)
+
+
+def decoded(image: np.ndarray) -> int:
+    bright = image[:, 4::8].mean(axis=(0, 2)) > 127
+    return int(sum(1 << bit for bit in range(8) if bright[bit]))
+
+
+def write_video(path: Path, frames: int = FRAMES) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fourcc = cv2.VideoWriter.fourcc(*FORMATS[path.suffix])
+    writer = cv2.VideoWriter(str(path), fourcc, 10, (64, 48))
+    if not writer.isOpened():
+        pytest.skip(f"this OpenCV cannot write {path.suffix}")
+    for k in range(frames):
+        writer.write(coded(k))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_any_order_gives_the_right_frame(tmp_path: Path, suffix: str) -> None:
+    frames = VideoFrames(write_video(tmp_path / f"a{suffix}"))
+    assert (len(frames), frames.width, frames.height) == (FRAMES, 64, 48)
+    for index in [0, 1, 2, 80, 3, 79, 89, 10, 11, 0, 45]:
+        assert decoded(frames.read(index)) == index
+
+
+def test_uncounted_video(tmp_path: Path) -> None:
+    frames = VideoFrames(write_video(tmp_path / "a.avi"), counted_frames=10)
+    assert len(frames) == FRAMES
+    for index in [70, 3, 60, 89, 0]:
+        assert decoded(frames.read(index)) == index
+
+
+def test_a_seek_that_lands_elsewhere_is_noticed(tmp_path: Path) -> None:
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    frames._times_ms = [time + 1 for time in frames._times_ms]
+    assert decoded(frames.read(50)) == 50
+    assert decoded(frames.read(5)) == 5
+
+
+def test_returned_images_may_be_written(tmp_path: Path) -> None:
+    frames = VideoFrames(write_video(tmp_path / "a.avi"))
+    frames.read(5)[:] = 255
+    assert decoded(frames.read(5)) == 5

@@ -1,0 +1,81 @@
+"""The benchmark's drives: each error of the optimised trajectory may be twice what was measured.
+
+The figures are of ``erfsfm-slam run`` on all frames of each sequence (300 of KITTI, 320 of the embedded loop). The map
+and the report are left out here: trajectories do not depend on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from slam import run_slam
+from slam.results.folder import RunFolder
+
+SLACK = 2.0
+QUICK = ("mapping.enabled=false", "output.report=false")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Errors of one drive as measured: ATE in metres after 7 and 6 dof alignment, rotation drift."""
+
+    sequence: str
+    weights: str
+    ate_7dof_m: float
+    ate_6dof_m: float
+    r_rel_deg_per_100m: float
+
+    def __str__(self) -> str:
+        return f"{self.sequence}-{self.weights}"
+
+
+KITTI = (
+    Measured("00", "sim", 0.218, 0.311, 0.945),
+    Measured("02", "default", 0.316, 0.386, 0.404),
+)
+MORE_KITTI = (
+    Measured("00", "default", 0.209, 0.368, 0.961),
+    Measured("02", "sim", 0.360, 0.535, 0.332),
+    Measured("05", "sim", 0.213, 0.443, 0.501),
+    Measured("05", "default", 0.316, 0.477, 0.453),
+)
+LOOP = (Measured("loop", "sim", 0.136, 0.538, 0.186), Measured("loop", "default", 0.135, 0.591, 0.182))
+LOOPS_CLOSED = 43
+
+
+def check(run: RunFolder, measured: Measured) -> None:
+    metrics = run.metrics()
+    align = metrics["trajectories"]["optimised"]["align"]
+    assert metrics["scale"]["mode"] == "camera-height"
+    assert align["7dof"]["ate_rmse_m"] < SLACK * measured.ate_7dof_m
+    assert align["6dof"]["ate_rmse_m"] < SLACK * measured.ate_6dof_m
+    assert align["7dof"]["r_rel_deg_per_100m"] < SLACK * measured.r_rel_deg_per_100m
+
+
+def check_kitti(data_root: Path, output: Path, measured: Measured) -> None:
+    root = data_root / "kitti_odometry"
+    check(run_slam(root, measured.sequence, weights=measured.weights, overrides=QUICK, output=output), measured)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("measured", KITTI, ids=str)
+def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
+    check_kitti(data_root, tmp_path / "run", measured)
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("measured", MORE_KITTI, ids=str)
+def test_more_of_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
+    check_kitti(data_root, tmp_path / "run", measured)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measured", LOOP, ids=str)
+def test_the_embedded_loop(tmp_path: Path, measured: Measured) -> None:
+    run = run_slam(weights=measured.weights, overrides=QUICK, output=tmp_path / "run")
+    check(run, measured)
+    assert run.metrics()["loops"]["accepted"] > LOOPS_CLOSED / SLACK

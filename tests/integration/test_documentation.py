@@ -1,0 +1,352 @@
+"""Every command and every Python block of the README and of ``docs/`` runs, on small data.
+
+Each runs in its own copy of a small workspace that holds everything the documents name: ``KITTI``, ``my_drive.mp4``,
+``results/latest``, ``runs/toy`` ... (see ``workspace``). ``SHORTER`` makes long commands short; ``NOT_RUN`` names what
+cannot run here, and why. A new command runs as it stands: if it fails for want of data or time, add what it names to
+the workspace or a line to one of the two tables.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+import erfsfm.cli
+import slam.cli
+from erfsfm.networks.presets import build
+from slam.frames import Intrinsics
+from slam.sequences.catalogue import open_sequence
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SHELL = ("", "sh", "bash", "shell", "console")
+PROGRAMS = ("erfsfm", "erfsfm-slam", "make", "pip", "python")
+ADVICE = "add what it names to the workspace of this test, or a line to SHORTER or NOT_RUN"
+
+WIDTH, HEIGHT, FRAMES, FIRST_RUN, RAW_FRAMES = 208, 64, 20, 14, 9
+
+SHORTER: tuple[tuple[str, str], ...] = (
+    # (pattern, replacement), applied to the whole command line one after another
+    (r"^erfsfm-slam run(?!.*(--dataset|--sequence|--frames))", r"\g<0> --frames 0:12"),
+    (r"--frames 0:900\b", f"--frames 0:{FIRST_RUN}"),
+    (r"--frames 900:", f"--frames {FIRST_RUN}:"),
+    (r"^erfsfm-slam simulate .*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
+    (r"^(erfsfm-slam simulate .*)--route loop --frames \d+", r"\1--route straight --frames 12"),
+    (r"^(erfsfm-slam simulate .*)--frames \d+", r"\1--frames 12"),
+    (r"^erfsfm train .*", r"\g<0> --set training.steps=2 --set training.batch=2"),
+    (r"--split eigen", "--split my_frames.txt"),  # the 697 frames of Eigen are not here
+    (r"^erfsfm receptive-field (?!.*--images).*", rf"\g<0> --width {WIDTH} --height {HEIGHT}"),
+    (r"--routes loop straight", "--routes straight"),
+    (r"--routes loop", "--routes straight"),
+    (r"--worlds( \d+)+", "--worlds 620"),
+    (r"^(python tools/benchmark.py .*)--frames \d+", r"\1--frames 32"),
+    (r"--growth( \d+)+", "--growth 12 16"),
+    (r"^(python tools/kiss_icp.*)--frames 0:120", r"\1--frames 0:12"),
+)
+
+SLOW = (
+    r"^erfsfm export .*--format onnx",  # the README has it without the default format
+    r"^python tools/",  # several whole runs each
+    r"^erfsfm train --config table1",  # networks of the paper's size
+)
+
+NOT_RUN: tuple[tuple[str, str], ...] = (
+    (r"^make ", "it sets up, lints or starts these very tests"),
+    (r"^pip install ", "it downloads"),
+    (r"--install-completion", "it changes the profile of the user's shell"),
+)
+if importlib.util.find_spec("rerun") is None:
+    NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A command, or the text of a fenced block, and where it stands."""
+
+    document: Path
+    line: int
+    text: str
+    language: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.document.relative_to(ROOT)}:{self.line}"
+
+
+def fenced(document: Path) -> Iterator[Block]:
+    """Blocks between lines of three backticks."""
+    opened: tuple[int, str] | None = None
+    held: list[str] = []
+    for number, line in enumerate(document.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.startswith("```"):
+            held.append(line)
+        elif opened is None:
+            opened, held = (number + 1, line[3:].strip()), []
+        else:
+            yield Block(document, opened[0], "\n".join(held), opened[1])
+            opened = None
+
+
+def command_lines(block: Block) -> Iterator[Block]:
+    """The commands of a block of shell lines, without comments and prompts, continued lines joined."""
+    text = block.text.replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), start=block.line):
+        words = shlex.split(line.removeprefix("$ "), comments=True)
+        if words:
+            yield Block(block.document, number, shlex.join(words))
+
+
+def indented(document: Path) -> Iterator[Block]:
+    """Lines indented by four blanks, outside of fences, that start with one of our programs."""
+    text = document.read_text(encoding="utf-8")
+    text = re.sub(r"^```.*?^```", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL | re.MULTILINE)
+    programs = "|".join(map(re.escape, PROGRAMS))
+    pattern = rf"^    ((?:[A-Z_]+=\S+ )*(?:{programs}) (?:.*\\\n)*.*)$"
+    for found in re.finditer(pattern, text, flags=re.MULTILINE):
+        yield Block(document, text.count("\n", 0, found.start()) + 1, found[1])
+
+
+def commands() -> list[Block]:
+    found: list[Block] = []
+    for document in DOCUMENTS:
+        for block in [b for b in fenced(document) if b.language in SHELL] + list(indented(document)):
+            found += command_lines(block)
+    return found
+
+
+def bare(command: str) -> str:
+    """A command without leading assignments of environment variables."""
+    return re.sub(r"^(?:[A-Z_]+=\S+ )+", "", command)
+
+
+def reason_not_to_run(command: str) -> str:
+    return next((reason for pattern, reason in NOT_RUN if re.search(pattern, bare(command))), "")
+
+
+def shorter(command: str) -> str:
+    for pattern, replacement in SHORTER:
+        command = re.sub(pattern, replacement, command)
+    return command
+
+
+def parameter(block: Block) -> Any:
+    slow = [pytest.mark.slow] if any(re.search(pattern, block.text) for pattern in SLOW) else []
+    return pytest.param(block, id=f"{block} {block.text[:50]}", marks=slow)
+
+
+RUNNABLE = [block for block in commands() if not reason_not_to_run(block.text)]
+OTHERS = [block for block in commands() if reason_not_to_run(block.text)]
+
+
+def call(command: str) -> None:
+    """Run a command line in the current folder; our two programs in this process, for the time it saves."""
+    program, *arguments = shlex.split(command)
+    if program == "python":
+        words = [sys.executable, str(ROOT / arguments[0]), *arguments[1:]]
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+        assert finished.returncode == 0, finished.stdout + finished.stderr
+        return
+    main = {"erfsfm": erfsfm.cli.main, "erfsfm-slam": slam.cli.main}[program]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [program, *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            assert not end.code, f"exit code {end.code}"
+
+
+def old_checkpoint(path: Path, preset: str) -> None:
+    """A small network under the names of SfMLearner-PyTorch."""
+    renamed = {}
+    for name, value in build(preset, "paper", 0.25, 4).state_dict().items():
+        name = re.sub(r"encoder\.stages\.(\d)\.(\d)\.0", lambda m: f"conv{int(m[1]) + 1}.{2 * int(m[2])}", name)
+        name = re.sub(r"(upconv|iconv)s\.(\d)", lambda m: f"{m[1]}{7 - int(m[2])}", name)
+        name = re.sub(r"^heads\.(\d)", lambda m: f"predict_disp{4 - int(m[1])}.0", name)
+        renamed[name.replace("pose_head", "pose_pred")] = value
+    torch.save({"state_dict": renamed}, path)
+
+
+def raw_drive(root: Path, sequence: Path) -> None:
+    """A KITTI raw drive of the images and scans of a simulated sequence, at 10 m/s."""
+    date = root / "2011_09_26"
+    drive = date / "2011_09_26_drive_0013_sync"
+    calibration = dict(line.split(":", 1) for line in (sequence / "calib.txt").read_text().splitlines())
+    T_camera_lidar = np.array(calibration["Tr"].split(), float).reshape(3, 4)
+    for kind, source, suffix in (("image_02", "image_2", "png"), ("velodyne_points", "velodyne", "bin")):
+        (drive / kind / "data").mkdir(parents=True)
+        for file in sorted((sequence / source).glob(f"*.{suffix}")):
+            shutil.copy(file, drive / kind / "data" / f"{int(file.stem):010d}.{suffix}")
+    (drive / "oxts" / "data").mkdir(parents=True)
+    stamps = [f"2011-09-26 13:10:51.{100_000_000 * k:09d}\n" for k in range(RAW_FRAMES)]
+    (drive / "oxts" / "timestamps.txt").write_text("".join(stamps))
+    for k in range(RAW_FRAMES):
+        values = np.zeros(30)
+        values[[6, 7]] = 6.0, 8.0
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, values)))
+    (date / "calib_cam_to_cam.txt").write_text(
+        f"R_rect_00: 1 0 0 0 1 0 0 0 1\nS_rect_02: {WIDTH} {HEIGHT}\nP_rect_02:{calibration['P2']}\n"
+    )
+    R, t = (" ".join(map(str, part.ravel())) for part in (T_camera_lidar[:, :3], T_camera_lidar[:, 3]))
+    (date / "calib_velo_to_cam.txt").write_text(f"R: {R}\nT: {t}\n")
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All that the documents name, small. Not to be changed: each command works on a copy."""
+    here = tmp_path_factory.mktemp("workspace") / "here"
+    here.mkdir()
+    size = f"--width {WIDTH} --height {HEIGHT} --route straight"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        call(f"erfsfm-slam simulate world {size} --frames {FRAMES} --seed 700 --depth")
+        call(f"erfsfm-slam simulate scanned {size} --frames {RAW_FRAMES} --seed 701 --lidar")
+        call(f"erfsfm-slam simulate held_out {size} --frames 60 --seed 501")
+        train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
+        call(f"{train} runs/toy")
+        call(f"{train} runs/table1-dfc --set network.sources=4")
+        for name in ("KITTI", "KITTI_ODOMETRY", "path/to/kitti"):
+            for sequence in ("05", "09"):
+                shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")
+                Path(name, "poses").mkdir(exist_ok=True)
+                shutil.copy("world/poses/sim.txt", f"{name}/poses/{sequence}.txt")
+        for name in ("worlds/600", "WORLD_600"):
+            shutil.copytree("world", name)
+        raw_drive(Path("KITTI_RAW"), Path("scanned/sequences/sim"))
+        Path("my_frames.txt").write_text("2011_09_26_drive_0013 5\n")
+        call(f"erfsfm-slam run --dataset KITTI --sequence 09 --frames 0:{FIRST_RUN}")
+        Path("poses").mkdir()
+        rows = Path("KITTI/poses/09.txt").read_text().splitlines(keepends=True)
+        Path("poses/09.txt").write_text("".join(rows[:FIRST_RUN]))
+        images = sorted(Path("world/sequences/sim/image_2").glob("*.png"))
+        for name in ("photos", "images", "drive/images"):
+            Path(name).mkdir(parents=True)
+            for image in images[:5]:
+                shutil.copy(image, name)
+        shutil.copy("world/camera.yaml", "camera.yaml")
+        video = cv2.VideoWriter("my_drive.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (WIDTH, HEIGHT))
+        for image in images:
+            video.write(cv2.imread(str(image)))
+        video.release()
+        for file in ("old", "exp_pose_model_best"):
+            old_checkpoint(Path(f"{file}.pth.tar"), "posenet")
+        old_checkpoint(Path("dispnet_model_best.pth.tar"), "depthnet")
+        Path("weights").mkdir()
+        call("erfsfm convert dispnet_model_best.pth.tar exp_pose_model_best.pth.tar --output weights/old")
+        Path("docs").mkdir()
+    return here
+
+
+@pytest.fixture
+def at_work(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the workspace as the current folder, where ``$KITTI_ODOMETRY`` is its ``KITTI``."""
+    here = tmp_path / "here"
+    shutil.copytree(workspace, here, symlinks=True, copy_function=os.link)  # the system never writes into a file
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("KITTI_ODOMETRY", str(here / "KITTI"))
+    return here
+
+
+def remove_outputs(command: str) -> None:
+    """Take away what the command is going to write: the workspace holds it for the commands that read it."""
+    words = shlex.split(command)
+    written = [words[2]] if words[1] == "simulate" else []
+    written += [value for option, value in pairwise(words) if option == "--output"]
+    for name in map(Path, written):
+        if name.is_dir():
+            shutil.rmtree(name)
+
+
+@pytest.mark.parametrize("block", [parameter(block) for block in RUNNABLE])
+def test_every_command_runs(block: Block, at_work: Path) -> None:
+    command = shorter(block.text)
+    if shlex.split(command)[0] not in PROGRAMS:
+        pytest.fail(f"{block}: '{block.text}' starts no program that this test knows; {ADVICE}")
+    remove_outputs(command)
+    try:
+        call(command)
+    except BaseException as error:
+        error.add_note(f"{block}: '{block.text}', run as '{command}', failed; {ADVICE}")
+        raise
+
+
+def test_what_is_not_run_exists() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    makefile = (ROOT / "Makefile").read_text()
+    for block in OTHERS:
+        program, *arguments = shlex.split(bare(block.text))
+        if program == "make":
+            assert re.search(rf"^{arguments[0]}:", makefile, re.MULTILINE), f"{block}: no target {arguments[0]}"
+        elif program == "pip":
+            extra = re.fullmatch(rf"{project['name']}\[(\w+)\]", arguments[1])
+            assert extra and extra[1] in project["optional-dependencies"], f"{block}: no extra {arguments[1]}"
+
+
+def test_documents_have_the_commands_that_matter() -> None:
+    """A reading that finds nothing would pass everything above."""
+    found = {" ".join(shlex.split(bare(block.text))[:2]) for block in commands()}
+    assert {"erfsfm-slam run", "erfsfm-slam evaluate", "erfsfm train", "erfsfm predict", "make test"} <= found
+    assert len(RUNNABLE) > 25
+
+
+def stand_ins(world: Path) -> dict[str, Any]:
+    """What the reader of a Python block is to have: a calibrated camera and some images."""
+    camera = yaml.safe_load((world / "camera.yaml").read_text())
+    files = sorted((world / "sequences/sim/image_2").glob("*.png"))
+    images = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files]
+    size = {name: camera[name] for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return {
+        "intrinsics": Intrinsics(**size),
+        "camera": [(0.1 * k, image) for k, image in enumerate(images)],
+        "image": images[0],
+        "five_images": images[:5],
+    }
+
+
+def blocks(*languages: str) -> list[Any]:
+    found = [block for document in DOCUMENTS for block in fenced(document) if block.language in languages]
+    return [pytest.param(block, id=str(block)) for block in found]
+
+
+@pytest.mark.parametrize("block", blocks("python", "py"))
+def test_every_python_block_runs(block: Block, at_work: Path) -> None:
+    names = stand_ins(at_work / "world")
+    code = "\n" * (block.line - 1) + block.text  # so that a traceback names the document's line
+    try:
+        exec(compile(code, str(block.document), "exec"), names)
+    except Exception as error:
+        error.add_note(f"{block}: a name that the reader is to have belongs into stand_ins")
+        raise
+
+
+@pytest.mark.parametrize("block", blocks("yaml", "yml"))
+def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
+    camera = yaml.safe_load(block.text)
+    assert "fx" in camera, f"{block}: this test knows camera.yaml only; teach it this kind of YAML"
+    for k in range(6):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))
+    (tmp_path / "camera.yaml").write_text(block.text)
+    assert len(open_sequence(tmp_path)) == 6
+
+
+def test_every_fence_is_of_a_known_language() -> None:
+    known = (*SHELL, "python", "py", "yaml", "yml", "text", "bibtex")
+    every = [block for document in DOCUMENTS for block in fenced(document)]
+    strange = [f"{block} {block.language}" for block in every if block.language not in known]
+    assert not strange, "say here how to run them, or call them text"

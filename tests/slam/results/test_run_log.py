@@ -1,0 +1,46 @@
+"""The log of a run is whole from its first line, and never ends the run."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from slam.results.run_log import run_log
+
+LOGGER = logging.getLogger("slam.test")
+
+
+def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with run_log() as log:
+        LOGGER.info("checked")
+        log.begin(tmp_path / "run.log")
+        LOGGER.info("measured")
+        log.failed("no space")
+    LOGGER.warning("after it")
+    lines = (tmp_path / "run.log").read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in lines] == [
+        "INFO slam.test: checked",
+        "INFO slam.test: measured",
+        "ERROR slam.run: the run failed: no space",
+    ]
+    assert "no space" not in caplog.text
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_loses_lines_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    with run_log() as log:
+        log.begin(Path("/dev/full"))
+        LOGGER.info("lost")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_without_a_folder_nothing_is_written_and_the_level_is_as_before(tmp_path: Path) -> None:
+    package = logging.getLogger("slam")
+    level, handlers = package.level, list(package.handlers)
+    with run_log():
+        LOGGER.info("checked")
+    assert package.level == level and package.handlers == handlers

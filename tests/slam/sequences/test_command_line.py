@@ -1,0 +1,136 @@
+"""Recordings as users have them, through ``erfsfm-slam run``: gaps, damage, odd names, and drives that go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.cli import main
+
+Call = Callable[..., tuple[int, str]]
+SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]
+
+
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+    tiny_weights: Path,
+) -> Call:
+    """Exit code of ``erfsfm-slam run ARGUMENTS``, its warnings and stderr; one line of error at most."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str]:
+        words = ["erfsfm-slam", "run", "--weights", tiny_weights, *SETTINGS, *arguments]
+        monkeypatch.setattr(sys, "argv", list(map(str, words)))
+        capsys.readouterr()
+        caplog.clear()
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        else:
+            code = 0
+        err = capsys.readouterr().err
+        assert "Traceback" not in err
+        assert len([line for line in err.splitlines() if line.startswith("erfsfm-slam: ")]) == (code != 0), err
+        return code, caplog.text + err
+
+    return call
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def write_folder(folder: Path, kitti_root: Path, suffix: str = ".png") -> Path:
+    """The pictures of ``kitti_root`` as a user's own folder."""
+    folder.mkdir()
+    for path in (kitti_root / "sequences/sim/image_2").iterdir():
+        cv2.imwrite(str(folder / f"{path.stem}{suffix}"), cv2.imread(str(path)))
+    shutil.copy(kitti_root / "camera.yaml", folder)
+    return folder
+
+
+def write_kitti(root: Path, name: str, kitti_root: Path) -> Path:
+    """The same as a sequence of the real odometry benchmark."""
+    shutil.copytree(kitti_root / "sequences/sim", root / "sequences" / name)
+    return root
+
+
+def test_a_folder_with_brackets_in_its_name(
+    tmp_path: Path, kitti_root: Path, run: Call, write_weights: Callable[..., Path]
+) -> None:
+    write_folder(tmp_path / "br[ack]ets", kitti_root)
+    given = ("--dataset", "br[ack]ets", "--camera", "br[ack]ets/camera.yaml", "--frames", "0:8")
+    code, err = run(*given, "--output", "o[u]t")
+    assert code == 0, err
+    assert (metrics(tmp_path / "o[u]t")["sequence"]["name"]) == "br[ack]ets"
+    for trained_on, leak in (("folder/br[ack]ets[7:20]", True), ("folder/br[ack]ets[8:20]", False)):
+        weights = write_weights(tmp_path / f"weights-{leak}", (trained_on,))
+        code, err = run(*given, "--weights", weights, "--output", f"leak-{leak}")
+        assert code == 0 and metrics(tmp_path / f"leak-{leak}")["provenance"]["leak"] is leak, err
+
+
+def test_half_a_jpeg_is_bridged_and_named(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+    image = write_folder(tmp_path / "drive", kitti_root, ".jpg") / "000006.jpg"
+    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
+    code, err = run("--dataset", "drive", "--output", "out")
+    assert code == 0, err
+    (bridged,) = metrics(tmp_path / "out")["sequence"]["bridged"]
+    assert (bridged["first"], bridged["last"]) == (6, 6) and "000006.jpg is truncated" in bridged["reason"]
+
+
+def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+    root = write_kitti(tmp_path / "root", "00", kitti_root)
+    for number in (6, 7):
+        (root / f"sequences/00/image_2/{number:06d}.png").unlink()
+    code, err = run("--dataset", root, "--output", "out")
+    assert code == 0, err
+    assert "2 of 14 frames have no image; the first gap is 000006.png to 000007.png" in err
+    rows = np.loadtxt(tmp_path / "out/trajectory_optimised.tum.txt")
+    assert rows[:, 0] == pytest.approx(0.1 * np.arange(14), abs=1e-6) and np.isfinite(rows).all()
+    assert [(gap["first"], gap["last"]) for gap in metrics(tmp_path / "out")["sequence"]["bridged"]] == [(6, 7)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("width:", "width: 208\nwidth:", "key 'width' stands twice"),
+        ("fx: ", "fx: 1 # ", "fx: 1 is no focal length in pixels of 208x64 images"),
+        ("width: 208", "width: 416", "are 208x64, but the camera file is for 416x64"),
+    ],
+)
+def test_cameras_that_cannot_be_right(
+    tmp_path: Path, kitti_root: Path, run: Call, old: str, new: str, message: str
+) -> None:
+    camera = write_folder(tmp_path / "drive", kitti_root) / "camera.yaml"
+    assert old in camera.read_text()
+    camera.write_text(camera.read_text().replace(old, new, 1))
+    code, err = run("--dataset", "drive", "--output", "out")
+    assert code == 1 and message in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_drive_goes_on_after_a_gap_and_not_with_another_one(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+    root = write_kitti(write_kitti(tmp_path / "root", "00", kitti_root), "02", kitti_root)
+    code, err = run("--dataset", root, "--sequence", "00", "--frames", "0:6", "--output", "begun")
+    assert code == 0, err
+    code, err = run("--dataset", root, "--sequence", "02", "--frames", "6:", "--continue", "begun", "--output", "off")
+    assert code == 1 and "kitti_odometry/02[6:14] cannot continue kitti_odometry/00[0:6]" in err
+    assert not (tmp_path / "off").exists()
+    code, err = run("--dataset", root, "--sequence", "00", "--frames", "8:", "--continue", "begun", "--output", "on")
+    assert code == 0, err
+    assert "2 frames between kitti_odometry/00[0:6] and kitti_odometry/00[8:14] are missing" in err
+    found = metrics(tmp_path / "on")["sequence"]
+    assert found["frames"] == 14 and [(gap["first"], gap["last"]) for gap in found["bridged"]] == [(6, 7)]
+    assert len(np.loadtxt(tmp_path / "on/trajectory_optimised.tum.txt")) == 14

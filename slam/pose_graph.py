@@ -89,7 +89,7 @@ class PoseGraph:
                 self._T_world_camera = self._solve(T_world_camera_initial)
                 return self._T_world_camera.copy()
             except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
-                reason = str(error).strip().partition("\n")[0]
+                reason = _first_line(error)
                 self._drop_newest_loop(reason)
                 _check_connected(self._relative_poses, len(T_world_camera_initial))
         raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
@@ -198,12 +198,16 @@ class IncrementalPoseGraph:
         try:
             self._exchange(wanted, T_world_camera_initial)
         except RuntimeError as error:  # iSAM2 is not usable after an indeterminate system
-            logger.warning("iSAM2 starts again: %s", str(error).strip().partition("\n")[0])
+            logger.warning("iSAM2 starts again: %s", _first_line(error))
+            self._start()
             initial = PoseGraph(self._config)
             initial.add_relative(*relative_poses)
             T_solved = initial.optimise(T_world_camera_initial)
-            self._start()
-            self._exchange(wanted, T_solved)
+            try:
+                self._exchange(wanted, T_solved)
+            except RuntimeError as again:
+                self._start()
+                raise SlamError(f"the pose graph cannot be solved: {_first_line(again)}") from again
         return self._T_world_camera.copy()
 
     def _start(self) -> None:
@@ -275,6 +279,10 @@ def _differ(old: RelativePose, new: RelativePose) -> bool:
     moved = np.abs(old.T_from_to - new.T_from_to).max()
     widened = np.abs(old.graph_sigmas / new.graph_sigmas - 1.0).max()
     return bool(moved > _SAME_RATIO * new.sigmas.min() or widened > _SAME_RATIO)
+
+
+def _first_line(error: RuntimeError) -> str:
+    return str(error).strip().partition("\n")[0]
 
 
 def _anchor(pose: Any) -> Any:

@@ -17,6 +17,8 @@ from slam.se3 import FloatArray, from_rotation_vector, invert
 
 INTERPOLATED_SOURCE = "interpolated"
 _STEPS_OF_A_MOTION = 3
+# the first step of a camera that stood, in steps before it stood
+_LONGEST_START = 2.0
 _SIGMA_FLOOR = 1e-6
 
 
@@ -96,8 +98,9 @@ def _without_frozen(
 ) -> tuple[set[int], StepTable]:
     """Repeated frames during which the camera went on, and the steps that remain without them.
 
-    The next new image tells: from a standing camera it lies at most a step away, from one that drove on as many
-    steps as images were repeated. Where no new image comes, the camera is taken to stand.
+    The step to the next new image decides: from a standing camera it is short, from one that drove on it has as many
+    steps as images were repeated. A length between the two is a failed match over a wide baseline: it is not used.
+    Where no new image comes, the camera is taken to stand.
     """
     frozen: set[int] = set()
     for first, last in runs(repeated):
@@ -107,11 +110,12 @@ def _without_frozen(
         expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
         jump = steps.motions.get((last, last + 1))
         repeats = last - first + 1
-        if jump is not None and jump.length_unscaled <= (1 + repeats / 2) * expected:
+        halfway = (1 + repeats / 2) * expected
+        if jump is not None and jump.length_unscaled <= min(halfway, _LONGEST_START * expected):
             continue
         frozen |= set(range(first, last + 1))
         steps = steps.without_frames(range(first, last + 1))
-        if jump is not None:
+        if jump is not None and jump.length_unscaled > halfway:
             over_gap = Motion(replace(jump.relative_pose, from_index=first - 1))
             steps = steps.replaced({over_gap.ends: over_gap})
     return frozen, steps

@@ -65,6 +65,8 @@ class Slam:
         self._mode = resolve_mode(config.scale, camera_height_m)
         if self._mode in ("reference", "lidar"):
             raise SlamError(f"scale mode {self._mode} wants a whole sequence: choose camera-height or none")
+        if config.lidar.factors:
+            raise SlamError("lidar.factors=true wants a whole sequence with LiDAR scans: leave the setting out")
         if self._mode == "camera-height" and camera_height_m is None:
             raise SlamError("scale mode camera-height wants camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
@@ -74,6 +76,7 @@ class Slam:
         self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
         self._observer = self._observe(None)
+        self._is_closed = False
         self._graph = IncrementalPoseGraph(config.pose_graph)
         self._shortest = predictor.sources + 1
         self._update_frames, self._sweep_frames = update_frames, sweep_frames
@@ -112,8 +115,12 @@ class Slam:
         self.close()
 
     def close(self) -> None:
-        """End the threads; what was measured can still be asked for."""
-        self._observer.close()
+        """Finish with every frame so far and end the threads; what was measured can still be asked for."""
+        self._is_closed = True
+        try:
+            self._observer.flush()
+        finally:
+            self._observer.close()
 
     def add_frame(self, image: Image, stamp: float) -> None:
         """Take the next frame.
@@ -124,7 +131,10 @@ class Slam:
 
         Raises:
             ValueError: another size, type or order.
+            SlamError: the session is closed.
         """
+        if self._is_closed:
+            raise SlamError("this session is closed: make another Slam and resume what was saved of this one")
         size = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3)
         if image.shape != size or image.dtype != np.uint8:
             raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
@@ -165,7 +175,7 @@ class Slam:
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
         self._observer.close()
-        self._observer = self._observe(checkpoint.state)
+        self._observer, self._is_closed = self._observe(checkpoint.state), False
         self._sequence.stamps = checkpoint.stamps
 
     def trajectory(self) -> Trajectory:

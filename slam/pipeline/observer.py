@@ -230,10 +230,12 @@ class Observer:
             raise error
 
     def _leave_out(self, index: int, reason: str) -> None:
-        self._watch_pending()
-        self._seen.unusable[index] = reason
-        self._seen.roads.append(MeasurementFailure(reason))
-        self._window = ()
+        try:
+            self._watch_pending()
+        finally:  # an error is about the frame before
+            self._seen.unusable[index] = reason
+            self._seen.roads.append(MeasurementFailure(reason))
+            self._window = ()
 
     def _ask_networks(self, frame: Frame) -> PendingFrame:
         length = self._predictor.sources + 1
@@ -328,10 +330,10 @@ class Observer:
 
     def _finish_tasks(self) -> None:
         """Wait for the tasks of the last frame."""
-        for task in self._tasks:
+        tasks, self._tasks = self._tasks, []  # one that fails is not waited for again
+        for task in tasks:
             with self._stopwatch.stage(task.stage):
                 task.keep(task.result.result())
-        self._tasks.clear()
 
     def _keep(self, frame: Frame, depth: DepthMap) -> None:
         """Keep thinned frames for the map, and a few whole ones for the report."""

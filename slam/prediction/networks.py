@@ -60,6 +60,7 @@ class NetworkPredictor:
         self._get_or_compute = get_or_compute
         self._answers = answers
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
+        self._key = object()  # names answers in frames, which outlive the networks
         self.sources = networks.sources
 
     def executor(self) -> Executor:
@@ -99,7 +100,7 @@ class NetworkPredictor:
         def ask() -> Answer:
             return (self._networks.disparity(self._prepared(frame)),)
 
-        return frame.derived((self, "disparity"), lambda: self._answers("disparity", [frame], ask)[0])
+        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], ask)[0])
 
     def _prepared(self, frame: Frame) -> Any:
-        return frame.derived((self, "prepared"), lambda: self._networks.prepare(frame.image))
+        return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))

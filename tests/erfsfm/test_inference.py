@@ -148,8 +148,35 @@ def test_another_number_of_images_is_refused(predictor: DepthPosePredictor, coun
     ],
 )
 def test_other_arrays_are_refused(predictor: DepthPosePredictor, wrong: NDArray[np.uint8]) -> None:
-    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 RGB; got"):
-        predictor.depth(wrong)
+    for ask in (predictor.depth, predictor.prepare):
+        with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 RGB; got"):
+            ask(wrong)
+
+
+def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredictor) -> None:
+    frames = [image() for _ in range(5)]
+    prepared = [predictor.prepare(frame) for frame in frames]
+    assert prepared[0].tensor.shape == (1, 3, 32, 64)
+    np.testing.assert_array_equal(predictor.disparity(prepared[0]), predictor.disparity(frames[0]))
+    np.testing.assert_array_equal(predictor.poses(prepared), predictor.poses(frames))
+    mixed = [prepared[0], *frames[1:4], prepared[4]]
+    np.testing.assert_array_equal(predictor.poses(mixed), predictor.poses(frames))
+
+
+def test_a_prepared_image_does_not_change_with_the_buffer_it_came_from(predictor: DepthPosePredictor) -> None:
+    buffer = image(32, 64)
+    expected, prepared = predictor.disparity(buffer), predictor.prepare(buffer)
+    buffer[:] = 255 - buffer
+    np.testing.assert_array_equal(predictor.disparity(prepared), expected)
+    assert np.abs(predictor.disparity(buffer) - expected).max() > 0
+
+
+def test_a_frozen_predictor_answers_the_same_up_to_rounding() -> None:
+    frames = [image() for _ in range(5)]
+    plain, frozen = DepthPosePredictor(model()), DepthPosePredictor(model()).freeze()
+    for _ in range(2):
+        np.testing.assert_allclose(frozen.depth(frames[0]), plain.depth(frames[0]), rtol=1e-4)
+        np.testing.assert_allclose(frozen.poses(frames), plain.poses(frames), atol=1e-6)
 
 
 def test_views_are_as_good_as_copies(predictor: DepthPosePredictor) -> None:

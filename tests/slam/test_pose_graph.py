@@ -270,3 +270,26 @@ def test_incremental_starts_again_where_the_system_broke(monkeypatch, caplog):
     _, batch = solve([*odometry, *skips, *loops], initial)
     assert apart(solved, batch) < 1e-3
     assert "starts again: Indeterminant linear system" in caplog.text
+
+
+def test_incremental_that_breaks_twice_is_one_error_and_goes_on_afterwards(monkeypatch):
+    """The restart fails as well: one line, and the next update is not left with an unusable iSAM2."""
+    _, odometry, skips, loops, initial = noisy_problem(count=60)
+    incremental = IncrementalPoseGraph(PoseGraphConfig())
+    incremental.update(odometry[:29], initial[:30])
+
+    class Broken:
+        def __init__(self, *_):
+            pass
+
+        def update(self, *_):
+            raise RuntimeError("Indeterminant linear system detected\nwhile working near variable 7")
+
+    incremental._isam = Broken()
+    with monkeypatch.context() as patched:
+        patched.setattr(gtsam, "ISAM2", Broken)
+        with pytest.raises(SlamError, match=r"^the pose graph cannot be solved: Indeterminant linear system detected$"):
+            incremental.update([*odometry, *skips, *loops], initial)
+    solved = incremental.update([*odometry, *skips, *loops], initial)
+    _, batch = solve([*odometry, *skips, *loops], initial)
+    assert apart(solved, batch) < 1e-3

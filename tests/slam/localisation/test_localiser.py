@@ -1,4 +1,4 @@
-"""New pictures of a street that was driven before are found in its map; others are not, and it is said why."""
+"""Images of a mapped street are localised in its map; images of other places are refused with a reason."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def reference() -> FloatArray:
 
 @functools.cache
 def places() -> Places:
-    """What a run on every third frame would keep, its depth exact."""
+    """Places as a run on every third frame keeps them, with exact depth."""
     sequence = street(630)
     extractor = FeatureExtractor(CONFIG, sequence.intrinsics)
     frames = range(0, 60, 3)
@@ -108,7 +108,7 @@ def test_damaged_places_are_one_error(tmp_path: Path, damage: str) -> None:
 
 
 @pytest.mark.parametrize("hazards", [(), ("exposure",), ("rain",)])
-def test_pictures_of_the_street_are_found_where_they_were_taken(hazards: tuple[str, ...]) -> None:
+def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
     localiser = Localiser(places(), CONFIG)
     found = 0
     for k in range(4, 58, 6):
@@ -135,7 +135,7 @@ def test_another_size_of_the_same_camera_is_found_too() -> None:
 
 
 @pytest.mark.parametrize("what", ["another street", "noise", "black"])
-def test_what_was_never_seen_is_not_found(what: str) -> None:
+def test_images_of_other_places_are_refused(what: str) -> None:
     images = {
         "another street": [street(seed).frame(k).image for seed in (631, 632) for k in range(5, 55, 10)],
         "noise": [np.random.default_rng(0).integers(0, 255, (96, 312, 3), np.uint8)],
@@ -147,7 +147,7 @@ def test_what_was_never_seen_is_not_found(what: str) -> None:
         assert result.T_world_camera is None and result.nearest_frame is None and result.reason
 
 
-def test_an_album_is_found_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
+def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, tmp_path: Path) -> None:
     found = list(localise(album, run))
     assert [each.image for each in found] == ["10.png", "25.png", "40.png", "50.png", "60.png"]
     assert [each.T_world_camera is not None for each in found] == [True, True, True, False, False]

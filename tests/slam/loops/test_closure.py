@@ -1,4 +1,4 @@
-"""Loops on simulated streets, driven by an oracle: what is found, that nothing false is, and what it is worth."""
+"""Loop closure on simulated streets, driven by an oracle: loops are found, none is false, the ATE falls."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def ate(result: SlamResult, name: str) -> float:
 
 
 @pytest.mark.parametrize("seed", [610, 611])
-def test_a_drive_that_comes_back_is_closed(seed: int) -> None:
+def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
     sequence = drive("loop", 250, seed)
     result = run(sequence, "loops.frame_stride=3")
     accepted = result.loops.accepted
@@ -73,7 +73,7 @@ def test_a_straight_drive_has_no_loop() -> None:
     assert result.loops.accepted == () and result.loops.candidates > 0
 
 
-def test_switched_off_it_says_so() -> None:
+def test_switched_off_the_summary_says_why_there_are_none() -> None:
     result = run(drive("straight", 20, 620), "loops.enabled=false")
     summary = result.loops.summary()
     assert summary["candidates"] is None and "loops.enabled" in summary["candidates_reason"]

@@ -36,14 +36,14 @@ def test_a_contradicted_loop_is_refused() -> None:
     assert [r.from_index for r in refused] == [6] and "contradicted by 7 of 7" in refused[0].reason
 
 
-def test_a_loop_alone_needs_to_be_strong() -> None:
+def test_a_loop_without_support_needs_many_inliers() -> None:
     for inliers, expected in ((40, 0), (300, 1)):
         kept, refused = agreeing([loop(5, 205, ring(), inliers=inliers)], ring(), CONFIG)
         assert len(kept) == expected and len(kept) + len(refused) == 1
     assert "stands alone" in agreeing([loop(5, 205, ring())], ring(), CONFIG)[1][0].reason
 
 
-def test_a_loop_that_would_fold_the_drive_is_refused() -> None:
+def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:
     far = [loop(k, 100 + k, ring(), shift=-60.0, inliers=300) for k in range(0, 40, 4)]
     kept, refused = agreeing(far, ring(), CONFIG)
     assert kept == [] and all("corrects the odometry by" in r.reason for r in refused)
@@ -55,5 +55,5 @@ def test_loops_of_one_image_do_not_support_each_other() -> None:
     assert kept == [] and len(refused) == len(same)
 
 
-def test_nothing_comes_of_nothing() -> None:
+def test_no_loops_are_no_loops() -> None:
     assert agreeing([], ring(), CONFIG) == ([], [])

@@ -40,7 +40,7 @@ def test_hamming_counts_bits() -> None:
     np.testing.assert_array_equal(hamming(first, second), slow)
 
 
-def test_words_find_their_own() -> None:
+def test_descriptors_keep_their_word_through_flipped_bits() -> None:
     rng = np.random.default_rng(2)
     views = drive(10, 0)
     words = train_vocabulary(np.concatenate([view.descriptors for view in views]), 200)
@@ -67,7 +67,7 @@ def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
     assert find_candidates(drive(20, 5), path_m, CONFIG) == []
 
 
-def test_candidates_keep_their_distance() -> None:
+def test_candidates_are_few_and_apart() -> None:
     found = find_candidates(drive(20, 5), np.arange(50.0), CONFIG)
     for later in {c.later for c in found}:
         earlier = [c.earlier for c in found if c.later == later]
@@ -81,7 +81,7 @@ def test_images_without_corners(count: int) -> None:
     assert find_candidates(blank, np.arange(float(count)), CONFIG) == []
 
 
-def test_blank_frames_among_others_are_no_place() -> None:
+def test_blank_frames_among_others_are_no_candidates() -> None:
     views = drive(20, 5)
     views[3] = views[44] = view(views[3].index, np.zeros((0, 32), np.uint8))
     found = find_candidates(views, np.arange(50.0), CONFIG)

@@ -1,7 +1,10 @@
-"""The system on a drive whose truth is known, driven by an oracle: no networks, and mostly no pictures."""
+"""The whole system on sequences with known poses, driven by an oracle in place of networks, mostly without images."""
 
 from __future__ import annotations
 
+import gc
+import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
 from slam import se3
 from slam.config import load_config
@@ -18,6 +22,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
 from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.prediction.networks import NetworkPredictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
@@ -32,8 +37,8 @@ NO_NOISE = OracleNoise()
 NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false")
 
 
-class SessionCheckpoint:
-    """A camera on a level road: poses and depth are exact, the images show nothing."""
+class LevelRoad:
+    """A sequence of a camera on a level road: poses and depth are exact, the images show nothing."""
 
     def __init__(self, T_world_camera: FloatArray, image: Image | None = None) -> None:
         self.name = "drive"
@@ -42,14 +47,14 @@ class SessionCheckpoint:
         self.reference: FloatArray | None = T_world_camera
         self.camera_height_m: float | None = HEIGHT_M
         self.T_camera_lidar: FloatArray | None = None
-        self.read = 0
+        self.frames_read = 0
         self._image = np.full((32, 104, 3), 90, np.uint8) if image is None else image
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        self.read += 1
+        self.frames_read += 1
         return Frame(index, float(self.stamps[index]), self._image)
 
     def scan_path(self, index: int) -> Path | None:
@@ -75,7 +80,7 @@ def road(index: int) -> FloatArray:
     return np.repeat(depth[:, None], 104, axis=1)
 
 
-def run(drive: SessionCheckpoint, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
+def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
     assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
@@ -85,8 +90,8 @@ def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
     return float(trajectory_metrics(estimate, reference)["align"]["7dof"]["ate_rmse_m"])
 
 
-def test_exact_answers_give_the_truth() -> None:
-    drive = SessionCheckpoint(turning(60))
+def test_exact_predictions_give_the_true_trajectory() -> None:
+    drive = LevelRoad(turning(60))
     result = run(drive)
     for each in (result.network, result.odometry, result.optimised, result.reference):
         assert each is not None and len(each) == 60
@@ -97,25 +102,25 @@ def test_exact_answers_give_the_truth() -> None:
     np.testing.assert_allclose(result.network.positions, FACTOR * turning(60)[:, :3, 3], atol=1e-9)
     for each in (result.odometry, result.optimised):
         np.testing.assert_allclose(each.T_world_camera, turning(60), atol=1e-3)
-    assert result.map is None and result.observations.geometric == []
+    assert result.map is None and len(result.observations.steps) == 0
     assert len(result.observations.snippets) == 56 and len(result.factors) == 4 * 56
 
 
-def test_noise_is_cut_by_the_graph() -> None:
+def test_the_graph_reduces_the_noise_of_the_pose_network() -> None:
     before, after = [], []
     for seed in range(5):
         noise = OracleNoise(np.deg2rad(0.3), 0.05, seed=seed)
-        result = run(SessionCheckpoint(turning(100)), noise=noise)
+        result = run(LevelRoad(turning(100)), noise=noise)
         before.append(ate(result.network, result.reference))
         after.append(ate(result.optimised, result.reference))
     assert np.mean(after) < 0.7 * np.mean(before)
 
 
-def test_a_unit_that_wanders_is_brought_back_by_the_road() -> None:
+def test_scale_drift_is_corrected_by_the_ground_plane() -> None:
     noise = OracleNoise(scale_drift_sigma=0.03)
-    result = run(SessionCheckpoint(turning(200)), "scale.smoothing_frames=11", noise=noise)
-    wandered = result.network.length_m / FACTOR / turning_length(200)
-    assert abs(np.log(wandered)) > 0.1
+    result = run(LevelRoad(turning(200)), "scale.smoothing_frames=11", noise=noise)
+    drifted = result.network.length_m / FACTOR / turning_length(200)
+    assert abs(np.log(drifted)) > 0.1
     assert result.optimised.length_m == pytest.approx(turning_length(200), rel=0.03)
     assert ate(result.optimised, result.reference) < 0.3 * ate(result.network, result.reference)
 
@@ -129,7 +134,7 @@ def turning_length(frames: int) -> float:
 )
 def test_scale_modes(mode: str, unit_m: float) -> None:
     """``none`` measures in camera heights, the others in metres."""
-    result = run(SessionCheckpoint(turning(30)), f"scale.mode={mode}")
+    result = run(LevelRoad(turning(30)), f"scale.mode={mode}")
     assert result.scale.mode == ("camera-height" if mode == "auto" else mode)
     assert result.optimised.length_m * unit_m == pytest.approx(turning_length(30), rel=1e-4)
     assert not isinstance(result.scale.estimate, MeasurementFailure)
@@ -137,41 +142,88 @@ def test_scale_modes(mode: str, unit_m: float) -> None:
 
 
 def test_auto_without_a_height_is_none() -> None:
-    drive = SessionCheckpoint(turning(30))
+    drive = LevelRoad(turning(30))
     drive.camera_height_m = None
     assert run(drive).scale.mode == "none"
 
 
 @pytest.mark.parametrize(
-    ("frames", "mode", "words"),
+    ("frames", "setting", "words"),
     [
-        (4, "auto", "drive has 4 frames, .* snippet .* has 5"),
-        (30, "lidar", "wants LiDAR scans of neighbouring frames"),
-        (30, "reference", "drive has none"),
-        (30, "camera-height", "add camera_height_m to camera.yaml"),
+        (4, "scale.mode=auto", "drive has 4 frames, .* snippet .* has 5"),
+        (30, "scale.mode=lidar", "scale.mode=lidar needs LiDAR scans of neighbouring frames"),
+        (30, "lidar.factors=true", "lidar.factors=true needs LiDAR scans of neighbouring frames"),
+        (30, "scale.mode=reference", "drive has none"),
+        (30, "scale.mode=camera-height", "add camera_height_m to camera.yaml"),
     ],
 )
-def test_what_cannot_work_is_refused_before_any_work(frames: int, mode: str, words: str) -> None:
-    drive = SessionCheckpoint(turning(frames))
+def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setting: str, words: str) -> None:
+    drive = LevelRoad(turning(frames))
     oracle = OraclePredictor(turning(frames), road)
     drive.reference = drive.camera_height_m = None
-    pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, f"scale.mode={mode}"]))
-    with pytest.raises(SlamError, match=words) as refused:
-        pipeline.run()
-    assert "\n" not in str(refused.value)
-    assert drive.read == 0
+    pipeline = SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, setting]))
+    for begin in (pipeline.require_possible, pipeline.run):
+        with pytest.raises(SlamError, match=words) as refused:
+            begin()
+        assert "\n" not in str(refused.value)
+    assert drive.frames_read == 0
+
+
+def test_what_can_work_is_not_refused() -> None:
+    drive = LevelRoad(turning(30))
+    for setting, mode in (("auto", "camera-height"), ("reference", "reference"), ("none", "none")):
+        config = load_config(None, [*NO_IMAGES, f"scale.mode={setting}"])
+        assert SlamPipeline(drive, OraclePredictor(turning(30), road), config).require_possible() == mode
+    assert drive.frames_read == 0
 
 
 def test_one_snippet_is_enough() -> None:
-    result = run(SessionCheckpoint(turning(5)))
+    result = run(LevelRoad(turning(5)))
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(5), atol=1e-3)
 
 
-def test_without_a_road_lengths_stay_unscaled_and_say_why() -> None:
-    result = run(SessionCheckpoint(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
+def test_without_a_ground_plane_lengths_stay_unscaled_with_a_reason() -> None:
+    result = run(LevelRoad(turning(20)), depth_of=lambda index: np.full((32, 104), 10.0))
     assert isinstance(result.scale.estimate, MeasurementFailure) and "0 frames" in result.scale.estimate.reason
     np.testing.assert_array_equal(result.scale.per_frame, 1.0)
     assert result.optimised.length_m == pytest.approx(FACTOR * turning_length(20), rel=1e-3)
+
+
+def threads() -> set[str]:
+    """Names of the threads that a run starts and must end, of those that are alive."""
+    prefixes = ("networks", "oracle", "beside", "ahead", "side")
+    return {thread.name for thread in threading.enumerate() if thread.name.startswith(prefixes)}
+
+
+def test_a_result_that_is_kept_keeps_neither_threads_nor_networks(tiny_weights: Path) -> None:
+    street = SimulatedSequence(SimulationOptions("straight", 9, 1002, 208, 64))
+    networks = DepthPosePredictor.from_weights(tiny_weights)
+    predictor = NetworkPredictor(networks, street.intrinsics)
+    during: set[str] = set()
+    pipeline = SlamPipeline(
+        street, predictor, load_config(None, ["mapping.enabled=false"]), lambda *_: during.update(threads())
+    )
+    result = pipeline.run()
+    assert {"networks_0", "beside_0"} <= during and threads() == set()
+    alive = weakref.ref(predictor), weakref.ref(networks)
+    del pipeline, predictor, networks
+    gc.collect()
+    assert [each() for each in alive] == [None, None]
+    assert len(result.optimised) == 9 and len(result.state.window) == 5
+
+
+def test_threads_end_where_a_run_fails() -> None:
+    """The depth of one frame cannot be computed: the error is the run's, and nothing goes on in the background."""
+
+    def fails(index: int) -> FloatArray:
+        if index == 12:
+            raise RuntimeError("out of memory")
+        return road(index)
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        run(LevelRoad(turning(30)), depth_of=fails)
+    gc.collect()
+    assert threads() == set()
 
 
 def speckled() -> Image:
@@ -180,8 +232,8 @@ def speckled() -> Image:
 
 
 @pytest.mark.parametrize("mode", ["camera-height", "reference"])
-def test_standing_still(mode: str) -> None:
-    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
+    still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
     metrics = trajectory_metrics(result.optimised, result.reference)
@@ -190,20 +242,20 @@ def test_standing_still(mode: str) -> None:
         assert isinstance(result.scale.estimate, MeasurementFailure) and "does not move" in result.scale.estimate.reason
 
 
-def test_images_that_do_not_change_hold_a_restless_network() -> None:
-    still = SessionCheckpoint(np.tile(np.eye(4), (40, 1, 1)), speckled())
+def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
+    still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
     result = run(still, *options, noise=noise)
-    assert {factor.source for factor in result.observations.geometric} == {STILL_SOURCE}
+    assert {factor.source for factor in result.observations.steps.relative_poses} == {STILL_SOURCE}
     turned = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
     assert turned[1] < 0.3 * turned[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
-def test_images_without_corners_refuse_the_geometry_and_the_network_goes_on() -> None:
-    result = run(SessionCheckpoint(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
-    assert result.observations.geometric == []
+def test_images_without_corners_leave_the_pose_network_alone() -> None:
+    result = run(LevelRoad(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
+    assert len(result.observations.steps) == 0
     pairs = [(first, second) for first, second, _ in result.observations.failures]
     assert sorted(pairs) == sorted([(k, k + 1) for k in range(19)] + [(k, k + 3) for k in range(17)])
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
@@ -231,7 +283,7 @@ def drive_street(
 
 
 def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
-    """Corners, RANSAC, the graph's threads and Open3D's: none of them may leave a trace."""
+    """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
     for name in ("first", "second"):
         result = drive_street(street)
         folder = tmp_path / name
@@ -247,23 +299,23 @@ def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 
 
-def test_pictures_reach_geometry_map_and_report(street: Excerpt) -> None:
+def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     told: list[tuple[str, int, int]] = []
     result = drive_street(street, lambda *words: told.append(words))
     assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
     seen = result.observations
-    assert len(seen.geometric) > 15 and len(seen.geometric) + len(seen.failures) == 24
-    measured = {g.from_index for g in seen.geometric}
+    assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
+    measured = {first for first, _ in seen.steps.motions}
     by_network = [f for f in result.factors if f.source == "network"]
     assert all(set(range(*sorted((f.from_index, f.to_index)))) - measured for f in by_network)
-    assert len(seen.road_steps) > 10 and np.isfinite(result.scale.lengths).sum() == len(seen.motions)
+    assert len(seen.road_steps) > 10 and result.scale.lengths.keys() == seen.steps.triangulated.keys()
     assert [index for index, _, _ in seen.examples] == [4, 8, 12, 16, 20]
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
 
 
-def test_a_network_whose_noise_is_known_has_a_say_at_every_step(street: Excerpt) -> None:
+def test_calibrated_network_factors_are_used_at_every_step(street: Excerpt) -> None:
     six = (0.002, 0.002, 0.002, 0.02, 0.02, 0.02)
     none = (0.0,) * 6
     noise = PoseNoise(

@@ -1,4 +1,4 @@
-"""A drive that is left and taken up again is the drive that was never interrupted."""
+"""A run that is continued gives the bytes of a run in one go."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 
 from slam import Slam, run_slam
 from slam.config import load_config
-from slam.errors import SlamError
+from slam.errors import RunError, SlamError
 from slam.frames import Frame
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES
+from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence
@@ -34,7 +34,7 @@ def run(root: Path, output: Path, frames: str | None, **options: Any) -> RunFold
 
 
 def rounded(tree: Any) -> Any:
-    """Numbers to nine decimals: the truth of both parts is joined, which rounds."""
+    """Numbers to nine decimals: joining the reference of both parts rounds."""
     if isinstance(tree, dict):
         return {key: rounded(value) for key, value in tree.items()}
     return f"{tree + 0.0:.9f}" if isinstance(tree, float) else tree
@@ -71,8 +71,8 @@ def test_every_file_has_the_bytes_of_a_run_in_one_go(whole: RunFolder, go_on: Ca
     assert metrics["map"]["points"] == wanted["map"]["points"] > 0
 
 
-def test_frame_by_frame(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
-    """Three runs in a row, one of them of a single frame."""
+def test_three_runs_in_a_row_give_the_graph_of_one(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
+    """One of them is of a single frame."""
     settings = ["output.report=false", "mapping.enabled=false"]
     before = run(kitti_root, tmp_path / "0", "0:6", overrides=settings).path
     for frames in ("6:7", "7:"):
@@ -80,7 +80,7 @@ def test_frame_by_frame(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> N
     assert (before / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
-def test_the_images_of_before_are_not_asked_for(
+def test_images_before_the_checkpoint_are_not_read(
     whole: RunFolder, go_on: Callable[..., RunFolder], copy_of_kitti_root: Callable[[], Path]
 ) -> None:
     root = copy_of_kitti_root()
@@ -90,10 +90,10 @@ def test_the_images_of_before_are_not_asked_for(
     assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
-def test_a_folder_that_begins_anew_comes_after(
+def test_a_folder_with_stamps_from_zero_continues_the_drive(
     whole: RunFolder, begun: RunFolder, kitti_root: Path, tmp_path: Path
 ) -> None:
-    """Images alone, with stamps from zero: the same poses, and no truth is made up."""
+    """Images alone: the same poses, and no reference."""
     images = tmp_path / "images"
     images.mkdir()
     for path in sorted((kitti_root / "sequences/sim/image_2").iterdir())[8:]:
@@ -107,7 +107,7 @@ def test_a_folder_that_begins_anew_comes_after(
     assert continued.trajectory("reference") is None
 
 
-def test_without_keyframes_the_map_begins_where_they_do(
+def test_without_kept_keyframes_the_map_begins_at_the_checkpoint(
     begun: RunFolder,
     go_on: Callable[..., RunFolder],
     whole: RunFolder,
@@ -122,7 +122,7 @@ def test_without_keyframes_the_map_begins_where_they_do(
     assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
-def test_what_follows_the_pass_over_the_frames_may_be_set_anew(go_on: Callable[..., RunFolder]) -> None:
+def test_graph_mapping_and_output_may_be_configured_anew(go_on: Callable[..., RunFolder]) -> None:
     continued = go_on(overrides=["pose_graph.kernel=none", "mapping.enabled=false", "output.keep=nothing"])
     config = load_config(continued.path / "config.yaml")
     assert (config.pose_graph.kernel, config.output.keep) == ("none", "nothing")
@@ -137,7 +137,9 @@ def test_what_follows_the_pass_over_the_frames_may_be_set_anew(go_on: Callable[.
     ],
     ids=["configuration", "geometry"],
 )
-def test_what_does_not_go_together(go_on: Callable[..., RunFolder], options: dict[str, Any], message: str) -> None:
+def test_configuration_of_the_pass_over_the_frames_is_fixed(
+    go_on: Callable[..., RunFolder], options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(SlamError, match=message):
         go_on(**options)
 
@@ -178,6 +180,25 @@ def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun
         go_on(continues=damaged)
 
 
+def test_damage_anywhere_in_the_keyframes_is_one_error_or_none(begun: RunFolder, tmp_path: Path) -> None:
+    """Compressed archives fail in several ways, in zlib among them."""
+    folder = Path(shutil.copytree(begun.path, tmp_path / "damaged"))
+    path, intact = folder / KEYFRAMES, SessionCheckpoint.open(folder).state.seen.keyframes
+    whole = path.read_bytes()
+    refused = 0
+    for start in range(0, len(whole), len(whole) // 60):
+        path.write_bytes(whole[:start] + bytes(255 - byte for byte in whole[start : start + 8]) + whole[start + 8 :])
+        try:
+            keyframes = SessionCheckpoint.open(folder).state.seen.keyframes
+        except RunError as error:
+            assert "keyframes.npz is damaged" in str(error)
+            refused += 1
+        else:
+            assert [k.index for k in keyframes] == [k.index for k in intact]
+            assert all(np.array_equal(k.image, i.image) for k, i in zip(keyframes, intact, strict=True))
+    assert refused > 40
+
+
 def live(root: Path, **options: Any) -> Slam:
     sequence = open_sequence(root, "sim")
     street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001, width=208, height=64))
@@ -198,12 +219,13 @@ def feed(slam: Slam, root: Path, frames: range) -> None:
         slam.add_frame(frame.image, frame.stamp)
 
 
-def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [str, Path])
+def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path, kind: type[str | Path]) -> None:
     first = live(kitti_root)
     feed(first, kitti_root, range(8))
-    first.save(tmp_path / "drive.zip")
+    first.save(kind(tmp_path / "drive.zip"))
     second = live(kitti_root)
-    second.resume(tmp_path / "drive.zip")
+    second.resume(kind(tmp_path / "drive.zip"))
     assert len(second) == 8
     np.testing.assert_allclose(second.trajectory().positions, first.trajectory().positions, atol=1e-9)
     for slam in (first, second):
@@ -212,7 +234,7 @@ def test_live_slam_is_saved_and_resumed(kitti_root: Path, tmp_path: Path) -> Non
     assert second.trajectory().length_m > 5
 
 
-def test_live_slam_resumes_its_own_drive_alone(kitti_root: Path, tmp_path: Path) -> None:
+def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_root: Path, tmp_path: Path) -> None:
     first = live(kitti_root)
     feed(first, kitti_root, range(6))
     first.save(tmp_path / "drive.zip")

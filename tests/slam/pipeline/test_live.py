@@ -1,8 +1,10 @@
-"""Frames as they come: the same measurements, the same loops, the same trajectory as in one batch."""
+"""Incremental SLAM: the same measurements, loops and trajectory as the batch pipeline."""
 
 from __future__ import annotations
 
 import functools
+import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ import pytest
 from slam import Slam
 from slam.config import SlamConfig, load_config
 from slam.errors import SlamError
-from slam.frames import Frame
+from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.sequences.simulation.sequence import SimulatedSequence
 from slam.sequences.simulation.street import SimulationOptions
@@ -77,7 +80,7 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         assert way == 0.0 if count < 5 else 0.5 * count < way < 1.5 * count
 
 
-def test_blank_frames_are_bridged() -> None:
+def test_blank_frames_are_interpolated() -> None:
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 12)
     for k in range(12, 17):
@@ -95,16 +98,108 @@ def test_wrong_frames_and_modes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"image must be \(96, 312, 3\) uint8; got \(96, 312\)"):
         slam.add_frame(image[..., 0], 0.0)
     slam.add_frame(image, 1.0)
-    with pytest.raises(ValueError, match=r"stamps must increase; got 1\.0 after 1\.0"):
-        slam.add_frame(image, 1.0)
+    for stamp in (1.0, 0.5, np.nan, np.inf):
+        with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
+            slam.add_frame(image, stamp)
+    assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
     with pytest.raises(SlamError, match="reference wants a whole sequence"):
         started(load_config(None, ["scale.mode=reference"]))
+    with pytest.raises(SlamError, match=r"lidar\.factors=true wants a whole sequence"):
+        started(load_config(None, ["lidar.factors=true"]))
     with pytest.raises(SlamError, match="wants camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
 
 
-def test_a_buffer_that_is_filled_anew_is_a_new_frame() -> None:
-    """As of a camera's driver, which writes every image to the same place."""
+def test_a_first_stamp_that_is_no_number_is_refused() -> None:
+    slam = started(load_config(None, SETTINGS))
+    with pytest.raises(ValueError, match="stamps must increase; got nan"):
+        slam.add_frame(drive().frame(0).image, np.nan)
+    assert len(slam) == 0
+
+
+class FailsOnce(OraclePredictor):
+    """An oracle that fails at one frame, at its depth or at the snippet that ends with it."""
+
+    def __init__(self, frame: int, question: str) -> None:
+        assert drive().reference is not None
+        super().__init__(drive().reference, lambda k: np.full((96, 312), 10.0), NOISE, FACTOR)
+        self._fails = {(question, frame)}
+
+    def depth(self, frame: Frame) -> DepthMap:
+        self._fail("depth", frame.index)
+        return super().depth(frame)
+
+    def snippet(self, frames: list[Frame]) -> SnippetPoses:
+        self._fail("snippet", frames[-1].index)
+        return super().snippet(frames)
+
+    def _fail(self, question: str, index: int) -> None:
+        if (question, index) in self._fails:
+            self._fails.clear()
+            raise RuntimeError(f"out of memory at frame {index}")
+
+
+@pytest.mark.parametrize("following", ["new", "black"])
+@pytest.mark.parametrize("question", ["depth", "snippet"])
+def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
+    question: str, following: str, tmp_path: Path
+) -> None:
+    """Whoever catches the error goes on: one row a frame, whether the next image is usable or not."""
+    predictor = FailsOnce(8, question)
+    config = load_config(None, [*SETTINGS, "geometry.enabled=true", "loops.enabled=false"])
+    with Slam(predictor, drive().intrinsics, config, drive().camera_height_m, update_frames=100) as slam:
+        failed = []
+        for k in range(20):
+            frame = drive().frame(k)
+            image = np.zeros_like(frame.image) if following == "black" and k == 9 else frame.image
+            try:
+                slam.add_frame(image, frame.stamp)
+            except RuntimeError as error:
+                failed.append(k)
+                assert str(error) == "out of memory at frame 8"
+            assert len(slam) == k + 1
+        assert len(failed) == 1 and 8 < failed[0] <= 11
+        trajectory = slam.trajectory()
+        slam.save(tmp_path / "drive.zip")
+    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.seen.unusable
+    if question == "depth":
+        assert unusable.pop(8) == "it could not be measured (out of memory at frame 8)"
+    assert set(unusable) <= {9, 10}, "the black frame, or the one that was measured when the snippet failed"
+    np.testing.assert_array_equal(trajectory.stamps, drive().stamps[:20])
+    assert trajectory.T_world_camera.shape == (20, 4, 4) and np.isfinite(trajectory.T_world_camera).all()
+    reference = drive().reference
+    assert reference is not None
+    assert np.linalg.norm(trajectory.positions[-1]) > 0.5 * np.linalg.norm(reference[19, :3, 3])
+
+
+def test_a_failure_at_the_last_frame_is_raised_once() -> None:
+    slam = Slam(FailsOnce(8, "snippet"), drive().intrinsics, load_config(None, SETTINGS), drive().camera_height_m)
+    with slam:
+        feed(slam, 0, 9)
+        with pytest.raises(RuntimeError, match="out of memory at frame 8"):
+            slam.trajectory()
+        assert len(slam.trajectory()) == len(slam) == 9
+
+
+def test_a_closed_session_has_no_threads_and_still_answers(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    config = load_config(None, [*SETTINGS, "geometry.enabled=true"])
+    with started(config) as slam, started(config) as other:
+        for each in (slam, other):
+            feed(each, 0, 13)
+        expected = other.trajectory().T_world_camera
+        assert set(threading.enumerate()) > before
+    assert set(threading.enumerate()) == before
+    np.testing.assert_array_equal(slam.trajectory().T_world_camera, expected)
+    slam.save(str(tmp_path / "drive.zip"))
+    with pytest.raises(SlamError, match="this session is closed"):
+        feed(slam, 13, 14)
+    assert len(slam) == 13
+    slam.close()
+
+
+def test_a_buffer_that_is_reused_is_a_new_frame() -> None:
+    """A camera driver may write every image to the same memory."""
     config = load_config(None, ["mapping.enabled=false", "loops.enabled=false"])
     slam, buffered = (started(config, sweep_frames=0) for _ in range(2))
     feed(slam, 0, 9)

@@ -1,22 +1,28 @@
-"""Ten frames in the middle of a drive show nothing: the run goes on, and says so."""
+"""One pass over the frames: damaged and missing ones are interpolated and reported, and a pass can be resumed."""
 
 from __future__ import annotations
 
 import functools
 import logging
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from slam.config import SlamConfig, load_config
-from slam.errors import SequenceError
+from slam.errors import MissingFrameError, SequenceError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
+from slam.frontend.scale.road_plane import GroundPlane
 from slam.pipeline.batch import SlamPipeline, SlamResult
-from slam.pipeline.observer import Observer
+from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.timing import Stopwatch
 from slam.sequences.simulation.sequence import SimulatedSequence
@@ -40,6 +46,24 @@ def noise(sequence: SimulatedSequence, index: int) -> Frame:
 
 def repeated(sequence: SimulatedSequence, index: int) -> Frame:
     return Frame(index, float(sequence.stamps[index]), sequence.frame(BAD[0] - 1).image)
+
+
+def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
+    """A frozen camera in a compressed video: the same image, encoded anew each time."""
+    quality = 60 + 3 * (index - BAD[0])
+    _, encoded = cv2.imencode(".jpg", sequence.frame(BAD[0] - 1).image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return Frame(index, float(sequence.stamps[index]), np.ascontiguousarray(decoded[..., ::-1]))
+
+
+def upside_down(sequence: SimulatedSequence, index: int) -> Frame:
+    image = np.ascontiguousarray(sequence.frame(index).image[::-1, ::-1])
+    return Frame(index, float(sequence.stamps[index]), image)
+
+
+def missing(sequence: SimulatedSequence, index: int) -> Frame:
+    raise MissingFrameError(f"there is no image {index}.png")
 
 
 def unreadable(sequence: SimulatedSequence, index: int) -> Frame:
@@ -70,7 +94,10 @@ class Damaged:
 
 @functools.cache
 def street() -> SimulatedSequence:
-    return SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
+    sequence = SimulatedSequence(SimulationOptions("straight", FRAMES, 1004, 208, 64))
+    # every run needs image and depth of every frame
+    sequence.street.render = functools.lru_cache(FRAMES)(sequence.street.render)
+    return sequence
 
 
 def oracle_of(sequence: Damaged) -> OraclePredictor:
@@ -90,28 +117,90 @@ def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> SlamResult
     return SlamPipeline(sequence, oracle_of(sequence), config_with("mapping.width_px=104", *overrides)).run()
 
 
-@pytest.mark.parametrize("damage", [black, noise, repeated, unreadable], ids=lambda damage: damage.__name__)
-def test_ten_frames_are_bridged_and_reported(damage: Damage, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        result = run(damage)
+@functools.cache
+def run_on(damage: Damage) -> tuple[SlamResult, str]:
+    """A run with ten damaged frames, and its warnings."""
+    lines: list[str] = []
+
+    class Listing(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            lines.append(record.getMessage())
+
+    listing = Listing(logging.WARNING)
+    logger = logging.getLogger("slam.pipeline.batch")
+    logger.addHandler(listing)
+    try:
+        return run(damage), "\n".join(lines)
+    finally:
+        logger.removeHandler(listing)
+
+
+def ate(result: SlamResult) -> float:
+    return float(trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]["ate_rmse_m"])
+
+
+DAMAGES = [black, noise, repeated, repeated_as_jpeg, upside_down, missing, unreadable]
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
+def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
+    result, warnings = run_on(damage)
     for each in (result.network, result.odometry, result.optimised):
         assert len(each) == FRAMES and np.isfinite(each.T_world_camera).all()
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
     seen = result.observations
-    assert set(seen.bridged) == set(BAD)
-    assert "frames 25 to 34 bridged: " in caplog.text
+    assert set(seen.interpolated) == set(BAD)
+    assert warnings.count("bridged by interpolation") == warnings.count("frames 25 to 34 bridged by interpolation") == 1
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
     assert [factor.from_index for factor in interpolated] == list(range(24, 35))
     assert min(factor.sigmas[0] for factor in interpolated) > 5 * np.deg2rad(0.3)
     # the gap is ten metres of seventy; standing still through it would cost more than a metre
-    errors = trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]
-    assert errors["ate_rmse_m"] < 0.6
+    assert ate(result) < 0.6
     assert result.map is not None and not {k.index for k in seen.keyframes} & set(BAD)
     assert not {view.index for view in seen.views} & set(BAD)
 
 
+@pytest.mark.parametrize("damage", [repeated_as_jpeg, upside_down], ids=lambda damage: damage.__name__)
+def test_misleading_frames_cost_no_more_than_black_ones(damage: Damage) -> None:
+    assert ate(run_on(damage)[0]) < 2 * ate(run_on(black)[0])
+
+
 def test_a_drive_in_order_is_left_alone() -> None:
-    assert run(bad=range(0)).observations.bridged == {}
+    assert run(bad=range(0)).observations.interpolated == {}
+
+
+def observe(frames: int, state: ObserverState | None, damage: Damage, bad: range, *overrides: str) -> ObserverState:
+    """The state after so many frames of a damaged drive, from a state on."""
+    sequence = Damaged(street(), damage, bad)
+    config = config_with("mapping.enabled=false", "geometry.enabled=false", *overrides)
+    with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state) as observer:
+        for index in range(0 if state is None else len(state.seen.roads), frames):
+            observer.add(index, read_frame(sequence, index))
+        return observer.state()
+
+
+def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
+    """Forty missing in a row are a gap in time; the thirty-first unreadable one is an error."""
+    state = observe(50, None, missing, range(8, 48))
+    assert sorted(state.seen.unusable) == list(range(8, 48)) and state.unread == 0
+    state = observe(38, None, unreadable, range(8, 48))
+    assert sorted(state.seen.unusable) == list(range(8, 38)) and state.unread == 30
+    with pytest.raises(SequenceError, match=r"image 38\.png is truncated"):
+        observe(39, state, unreadable, range(8, 48))
+
+
+def test_missing_images_between_unreadable_ones_are_not_counted() -> None:
+    def either(sequence: SimulatedSequence, index: int) -> Frame:
+        return (missing if index % 2 else unreadable)(sequence, index)
+
+    assert observe(20, None, either, range(8, 18), "gaps.max_unread_frames=5").unread == 0
+    with pytest.raises(SequenceError, match=r"image 18\.png is truncated"):
+        observe(20, None, either, range(8, 20), "gaps.max_unread_frames=5")
+
+
+def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
+    with pytest.raises(MissingFrameError, match=r"there is no image 8\.png"):
+        observe(20, None, missing, range(8, 10), "gaps.enabled=false")
 
 
 def test_too_many_unreadable_images_are_the_error_they_are() -> None:
@@ -121,24 +210,73 @@ def test_too_many_unreadable_images_are_the_error_they_are() -> None:
         run(unreadable, BAD, "gaps.enabled=false")
 
 
-def test_settling_after_each_frame_sees_the_same_as_going_on() -> None:
+def test_flushing_after_each_frame_measures_the_same_as_going_on() -> None:
     sequence = Damaged(street(), black, range(12, 14))
     config = config_with("mapping.enabled=false")
-    going_on, settling = (
-        Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "settling")
+    going_on, flushed = (
+        Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "flushed")
     )
-    for index in range(24):
-        frame = sequence.frame(index)
-        going_on.add(index, frame)
-        settling.add(index, frame)
-        settling.flush()
-        assert len(settling.seen.roads) == index + 1, "a settled observer has finished with every frame"
-    late, soon = going_on.closed(), settling.closed()
-    assert len(late.relative_rotations) > 10 and late.road_steps.keys() == soon.road_steps.keys()
-    for seen in (
-        lambda o: [span.R_to_from for span in o.relative_rotations],
-        lambda o: [pose.T_from_to for pose in o.geometric],
+    with going_on, flushed:
+        for index in range(24):
+            frame = sequence.frame(index)
+            going_on.add(index, frame)
+            flushed.add(index, Frame(index, frame.stamp, frame.image))
+            flushed.flush()
+            assert len(flushed.state().seen.roads) == flushed.frames == going_on.frames == index + 1
+        assert_same(going_on, flushed)
+
+
+def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_path: Path) -> None:
+    sequence = Damaged(street(), black, range(12, 14))
+    config = config_with("mapping.enabled=false")
+
+    def begin(state: ObserverState | None = None) -> Observer:
+        return Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state)
+
+    with begin() as going_on:
+        resumed = begin()
+        for index in range(24):
+            frame = sequence.frame(index)
+            going_on.add(index, frame)
+            with resumed:
+                resumed.add(index, Frame(index, frame.stamp, frame.image))
+                SessionCheckpoint.of(sequence, resumed.state(), "").write(tmp_path / "drive.zip")
+            resumed = begin(SessionCheckpoint.read(tmp_path / "drive.zip").state)
+        with resumed:
+            assert_same(going_on, resumed)
+
+
+def assert_same(one: Observer, other: Observer) -> None:
+    """Both have measured the same bytes, of every kind."""
+    first, second = one.closed(), other.closed()
+    assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 15
+    assert first.road_steps.keys() == second.road_steps.keys()
+    for measured in (
+        lambda o: [rotation.R_to_from for rotation in o.relative_rotations],
+        lambda o: [pose.T_from_to for pose in o.steps.relative_poses],
+        lambda o: [pose.sigmas for pose in o.steps.relative_poses],
+        lambda o: [snippet.T_source_target for snippet in o.snippets],
+        lambda o: [road.height_unscaled for road in o.roads if isinstance(road, GroundPlane)],
+        lambda o: [step.length_heights for step in o.road_steps.values()],
+        lambda o: np.concatenate([view.points for view in o.views]),
     ):
-        np.testing.assert_array_equal(seen(late), seen(soon))
-    assert [snippet.target for snippet in late.snippets] == [snippet.target for snippet in soon.snippets]
-    assert [view.index for view in late.views] == [view.index for view in soon.views]
+        np.testing.assert_array_equal(measured(first), measured(second))
+    assert first.steps.motions.keys() == second.steps.motions.keys()
+    assert [snippet.target for snippet in first.snippets] == [snippet.target for snippet in second.snippets]
+    assert [view.index for view in first.views] == [view.index for view in second.views]
+    assert first.interpolated == second.interpolated and first.failures == second.failures
+
+
+def test_the_threads_of_an_observer_end_with_it() -> None:
+    sequence = Damaged(street(), black, range(0))
+    before = set(threading.enumerate())
+    with Observer(oracle_of(sequence), sequence.intrinsics, config_with(), Stopwatch()) as observer:
+        for index in range(8):
+            observer.add(index, sequence.frame(index))
+        assert {thread.name for thread in set(threading.enumerate()) - before} == {"oracle_0", "beside_0"}
+    assert set(threading.enumerate()) == before
+
+
+def test_the_observer_needs_no_torch() -> None:
+    program = "import sys, slam.pipeline.observer; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -1,3 +1,5 @@
+"""The oracle answers with true depth and poses, and errs by the amount asked for."""
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ def depth_of(index: int) -> np.ndarray:
     return np.full((40, 60), 10.0 + index, np.float32)
 
 
-def test_without_noise_it_tells_the_truth_in_its_unit():
+def test_without_noise_answers_are_true_in_the_unscaled_unit():
     oracle: Predictor = OraclePredictor(truth(), depth_of, unscaled_factor=0.5)
     assert oracle.sources == 4
     snippet = oracle.snippet(frames(3))
@@ -65,7 +67,7 @@ def test_noise_has_the_size_asked_for():
     assert 0.02 < np.std(depths) < 0.06
 
 
-def test_drift_is_shared_by_depth_and_motion():
+def test_scale_drift_is_shared_by_depth_and_motion():
     oracle = OraclePredictor(truth(), depth_of, OracleNoise(scale_drift_sigma=0.05))
     ratios = [
         float(oracle.depth(frames(k)[2])[0, 0] / depth_of(k + 2)[0, 0])

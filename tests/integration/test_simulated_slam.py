@@ -74,7 +74,7 @@ def round_trip(street: Rendered) -> SlamResult:
 
 def test_images_and_graph_cut_the_noise_of_the_network(round_trip: SlamResult) -> None:
     assert len(round_trip.optimised) == 250
-    sources = [factor.source for factor in round_trip.observations.geometric]
+    sources = [motion.relative_pose.source for motion in round_trip.observations.steps]
     assert sources.count(ESSENTIAL_SOURCE) > 200
     assert ate(round_trip.network, round_trip) == pytest.approx(1.2, rel=0.2)
     assert ate(round_trip.odometry, round_trip) < 2 * 0.64

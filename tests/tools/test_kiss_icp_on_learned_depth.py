@@ -50,19 +50,6 @@ def test_true_depth_gives_the_true_path(tool: ModuleType) -> None:
     assert error.max() < 0.1 * np.linalg.norm(street.T_world_camera[-1, :3, 3])
 
 
-def test_a_second_run_reads_the_answers_of_the_first(
-    tool: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--frames", "0:8", "--weights", "sim", "--cache", str(tmp_path / "cache"), "--columns", "120"]
-    tables, entries = [], []
-    for _ in range(2):
-        tool.main([*words, "--set", "loops.enabled=false"])
-        tables.append(capsys.readouterr().out)
-        entries.append({path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*") if path.is_file()})
-    assert "kiss-icp, one unit" in tables[0] and tables[0] == tables[1]
-    assert len(entries[0]) == 8 + 4 and entries[0] == entries[1], "one disparity a frame and one answer a snippet"
-
-
 def test_a_cache_that_cannot_be_made_is_one_line(tool: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SystemExit, match="no cache can be made in"):

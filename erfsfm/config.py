@@ -9,9 +9,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from erfsfm import config_tree
-from erfsfm.config_tree import Section, dump_yaml
-
-__all__ = ["ExperimentConfig", "Section", "config_folders", "dump_yaml", "load_experiment"]
+from erfsfm.config_tree import Section
+from erfsfm.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
 

@@ -163,8 +163,10 @@ def _override(tree: dict[str, Any], text: str) -> None:
     except YamlError as error:
         raise ConfigError(f"the value of --set {text} is not YAML: {error}") from error
     for part in parts[:-1]:
-        if not isinstance(tree.setdefault(part, {}), dict):
+        section = tree.get(part, {})
+        if not isinstance(section, dict):
             raise ConfigError(f"--set {text}: '{part}' is not a section")
+        tree[part] = dict(section)  # an alias in the file may have made it another section too
         tree = tree[part]
     tree[parts[-1]] = value
 

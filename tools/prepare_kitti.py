@@ -21,7 +21,7 @@ import numpy as np
 
 from erfsfm.errors import DataError, ErfsfmError
 from erfsfm.files import write_atomically
-from erfsfm.readers.images import image_size, list_images, resize_image
+from erfsfm.readers.images import image_size, list_images, read_values, resize_image
 
 MARK = "prepared.json"
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")
@@ -156,10 +156,7 @@ def _write(job: Job) -> None:
     if job.size is None:
         content = job.source.read_bytes()
     else:
-        image = cv2.imread(str(job.source), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise DataError(f"{job.source} is not a readable image; download it again")
-        small = resize_image(image, job.size.height, job.size.width)
+        small = resize_image(read_values(job.source), job.size.height, job.size.width)
         options = [] if job.target.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPG_QUALITY]
         content = cv2.imencode(job.target.suffix, small, options)[1].tobytes()
     write_atomically(job.target, lambda path: path.write_bytes(content))

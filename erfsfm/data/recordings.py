@@ -126,8 +126,6 @@ class Recording:
 def split_at_gaps(whole: Recording, files: NumberedFiles) -> list[Recording]:
     """The parts of a recording between missing frame numbers, each with the numbers of its files."""
     if files.gaps():
-        logger.warning(
-            "%s: %s; learnt from in %d parts", files.paths[0].parent, files.describe_gaps(), len(files.parts())
-        )
+        logger.warning("%s: %s; split into %d parts", files.paths[0].parent, files.describe_gaps(), len(files.parts()))
     parts = [replace(whole.part(a, b), start=files.first + files.rows[a]) for a, b in files.parts()]
     return [replace(part, stored=len(files.paths)) for part in parts]

@@ -149,7 +149,7 @@ def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
 
 
 def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same motion ``(..., 4, 4)`` seen in a mirror, x turned round."""
+    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
     mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
     return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)
 
@@ -192,7 +192,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     for recording in found:
         validation += _parts(recording, held_out)
         forbidden = [*never, *scenes] if recording.name.startswith("kitti_raw/") else never
-        for part in _parts(recording, ranges) or (_parts(recording, listed) if listed else [recording]):
+        for part in _chosen(recording, ranges, listed):
             if not overlapping([part.frames_name], forbidden):
                 training.append(part)
     if not training:
@@ -207,6 +207,10 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             f"nothing to validate on: data.validation and data.split name {wanted}; found {names}; name one of these, "
             "or train without validation by data.validation=[]"
         )
+    named = config.validation if config.validation != _DEFAULT_VALIDATION else []
+    absent = [name for name in named if not any(FrameRange.parse(name).counted_in(r.name) for r in found)]
+    if absent:
+        logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training, config), _without_stops(validation, config)
 
 
@@ -214,6 +218,14 @@ def _some(names: Sequence[str]) -> str:
     """Names for an error: each once, and the first few of many."""
     distinct = list(dict.fromkeys(names))
     return ", ".join(distinct[:8]) + (f" and {len(distinct) - 8} more" if len(distinct) > 8 else "")
+
+
+def _chosen(recording: Recording, ranges: Sequence[FrameRange], listed: Sequence[FrameRange]) -> list[Recording]:
+    """What to train on of a recording: its ranges, else what the split lists of it, else all where there is no list."""
+    for spans in (ranges, listed):
+        if any(span.counted_in(recording.name) is not None for span in spans):
+            return _parts(recording, spans)
+    return [] if listed else [recording]
 
 
 def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:

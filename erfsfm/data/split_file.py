@@ -11,8 +11,8 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from erfsfm.config import Section, config_folders
-from erfsfm.config_tree import first_problem
+from erfsfm.config import config_folders
+from erfsfm.config_tree import Section, first_problem
 from erfsfm.errors import DataError
 from erfsfm.yaml_file import YamlError, read_yaml
 

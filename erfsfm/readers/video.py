@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import os
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
 _COUNTED_FRAMES = 3000
 _CACHED_FRAMES = 32
 _SKIPPED_FRAMES = 30
+_QUIET = "-8"  # AV_LOG_QUIET
 
 
 class VideoFrames:
@@ -108,6 +110,7 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # the one line of error is ours
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(

@@ -40,7 +40,7 @@ class SelfSupervision(lightning.LightningModule):
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
         self.pose_net.requires_grad_(config.training.networks == "both")
-        self.train()  # Lightning keeps the modes that modules come with
+        self.train()  # Lightning keeps the mode of each module
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
@@ -70,7 +70,7 @@ class SelfSupervision(lightning.LightningModule):
         return result.total
 
     def _refuse_constant(self, disparity: Tensor) -> None:
-        """Stop once the disparity ``(B, 1, H, W)`` has been flat in all images for many steps on end."""
+        """Stop once the disparity ``(B, 1, H, W)`` has been constant in all images for `_CONSTANT_STEPS` steps."""
         spread = float((disparity.std(dim=(1, 2, 3)) / disparity.mean(dim=(1, 2, 3))).max())
         self._constant_steps = self._constant_steps + 1 if spread < _CONSTANT else 0
         if self._constant_steps == _CONSTANT_STEPS:
@@ -120,7 +120,7 @@ class SelfSupervision(lightning.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_validation_epoch_start(self) -> None:
-        """Forget the last validation."""
+        """Start a new validation."""
         self._validation = {}
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:

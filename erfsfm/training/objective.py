@@ -23,7 +23,7 @@ from erfsfm.losses.regularisation import (
 )
 from erfsfm.losses.structure import Bounds, outside, translation_disagreement
 
-HEIGHTS = 10.0  # camera heights in a taught network's unit: steps are hundredths, as the pose network's first outputs
+HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are hundredths, like fresh outputs
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ def evaluate_objective(
         batch: images and intrinsics.
         config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
-    said = _Prediction.of(depth_net, pose_net, batch, config)
+    prediction = _Prediction.of(depth_net, pose_net, batch, config)
     with torch.autocast(batch.target.device.type, enabled=False):
-        return _evaluate(said, batch, config)
+        return _evaluate(prediction, batch, config)
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ def _adjacent(count: int) -> tuple[int, int]:
     return count // 2 - 1, count // 2
 
 
-def _evaluate(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
-    T_source_target = pose_vector_to_matrix(said.pose_vectors)
+def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
+    T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
     if config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
@@ -144,43 +144,43 @@ def _evaluate(said: _Prediction, batch: SnippetBatch, config: ExperimentConfig) 
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: tuple[Tensor, Projection] | None = None
     for level in range(loss.scales):
-        scale = _Level.of(batch, said.disparities[level], config)
+        scale = _Level.of(batch, prediction.disparities[level], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
             warped, projection = scale.warp(T_warp)
-            mask = said.masks[level] if said.masks is not None else None
+            mask = prediction.masks[level] if prediction.masks is not None else None
             photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
             finest = finest or (warped, projection)
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
-    if said.masks is not None and loss.mask_weight > 0:
-        terms["explainability"] = torch.stack([explainability_prior(m) for m in said.masks]).sum()
+    if prediction.masks is not None and loss.mask_weight > 0:
+        terms["explainability"] = torch.stack([explainability_prior(m) for m in prediction.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
     if batch.T_source_target is not None and batch.bounds is not None:
-        taught = _teacher_terms(said, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
-        terms |= taught
+        teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
+        terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
-            total = total + weight * taught[name]
+            total = total + weight * teacher_terms[name]
     if loss.consistency_weight > 0 and finest is not None:
-        terms["consistency"] = _consistency(said.adjacent, finest[1], batch.sources.shape[1])
+        terms["consistency"] = _consistency(prediction.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
     warped_finest = None if finest is None else finest[0].reshape(batch.sources.shape)
-    return ObjectiveResult(total, terms, said.disparities, T_source_target, warped_finest)
+    return ObjectiveResult(total, terms, prediction.disparities, T_source_target, warped_finest)
 
 
 def _teacher_terms(
-    said: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
+    prediction: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
 ) -> dict[str, Tensor]:
     """Loss terms of the teacher's measurements.
 
     Depth and motion are compared after the teacher's unit, which the road measures only roughly, has been fitted to the
     depth network's; the unit itself is a separate term.
     """
-    finest = said.disparities[0]
+    finest = prediction.disparities[0]
     log_scale = bounds.log_scale(finest)
     unit = log_scale.detach()
     structure = sum(
-        (outside(said.disparities[k], bounds.strided(2**k), unit) for k in range(scales)), unit.new_zeros(())
+        (outside(prediction.disparities[k], bounds.strided(2**k), unit) for k in range(scales)), unit.new_zeros(())
     )
     t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
     return {

@@ -1,4 +1,4 @@
-"""The output folder of a training run: whose it is, and what of a run it holds already."""
+"""The output folder of a training run: whether it may be written to, and what of a run it holds already."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # what a run leav
 
 
 class OutputFolder:
-    """Where one run writes; a folder that holds anything but a run of ours is never touched."""
+    """The folder of one run; one that holds files of others is never written to."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -73,7 +73,7 @@ class OutputFolder:
         write_atomically(self.path / CONFIG, lambda path: path.write_text(dump_yaml(config)))
 
     def _has_our_config(self) -> bool:
-        """Whether ``config.yaml`` is what `write_config` writes: complete, which nobody writes by hand."""
+        """Whether ``config.yaml`` is what `write_config` writes: all keys, in its order."""
         try:
             return dump_yaml(load_experiment(self.path / CONFIG)) == (self.path / CONFIG).read_text()
         except ConfigError:

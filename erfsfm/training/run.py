@@ -47,7 +47,7 @@ def train(
 ) -> Path:
     """Train, validate, keep the best.
 
-    With several devices, Lightning starts this very program again for each further one; these end here.
+    With several devices, Lightning starts this program again for each further one; these processes exit here.
 
     Args:
         config: the experiment.
@@ -119,7 +119,7 @@ def _fit(
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
     except DataError as error:
-        # from a worker process it arrives with that process' traceback before its own last line
+        # an error of a worker process has its traceback before the message, its last line
         raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.errors.DataError: ")) from error
     except SystemExit as error:
         # Lightning turns Ctrl-C into an exit
@@ -168,10 +168,10 @@ def _trainer(
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
-        # a term or a scale that is switched off leaves weights without gradient
+        # loss terms and scales that are off leave weights without gradient
         strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
         sync_batchnorm=several and not on_cpu,
-        use_distributed_sampler=False,  # the draws are dealt out already, and every process validates everything
+        use_distributed_sampler=False,  # each process has its own draws, and all validate everything
         precision=precision,
         max_steps=training.steps,
         gradient_clip_val=training.gradient_clip or None,

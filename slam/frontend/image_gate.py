@@ -16,8 +16,11 @@ from slam.frontend.failure import MeasurementFailure
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages what compression changes
 _LEAST_GRADIENT = 1e-3
-# an image is frozen where the one before it still moved by this times the largest difference of a copy
+# an image is frozen where the one before it still moved by this times the usual difference of a copy
 _MOVING = 3.0
+# copies of dark or blurred images differ by more: up to this ratio of the motion before, and twice the usual difference
+_COPY_OVER_MOTION = 0.25
+_LARGEST_COPY = 2.0
 _LEAST_FLIPPED_CORRELATION = 0.3
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
@@ -28,14 +31,14 @@ _Layer = NDArray[np.float32]
 class GateState:
     """What the gate compares the next image with.
 
-    ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and whether it
-    ``moved`` clearly against the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length.
+    ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
+    from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length.
     """
 
     last: Frame | None = None
     verdict: Verdict = "new"
     shrunk: _Layer | None = None
-    moved: bool = False
+    difference: float = 0.0
     usable: _Layer | None = None
     doubtful: _Layer | None = None
 
@@ -100,14 +103,15 @@ class ImageGate:
         """
         height, width = (max(side // _SHRINKING, 1) for side in frame.grey.shape)
         shrunk = cv2.resize(frame.grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        before, limit = self._state.shrunk, self._config.repeat_difference
+        before, limit, motion = self._state.shrunk, self._config.repeat_difference, self._state.difference
         if before is None or before.shape != shrunk.shape:
-            self._state = replace(self._state, shrunk=shrunk, moved=False)
+            self._state = replace(self._state, shrunk=shrunk, difference=0.0)
             return False
         difference = _difference(before, shrunk)
-        if difference < limit and self._state.moved:
+        largest = min(max(limit, _COPY_OVER_MOTION * motion), _LARGEST_COPY * limit)
+        if difference < largest and motion > _MOVING * limit:
             return True
-        self._state = replace(self._state, shrunk=shrunk, moved=difference > _MOVING * limit)
+        self._state = replace(self._state, shrunk=shrunk, difference=difference)
         return False
 
 

@@ -126,8 +126,8 @@ def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> Flo
 def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
     """Factors ``(P, 6)`` on the sigmas of pairs for the correlation of their errors along the drive.
 
-    The network's errors on neighbouring snippets are correlated. Sums of whitened errors over a quarter of the drive are
-    compared with those of independent errors. Where few pairs are measured, errors are taken to be the same over a
+    The network's errors on neighbouring snippets are correlated. Sums of whitened errors over a quarter of the drive
+    are compared with those of independent errors. Where few pairs are measured, errors are taken to be the same over a
     quarter of the drive. Pairs of different distances in frames repeat each other, so each distance counts as a part.
     """
     factors = np.ones_like(whitened)

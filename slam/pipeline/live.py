@@ -29,8 +29,8 @@ from slam.trajectory import Trajectory
 class Slam:
     """Monocular SLAM fed frame by frame; it keeps no images and makes no map.
 
-    Measurements are those of the pipeline, causally. Lengths and noise are estimated anew as the drive goes on, so earlier
-    poses move a little with every update.
+    Measurements are those of the pipeline, causally. Lengths and noise are estimated anew as the drive goes on, so
+    earlier poses move a little with every update.
     """
 
     def __init__(

@@ -12,7 +12,8 @@ from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Frame, Intrinsics, Sequence
 from slam.se3 import FloatArray, invert
 from slam.sequences.excerpt import Excerpt
-from slam.sequences.recording import MAX_GAP_FRAMES, MAX_GAP_S, require_frame
+from slam.sequences.images import MAX_GAP_FRAMES
+from slam.sequences.recording import MAX_GAP_S, require_frame
 
 logger = logging.getLogger(__name__)
 

@@ -7,6 +7,8 @@ from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Image
 
+MAX_GAP_FRAMES = 100
+
 
 class ImageFiles:
     """Images on disk, one row a number, all of the size of the first."""
@@ -16,8 +18,12 @@ class ImageFiles:
 
         Raises:
             DataError: if it cannot be read.
+            SequenceError: if a gap in the numbering is longer than 100 frames.
         """
         self.files = files
+        for first, last in files.gaps():
+            if last - first + 1 > MAX_GAP_FRAMES:
+                raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
         self.height, self.width = read_image(files.paths[0]).shape[:2]
 
@@ -46,3 +52,11 @@ class ImageFiles:
                 f"{self.width}x{self.height}: all images of a sequence need one size; resize or remove it"
             )
         return image
+
+
+def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
+    """What to say of a gap from row ``first`` to ``last`` across which no motion can be interpolated."""
+    return SequenceError(
+        f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
+        f"{last - first + 1} frames is too long to interpolate; split the recording there"
+    )

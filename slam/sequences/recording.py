@@ -20,11 +20,12 @@ from slam import se3
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray
+from slam.sequences.images import too_long
 
 logger = logging.getLogger(__name__)
 
 DEFAULT_FPS = 10.0
-MAX_GAP_FRAMES, MAX_GAP_S = 100, 10.0
+MAX_GAP_S = 10.0
 
 
 class ImageSource(Protocol):
@@ -174,15 +175,11 @@ def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
     """Warn once of missing images, and refuse gaps too long to be interpolated across.
 
     Raises:
-        SequenceError: if a gap is longer than 100 frames or 10 seconds.
+        SequenceError: if a gap is longer than 10 seconds.
     """
     for first, last in files.gaps():
-        seconds = float(stamps[last + 1] - stamps[first - 1])
-        if last - first + 1 > MAX_GAP_FRAMES or seconds > MAX_GAP_S:
-            raise SequenceError(
-                f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
-                f"{last - first + 1} frames and {seconds:.1f} s is too long to interpolate; split the recording there"
-            )
+        if stamps[last + 1] - stamps[first - 1] > MAX_GAP_S:
+            raise too_long(files, first, last)
     if files.gaps():
         logger.warning("%s: %s; the motion across gaps is interpolated", files.paths[0].parent, files.describe_gaps())
 

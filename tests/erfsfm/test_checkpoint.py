@@ -148,7 +148,7 @@ def test_swapped_files(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "- 1", "a: [", "format: 1\n", "format: 2\nnetwork: {}\ntrained_on: []\n", "\x00\x01"]
+    "text", ["", "- 1", "a: [", "[" * 3000, "format: 1\n", "format: 2\nnetwork: {}\ntrained_on: []\n", "\x00\x01"]
 )
 def test_bad_record(folder: Path, text: str) -> None:
     (folder / "model.yaml").write_text(text)

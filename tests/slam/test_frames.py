@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import threading
+
+import cv2
 import numpy as np
 
-from slam.frames import Intrinsics, runs
+from slam.frames import Frame, Intrinsics, RelativePose, runs
 
 
 def test_runs_of_frames() -> None:
@@ -18,3 +21,62 @@ def test_rays_project_back_to_their_pixels() -> None:
     assert grid.shape == (30, 40, 2) and rays.shape == (30, 40, 3)
     np.testing.assert_allclose((rays @ camera.K.T)[..., :2], grid, atol=1e-12)
     assert (rays[..., 2] == 1.0).all()
+
+
+def image(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (30, 40, 3), np.uint8)
+
+
+def test_grey_levels_and_digest_are_made_once_a_frame() -> None:
+    frame = Frame(3, 0.3, image())
+    np.testing.assert_array_equal(frame.grey, cv2.cvtColor(image(), cv2.COLOR_RGB2GRAY))
+    assert frame.grey is frame.grey and frame.digest is frame.digest
+    assert frame.digest == Frame(9, 0.9, image()).digest != Frame(3, 0.3, image(1)).digest
+    assert frame.digest != Frame(3, 0.3, image().reshape(40, 30, 3)).digest  # the shape counts
+
+
+def test_what_is_derived_from_a_frame_is_kept_by_its_key() -> None:
+    frame = Frame(0, 0.0, image())
+    made: list[str] = []
+
+    def make(name: str) -> str:
+        made.append(name)
+        return name
+
+    assert [frame.derived(("layers", k), lambda k=k: make(f"layers {k}")) for k in (1, 2, 1)] == [
+        "layers 1",
+        "layers 2",
+        "layers 1",
+    ]
+    assert made == ["layers 1", "layers 2"]
+    assert Frame(0, 0.0, image()).derived(("layers", 1), lambda: "of another frame") == "of another frame"
+
+
+def test_threads_that_derive_at_once_get_the_same_object() -> None:
+    frame, barrier, found = Frame(0, 0.0, image()), threading.Barrier(8), []
+
+    def make() -> object:
+        barrier.wait(timeout=10)  # all are making it at once
+        return object()
+
+    threads = [threading.Thread(target=lambda: found.append(frame.derived("shared", make))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8 and len(set(map(id, found))) == 1
+
+
+def test_a_relative_pose_in_another_unit_has_other_lengths_only() -> None:
+    T = np.eye(4)
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    measured = RelativePose(3, 4, T, np.arange(1.0, 7.0), "network", np.arange(2.0, 8.0), 4.0)
+    metric = measured.scaled(2.0)
+    np.testing.assert_array_equal(metric.T_from_to[:3, 3], [2.0, 4.0, 6.0])
+    np.testing.assert_array_equal(metric.sigmas, [1, 2, 3, 8, 10, 12])
+    np.testing.assert_array_equal(metric.graph_sigmas, [2, 3, 4, 10, 12, 14])
+    np.testing.assert_array_equal(measured.T_from_to[:3, 3], [1.0, 2.0, 3.0])
+    assert (metric.ends, metric.source, metric.student_t_dof) == ((3, 4), "network", 4.0)
+    uncorrelated = RelativePose(3, 4, T, np.arange(1.0, 7.0), "network").scaled(2.0)
+    assert uncorrelated.correlated_sigmas is None
+    np.testing.assert_array_equal(uncorrelated.graph_sigmas, uncorrelated.sigmas)

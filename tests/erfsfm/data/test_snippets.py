@@ -55,6 +55,28 @@ def coded(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["folder/b"], []),
+        (["folder/b", "folder/c"], ["data.validation names folder/c, which is not among the data"]),
+    ],
+)
+def test_a_validation_that_is_partly_absent_is_said(
+    coded: Path, names: list[str], said: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    _, validation = split_recordings(DataConfig(roots=[coded / "a", coded / "b"], validation=names))
+    assert [recording.name for recording in validation] == ["folder/b"]
+    assert [record.message for record in caplog.records] == said
+
+
+def test_only_the_default_may_name_nothing_to_validate_on(coded: Path) -> None:
+    assert split_recordings(DataConfig(roots=[coded / "a"]))[1] == []
+    assert split_recordings(DataConfig(roots=[coded / "a"], validation=[]))[1] == []
+    with pytest.raises(DataError, match=r"nothing to validate on: .* name folder/c; found folder/a; name one"):
+        split_recordings(DataConfig(roots=[coded / "a"], validation=["folder/c"]))
+
+
 def frames_of(sample: dict[str, Tensor]) -> list[int]:
     """Frame numbers in time order of a sample of ``coded``."""
     colours = [*sample["sources"][:, 0].mean(dim=(1, 2))]
@@ -430,3 +452,19 @@ def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:
     torch.testing.assert_close(
         mirrored["T_source_target"][:, 0, 2], -straight["T_source_target"][:, 0, 2]
     )  # the other way round
+
+
+def test_ranges_and_gaps(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    """A range holds for every part of its recording; a part outside it is not trained on."""
+    root = write_root(tmp_path, frames=12, seed=3)
+    for number in (4, 8):
+        (root / f"sequences/00/image_2/{number:06d}.png").unlink()
+
+    def names(**data: object) -> list[str]:
+        training, _ = split_recordings(DataConfig.model_validate({"roots": [root], "validation": [], **data}))
+        return [recording.frames_name for recording in training]
+
+    assert names() == ["simulated/3[0:4]", "simulated/3[5:8]", "simulated/3[9:12]"]
+    assert names(ranges={"simulated/3": "2:7"}) == ["simulated/3[2:4]", "simulated/3[5:7]"]
+    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that there are"):
+        names(ranges={"simulated/3": "12:"})

@@ -51,6 +51,8 @@ def test_runs_that_are_none(name: str) -> None:
         ("test: a", "test: Input should be a valid list"),
         ("- a", "all of it: Input should be a valid dictionary"),
         ("test: [", "is not YAML"),
+        ("test: " + "[" * 3000, "nested levels"),
+        ("test: [a]\ntest: [b]", "key 'test' stands twice"),
     ],
 )
 def test_files_that_are_no_splits(tmp_path: Path, text: str, words: str) -> None:

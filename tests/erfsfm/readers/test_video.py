@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -63,3 +65,17 @@ def test_returned_images_may_be_written(tmp_path: Path) -> None:
     frames = VideoFrames(write_video(tmp_path / "a.avi"))
     frames.read(5)[:] = 255
     assert decoded(frames.read(5)) == 5
+
+
+def test_a_damaged_video_is_one_line_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """The decoder would print lines of its own past Python."""
+    path = tmp_path / "a.mp4"
+    path.write_bytes(write_video(tmp_path / "b.mp4").read_bytes()[:600])
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom erfsfm.errors import DataError\n"
+        "from erfsfm.readers.video import VideoFrames\n"
+        "try:\n    VideoFrames(Path(sys.argv[1]))\nexcept DataError as error:\n    print(error, file=sys.stderr)"
+    )
+    answer = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    (line,) = answer.stderr.splitlines()
+    assert "a.mp4 cannot be opened: it is damaged" in line

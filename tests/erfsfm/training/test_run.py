@@ -575,7 +575,7 @@ def test_a_broken_image_is_one_line(
     root = write_root(tmp_path / "root", frames=4)
     for index in (1, 2):
         (root / f"sequences/00/image_2/{index:06d}.png").write_bytes(b"broken")
-    with pytest.raises(DataError, match=r"00000[12]\.png is missing or not a readable image") as caught:
+    with pytest.raises(DataError, match=r"00000[12]\.png cannot be decoded") as caught:
         train(configure(small, [root], data={"workers": workers}), tmp_path / "run", device="cpu")
     assert "\n" not in str(caught.value)
 

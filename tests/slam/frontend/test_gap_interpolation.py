@@ -1,4 +1,4 @@
-"""Gaps are closed with the motion around them, and with doubt."""
+"""Gaps are interpolated with the motion around them, and with wide sigmas."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, InterpolatedGaps, interpolate_gaps, network_steps
 from slam.frontend.network_factors import chain_raw
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.motion import Motion
 from slam.se3 import FloatArray, chain, from_rotation_vector, invert
 
 CONFIG = GapsConfig()
@@ -33,28 +35,26 @@ def snippets_of(T_world_camera: FloatArray, unusable: set[int]) -> list[SnippetP
     return [snippet(T_world_camera, t) for t in targets if not unusable & set(range(t - 2, t + 3))]
 
 
-def measured(T_world_camera: FloatArray, first: int, last: int) -> RelativePose:
+def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
     T_from_to = invert(T_world_camera[first]) @ T_world_camera[last]
-    return RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential")
+    return Motion(RelativePose(first, last, T_from_to, np.full(6, 0.01), "essential"))
 
 
-def closed(
-    T_world_camera: FloatArray, unusable: set[int], geometric: list[RelativePose] | None = None, repeated: tuple = ()
-) -> InterpolatedGaps:
+def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> InterpolatedGaps:
     snippets = snippets_of(T_world_camera, unusable)
     reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(len(T_world_camera), 4, snippets, geometric or [], reasons, repeated, CONFIG)
+    return interpolate_gaps(len(T_world_camera), 4, snippets, StepTable.of(steps), reasons, (), CONFIG)
 
 
-def test_nothing_to_bridge_changes_nothing() -> None:
-    snippets, geometric = snippets_of(steady(), set()), [measured(steady(), 3, 4)]
-    found = interpolate_gaps(COUNT, 4, snippets, geometric, {}, (), CONFIG)
-    assert found.snippets == found.trusted == snippets and found.geometric == geometric
+def test_a_drive_without_gaps_stays_as_it_was() -> None:
+    snippets, steps = snippets_of(steady(), set()), StepTable.of([measured(steady(), 3, 4)])
+    found = interpolate_gaps(COUNT, 4, snippets, steps, {}, (), CONFIG)
+    assert found.snippets == found.trusted == snippets and found.steps is steps
     assert found.interpolated == [] and found.frames == {}
 
 
 @pytest.mark.parametrize("gap", [{20}, set(range(15, 25)), {0}, {39}, {3, 20, 21}, {10, 12, 14, 16}])
-def test_a_steady_drive_is_bridged_exactly(gap: set[int]) -> None:
+def test_a_gap_of_a_steady_drive_is_interpolated_exactly(gap: set[int]) -> None:
     found = closed(steady(), gap)
     assert set(found.frames) == gap and found.frames[min(gap)] == "black"
     np.testing.assert_allclose(chain_raw(found.snippets, COUNT), steady(), atol=1e-9)
@@ -68,7 +68,7 @@ def test_a_steady_drive_is_bridged_exactly(gap: set[int]) -> None:
     assert linked == set(range(COUNT - 1))
 
 
-def test_the_motion_goes_over_from_before_to_after() -> None:
+def test_the_motion_changes_evenly_from_before_to_after() -> None:
     lengths = np.r_[np.full(19, 1.0), np.full(20, 3.0)]
     drive = chain(from_rotation_vector(np.zeros((39, 3)), np.stack([0 * lengths, 0 * lengths, lengths], axis=1)))
     steps = {f.from_index: f.T_from_to[2, 3] for f in closed(drive, set(range(15, 25))).interpolated}
@@ -76,61 +76,76 @@ def test_the_motion_goes_over_from_before_to_after() -> None:
     assert values == sorted(values) and 1.0 < values[0] < 1.5 and 2.5 < values[-1] < 3.0
 
 
-def test_a_gap_that_image_geometry_spans_is_shared_out() -> None:
+def test_a_step_over_a_gap_is_divided_into_equal_ones() -> None:
     drive = steady()
     drive[25:] = drive[14] @ from_rotation_vector(np.array([0.0, 0.4, 0.0]), np.array([1.0, 0.0, 5.0])) @ drive[:15]
-    spanning = measured(drive, 14, 25)
-    found = closed(drive, set(range(15, 25)), [spanning])
+    over_gap = measured(drive, 14, 25)
+    found = closed(drive, set(range(15, 25)), over_gap)
     inside = [f.T_from_to for f in found.interpolated if 14 <= f.from_index < 25]
-    np.testing.assert_allclose(chain(np.array(inside))[-1], spanning.T_from_to, atol=1e-9)
-    assert spanning in found.geometric
+    np.testing.assert_allclose(chain(np.array(inside))[-1], over_gap.relative_pose.T_from_to, atol=1e-9)
+    assert found.steps.motions[14, 25] is over_gap
 
 
-def test_steps_measured_by_image_geometry_need_no_bridge() -> None:
-    found = closed(steady(), {10, 12}, [measured(steady(), 5, 6), measured(steady(), 8, 9)])
+def test_steps_measured_by_image_geometry_are_not_interpolated() -> None:
+    found = closed(steady(), {10, 12}, measured(steady(), 5, 6), measured(steady(), 8, 9))
     assert [f.from_index for f in found.interpolated] == [9, 10, 11, 12]
     assert [f.from_index for f in closed(steady(), {2}).interpolated] == [0, 1, 2]
 
 
+def test_a_step_that_skips_usable_frames_does_not_change_the_interpolation() -> None:
+    """A step from a keyframe beside those from frame to frame; its frames are measured by the network."""
+    without, beside = closed(steady(), {20}), closed(steady(), {20}, measured(drifting(), 5, 11))
+    assert [f.ends for f in beside.interpolated] == [f.ends for f in without.interpolated]
+    for one, other in zip(without.interpolated, beside.interpolated, strict=True):
+        np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
+    assert list(beside.steps.motions) == [(5, 11)]
+
+
+def drifting() -> FloatArray:
+    return chain(np.tile(from_rotation_vector(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 2.0])), (COUNT - 1, 1, 1)))
+
+
 def repeating(frozen: bool) -> tuple[InterpolatedGaps, FloatArray]:
     """Ten repeated images: the camera drove on, or stood."""
-    steps = np.tile(STEP, (COUNT - 1, 1, 1))
+    T_steps = np.tile(STEP, (COUNT - 1, 1, 1))
     if not frozen:
-        steps[14:24] = np.eye(4)
-    true = chain(steps)
+        T_steps[14:24] = np.eye(4)
+    true = chain(T_steps)
     seen = true.copy()
     seen[15:25] = seen[14]
-    geometric = [measured(seen, k, k + 1) for k in range(COUNT - 1)]
+    steps = StepTable.of(measured(seen, k, k + 1) for k in range(COUNT - 1))
     snippets = snippets_of(seen, set())
-    return interpolate_gaps(COUNT, 4, snippets, geometric, {}, range(15, 25), CONFIG), true
+    return interpolate_gaps(COUNT, 4, snippets, steps, {}, range(15, 25), CONFIG), true
 
 
-def test_repeated_images_of_a_moving_camera_are_bridged() -> None:
+def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
     found, true = repeating(frozen=True)
     assert set(found.frames) == set(range(15, 25)) and "stands still" in found.frames[15]
     assert [f.from_index for f in found.interpolated] == list(range(14, 25))
     np.testing.assert_allclose(chain(np.array([f.T_from_to for f in found.interpolated])), true[:12], atol=1e-9)
-    assert [(f.from_index, f.to_index) for f in found.geometric if f.to_index - f.from_index > 1] == [(14, 25)]
+    assert [ends for ends in found.steps.motions if ends[1] - ends[0] > 1] == [(14, 25)]
+    assert not any(set(range(15, 25)).intersection(ends) for ends in found.steps.motions)
 
 
 def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
     found, _ = repeating(frozen=False)
     assert found.frames == {} and found.interpolated == [] and len(found.trusted) == COUNT - 4
+    assert len(found.steps) == COUNT - 1
 
 
 def test_repetition_to_the_end_is_standing_still() -> None:
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(COUNT, 4, snippets_of(still, set()), [], {}, range(1, COUNT), CONFIG)
+    found = interpolate_gaps(COUNT, 4, snippets_of(still, set()), StepTable({}), {}, range(1, COUNT), CONFIG)
     assert found.frames == {} and found.interpolated == []
 
 
 def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
-        interpolate_gaps(COUNT, 4, [], [], reasons, (), CONFIG)
+        interpolate_gaps(COUNT, 4, [], StepTable({}), reasons, (), CONFIG)
 
 
-def test_direct_answers_of_the_target_make_the_steps() -> None:
+def test_steps_are_the_direct_poses_of_the_target() -> None:
     first, second = snippet(steady(), 2), snippet(steady(), 3)
     bent = second.T_source_target.copy()
     bent[2, 0, 3] += 0.1  # source 4, the next of target 3

@@ -1,17 +1,22 @@
-"""Pictures of a street pass whatever their light; darkness, noise and repetition are told."""
+"""Images of a street pass whatever their light; blank, noisy, frozen and upside-down ones are detected."""
 
 from __future__ import annotations
 
 import functools
 
+import cv2
 import numpy as np
 import pytest
 
 from slam.config import GapsConfig
-from slam.frames import Image
+from slam.frames import Frame, Image
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+
+UNLIKE = "the image is unlike those before it"
+UPSIDE_DOWN = "the image is upside down"
+QUALITIES = range(60, 90, 3)
 
 
 @functools.cache
@@ -24,9 +29,38 @@ def noise(seed: int) -> Image:
     return np.random.default_rng(seed).integers(0, 255, (64, 208, 3), np.uint8)
 
 
-def verdicts(images: list[Image]) -> list[str]:
-    gate = ImageGate(GapsConfig())
-    return [v.reason if isinstance(v, MeasurementFailure) else v for v in map(gate.check, images)]
+def frames_of(images: list[Image]) -> list[Frame]:
+    return [Frame(k, 0.1 * k, image) for k, image in enumerate(images)]
+
+
+def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
+    gate = gate or ImageGate(GapsConfig())
+    return [v.reason if isinstance(v, MeasurementFailure) else v for v in map(gate.check, frames_of(images))]
+
+
+def jpeg(image: Image, quality: int) -> Image:
+    """Encoded and decoded again."""
+    _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
+
+
+def upside_down(image: Image) -> Image:
+    return np.ascontiguousarray(image[::-1, ::-1])
+
+
+@functools.cache
+def wide() -> Image:
+    """A wide image with structures of all sizes."""
+    rng = np.random.default_rng(0)
+    layers = [cv2.GaussianBlur(rng.normal(size=(64, 700)), (0, 0), sigma) for sigma in (1.0, 3.0, 20.0)]
+    grey = 128.0 + sum(weight * layer / layer.std() for weight, layer in zip((15.0, 15.0, 40.0), layers, strict=True))
+    return np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def panned(positions_px: np.ndarray) -> list[Image]:
+    """What a camera sees that moves along the wide image."""
+    shifts = [np.float32([[1, 0, -position], [0, 1, 0]]) for position in positions_px]
+    return [cv2.warpAffine(wide(), shift, (208, 64), flags=cv2.INTER_LINEAR) for shift in shifts]
 
 
 @pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
@@ -46,17 +80,88 @@ def test_noise_is_refused_also_where_it_repeats() -> None:
     assert found == ["new"] * 2 + ["the image is noise"] * 3 + ["new"] * 3
 
 
-def test_another_picture_is_damage_once_and_a_new_scene_twice() -> None:
-    other = [image[:, ::-1][::-1] for image in street()]  # upside down: sky below, road above
-    assert verdicts([*street()[:3], other[3], *street()[4:6]]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
-    assert verdicts([*street()[:3], *other[3:6]]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
+def test_an_unlike_image_is_damage_once_and_a_new_scene_twice() -> None:
+    other = panned(10.0 * np.arange(3))
+    assert verdicts([*street()[:3], other[0], *street()[4:6]]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
+    assert verdicts([*street()[:3], *other]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
 
 
-UNLIKE = "the image is unlike those before it"
-
-
-def test_repetition_is_told_by_the_bytes() -> None:
+def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
     first, second = street()[:2]
     almost = second.copy()
     almost[0, 0, 0] ^= 1
-    assert verdicts([first, second, second.copy(), second, almost]) == ["new", "new", "repeated", "repeated", "new"]
+    assert verdicts([first, second, second.copy(), second]) == ["new", "new", "repeated", "repeated"]
+    assert verdicts([first, almost, second]) == ["new", "new", "repeated"]  # a bit is no motion
+    assert verdicts([second, almost]) == ["new", "new"]  # the camera has not moved yet
+
+
+@pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
+@pytest.mark.parametrize("first", [3, 9, 15])
+def test_ten_copies_encoded_again_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
+    images = street(hazards)
+    copies = [jpeg(images[first], quality) for quality in QUALITIES]
+    assert len(copies) == 10 and not any(np.array_equal(copy, images[first]) for copy in copies)
+    found = verdicts([*images[: first + 1], *copies, *images[first + 11 :]])
+    assert found == ["new"] * (first + 1) + ["repeated"] * 10 + ["new"] * (len(images) - first - 11)
+
+
+def test_copies_are_detected_where_every_image_is_compressed() -> None:
+    images = [jpeg(image, 75) for image in street()]
+    frozen = [jpeg(street()[9], quality) for quality in QUALITIES]
+    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 10
+    assert set(verdicts(images)) == {"new"}
+
+
+def test_a_freeze_of_a_slow_camera_is_detected() -> None:
+    """At two pixels a frame; the drive goes on where the camera is by then."""
+    images = panned(2.0 * np.arange(40))
+    frozen = [jpeg(images[9], quality) for quality in QUALITIES]
+    assert verdicts([*images[:10], *frozen, *images[20:]]) == ["new"] * 10 + ["repeated"] * 10 + ["new"] * 20
+
+
+@pytest.mark.parametrize("braking_px", [0.2, 0.4])
+def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> None:
+    """Compressed anew in every frame, so that no two images of the standing camera have the same bytes."""
+    speeds = np.concatenate([np.full(8, 4.0), np.arange(4.0, 0.0, -braking_px), np.zeros(12), np.arange(0.0, 4.0, 0.5)])
+    images = panned(np.cumsum(speeds))
+    rng = np.random.default_rng(0)
+    noisy = [np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).astype(np.uint8) for image in images]
+    assert set(verdicts([jpeg(image, 60 + k % 28) for k, image in enumerate(noisy)])) == {"new"}
+
+
+def test_a_simulated_stop_is_not_frozen() -> None:
+    drive = SimulatedStreet(SimulationOptions("straight", 60, 704, 208, 64, ("stop",)))
+    steps = np.linalg.norm(np.diff(drive.T_world_camera[:, :3, 3], axis=0), axis=1)
+    assert (steps < 1e-9).sum() >= 10 and (steps > 0.5).sum() >= 10
+    images = [jpeg(drive.render(k).image, 60 + k % 28) for k in range(60)]
+    assert set(verdicts(images)) == {"new"}
+
+
+@pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
+def test_ten_upside_down_images_are_refused_and_the_drive_goes_on(hazards: tuple[str, ...]) -> None:
+    images = street(hazards)
+    found = verdicts([*images[:10], *map(upside_down, images[10:20]), *images[20:]])
+    assert found == ["new"] * 10 + [UPSIDE_DOWN] * 10 + ["new"] * 10
+
+
+def test_a_gate_goes_on_from_its_state() -> None:
+    images = [*street()[:8], *(jpeg(street()[7], quality) for quality in QUALITIES), *street()[18:]]
+    images[20:24] = map(upside_down, images[20:24])
+    whole = verdicts(images)
+    assert len(set(whole)) == 3
+    for split in range(len(images)):
+        first = ImageGate(GapsConfig())
+        before = verdicts(images[:split], first)
+        assert before + verdicts(images[split:], ImageGate(GapsConfig(), first.state())) == whole
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["00", "02", "05"])
+def test_freezes_and_flips_are_detected_on_real_frames(data_root, name: str) -> None:
+    folder = data_root / "kitti_odometry" / "sequences" / name / "image_0"
+    images = [cv2.imread(str(path)) for path in sorted(folder.iterdir())[:60]]
+    assert set(verdicts(images)) == {"new"}
+    frozen = [*images[:20], *(jpeg(images[19], quality) for quality in QUALITIES), *images[30:]]
+    assert verdicts(frozen) == ["new"] * 20 + ["repeated"] * 10 + ["new"] * 30
+    flipped = [*images[:20], *map(upside_down, images[20:30]), *images[30:]]
+    assert verdicts(flipped) == ["new"] * 20 + [UPSIDE_DOWN] * 10 + ["new"] * 30

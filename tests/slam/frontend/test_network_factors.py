@@ -1,3 +1,7 @@
+"""The pose network's snippets as factors with measured noise, and as the raw trajectory."""
+
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -124,16 +128,30 @@ def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_saw_l
     assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3], CONFIG) == CONFIG
 
 
-def test_the_network_bridges_what_geometry_did_not_measure():
+def test_the_network_serves_where_geometry_did_not_measure():
     T = drive(20)
     factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
     assert without_measured(factors, geometric) == []
     assert without_measured(factors, []) == factors
     gap = without_measured(factors, geometric[:9] + geometric[10:])
-    pairs = {tuple(sorted((f.from_index, f.to_index))) for f in gap}
-    assert pairs == {(9, 10), (8, 10), (9, 11)}
-    over_two = [RelativePose(9, 11, T[0], np.ones(6), "essential")]
-    assert without_measured(factors, geometric[:9] + geometric[10:] + over_two) == gap
+    assert pairs_of(gap) == {(9, 10), (8, 10), (9, 11)}
+
+
+def test_a_step_that_skips_frames_replaces_the_network_between_its_frames_alone():
+    """Geometry measured from frame 9 to 11 at once, and not the single steps between them."""
+    T = drive(20)
+    factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
+    over_two = RelativePose(9, 11, se3.invert(T[9]) @ T[11], np.ones(6), "essential")
+    gap = without_measured(factors, [*geometric[:9], over_two, *geometric[11:]])
+    assert pairs_of(gap) == {(9, 10), (8, 10), (10, 11), (10, 12)}
+    beside = without_measured(factors, [*geometric[:9], over_two, *geometric[10:]])
+    assert pairs_of(beside) == {(9, 10), (8, 10)}
+    alone = without_measured(factors, [over_two])
+    assert len(factors) - len(alone) == 2 and (9, 11) not in pairs_of(alone)
+
+
+def pairs_of(factors) -> set[tuple[int, int]]:
+    return {tuple(sorted(factor.ends)) for factor in factors}
 
 
 NOISE = PoseNoise(
@@ -186,7 +204,23 @@ def test_a_drive_scales_measured_noise_both_ways():
     assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # no further, however well both agree
     few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG)
     np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
-    assert {f.student_t_dof for f in few} == {np.inf}  # the law as it lies beside the weights
+    assert {f.student_t_dof for f in few} == {np.inf}  # as it lies beside the weights
+
+
+def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
+    """Geometry leads over two frames at a time: pairs of neighbours keep the noise beside the weights."""
+    T = drive(300)
+    snippets = wobbling(T, np.full(300, 0.05))
+    over_two = [
+        RelativePose(k, k + 2, se3.invert(T[k]) @ T[k + 2], np.full(6, 1e-6), "essential") for k in range(0, 298, 2)
+    ]
+    scaled = sigmas_of(calibrated_factors(snippets, over_two, NOISE, CONFIG))
+    promised = 0.01 * np.sqrt(0.75)
+    np.testing.assert_allclose(scaled[50, 51], promised, rtol=1e-3)
+    single = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
+    for pair in ((50, 52), (51, 53)):  # steps begin at even frames, the scaling is that of the distance
+        assert scaled[pair][0] == pytest.approx(single[pair][0], rel=0.25)
+        assert scaled[pair][0] > 2 * promised
 
 
 def test_turns_are_scaled_apart_from_straights():
@@ -200,7 +234,7 @@ def test_turns_are_scaled_apart_from_straights():
     assert np.median(turning) > 5 * np.median(straight)
 
 
-def test_what_geometry_does_not_know_the_network_does_not_know():
+def test_noise_of_geometry_is_added_to_that_of_the_network():
     T = drive(100)
     geometric = [replace(g, sigmas=np.full(6, 0.4)) for g in geometry_of(T)]
     factors = sigmas_of(calibrated_factors(snippets_of(T), geometric, NOISE, CONFIG))
@@ -210,13 +244,13 @@ def test_what_geometry_does_not_know_the_network_does_not_know():
     np.testing.assert_allclose(without_one[50, 51], 0.4, rtol=1e-2)
 
 
-def test_turns_that_are_all_alike_are_one_kind():
+def test_turns_that_are_all_alike_share_one_scaling():
     T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
     factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE, CONFIG))
     np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)
 
 
-def test_the_graph_takes_errors_that_last_for_more_than_errors_that_change():
+def test_correlated_errors_get_larger_sigmas_in_the_graph():
     """The pitch of each step errs anew, its roll always to the same side; both by about as much."""
     rng, count = np.random.default_rng(2), 400
     ahead = np.tile([0.0, 0.0, 1.0], (count - 1, 1))
@@ -230,11 +264,11 @@ def test_the_graph_takes_errors_that_last_for_more_than_errors_that_change():
         )
         for distance in (1, 2)
     }
-    # pairs of both distances say the same twice; of a hundred steps' equal errors a graph would expect ten
+    # pairs of both distances measure the same twice; a hundred equal errors add up to ten times independent ones
     assert longer[1][0] == pytest.approx(np.sqrt(2), rel=0.3)
     assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
     assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)
     few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE, CONFIG)
-    for distance, pairs in ((1, 397), (2, 398)):  # nothing is known of them: as if they lasted for a quarter
+    for distance, pairs in ((1, 397), (2, 398)):  # too few to tell: taken to last for a quarter of the drive
         ratios = [f.graph_sigmas / f.sigmas for f in few if f.to_index - f.from_index == distance]
         np.testing.assert_allclose(ratios, np.sqrt(pairs // 4) * np.sqrt(2))

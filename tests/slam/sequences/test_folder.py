@@ -63,7 +63,7 @@ def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
         open_sequence(tmp_path).frame(2)
 
 
-@pytest.mark.parametrize("fps, last", [(50, 202), (5, 60)], ids=["frames", "seconds"])
+@pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
 def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml.replace("fps: 5", f"fps: {fps}"))

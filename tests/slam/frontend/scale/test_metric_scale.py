@@ -1,58 +1,93 @@
+"""The unit of a run and the lengths of its steps, by mode, on a drawn drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from slam import se3
 from slam.config import LengthConfig, LidarConfig, ScaleConfig
-from slam.frames import RelativePose
+from slam.frames import Ends, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
 from slam.frontend.scale.road_homography import RoadStep
-from slam.frontend.scale.road_plane import GroundPlane, ScaleEstimate
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.frontend.visual.epipolar import TriangulatedPoints
-from slam.frontend.visual.odometry import Motion
+from slam.frontend.visual.motion import Motion
 
 DOWN = np.array([0.0, 1.0, 0.0])
 HEIGHT_M = 1.65
 UNIT = 0.05  # unscaled lengths per metre
 STEPS_M = 1.0 + 0.2 * np.sin(np.arange(60) / 6.0)
-NO_STRUCTURE = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
+FRAMES = len(STEPS_M) + 1
+SINGLE = [(k, k + 1) for k in range(FRAMES - 1)]
+NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
+
+
+def metres(ends: Ends) -> float:
+    """True length of a straight step."""
+    return float(STEPS_M[ends[0] : ends[1]].sum())
+
+
+def step(ends: Ends, unit: float, source: str) -> RelativePose:
+    T = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres(ends)]))
+    return RelativePose(*ends, T, np.ones(6), source)
 
 
 def measured(
-    road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M
+    road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
 ) -> LengthMeasurements:
-    """A straight drive; ``bias`` makes the learned road lie too near, ``lidar`` steps have scans."""
-    poses = [se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, length])) for length in STEPS_M]
-    motions = {}
-    for k, T in enumerate(poses):
-        unscaled = T.copy()
-        unscaled[:3, 3] *= UNIT
-        motions[k] = Motion(RelativePose(k, k + 1, unscaled, np.ones(6), "essential"), NO_STRUCTURE, np.zeros(3))
+    """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
+    motions = {ends: Motion(step(ends, UNIT, "essential"), NO_POINTS, np.zeros(3)) for ends in steps}
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )
-    roads = {k: RoadStep(length / height_m, 0.06, DOWN) for k, length in enumerate(STEPS_M)} if road else {}
-    scans = [RelativePose(k, k + 1, poses[k], np.ones(6), "lidar") for k in range(lidar)]
-    return LengthMeasurements([plane] * (len(STEPS_M) + 1), motions, roads, scans)
+    roads = {ends: RoadStep(metres(ends) / height_m, 0.06, DOWN) for ends in steps} if road else {}
+    scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
+    return LengthMeasurements([plane] * FRAMES, motions, roads, scans)
 
 
 def find(mode, measurements: LengthMeasurements, height_m: float | None = HEIGHT_M) -> Scale:
     return find_scale(mode, height_m, measurements, ScaleConfig(), LengthConfig(), LidarConfig())
 
 
+def lengths(scale: Scale) -> dict[Ends, float]:
+    """Lengths of steps in the mode's unit."""
+    return {ends: length.value * scale.per_frame[ends[0]] for ends, length in scale.lengths.items()}
+
+
+def assert_lengths(scale: Scale, expected: dict[Ends, float], rtol: float) -> None:
+    found = lengths(scale)
+    assert found.keys() == expected.keys()
+    np.testing.assert_allclose([found[ends] for ends in expected], list(expected.values()), rtol=rtol)
+
+
+TRUE_M = {ends: metres(ends) for ends in SINGLE}
+
+
 @pytest.mark.parametrize(("mode", "unit_m"), [("camera-height", 1.0), ("none", HEIGHT_M), ("reference", HEIGHT_M)])
 @pytest.mark.parametrize("planes", [True, False])
-def test_the_road_in_the_image_overrules_the_learned_road(mode, unit_m, planes):
+def test_the_road_in_the_image_outweighs_the_learned_road(mode, unit_m, planes):
     scale = find(mode, measured(planes=planes, bias=0.7))
-    np.testing.assert_allclose(scale.lengths * unit_m, STEPS_M, rtol=0.02)
+    assert_lengths(scale, {ends: length / unit_m for ends, length in TRUE_M.items()}, rtol=0.02)
     np.testing.assert_allclose(scale.per_frame * unit_m, 1 / UNIT, rtol=0.03)
     assert isinstance(scale.estimate, ScaleEstimate)
     assert scale.estimate.frames_used == len(STEPS_M) and scale.estimate.spread < 0.02
 
 
+def test_lengths_are_unscaled_and_have_sigmas():
+    scale = find("camera-height", measured())
+    for ends, length in scale.lengths.items():
+        assert length.value == pytest.approx(UNIT * metres(ends), rel=0.03)
+        assert 0 < length.relative_sigma <= 0.06 and length.relative_correlated_sigma >= length.relative_sigma
+
+
 def test_without_a_road_in_the_image_the_learned_road_stands():
     scale = find("camera-height", measured(road=False))
-    np.testing.assert_allclose(scale.lengths, STEPS_M, rtol=1e-4)
+    assert_lengths(scale, TRUE_M, rtol=1e-4)
     assert isinstance(scale.estimate, ScaleEstimate)
 
 
@@ -60,22 +95,59 @@ def test_without_any_road_lengths_stay_unscaled():
     scale = find("camera-height", measured(road=False, planes=False))
     assert isinstance(scale.estimate, MeasurementFailure)
     np.testing.assert_allclose(scale.per_frame, 1.0, rtol=1e-12)
-    np.testing.assert_allclose(scale.lengths, UNIT * STEPS_M, rtol=1e-6)
+    assert_lengths(scale, {ends: UNIT * length for ends, length in TRUE_M.items()}, rtol=1e-6)
 
 
 def test_lidar_measures_its_steps_and_the_height_for_the_others():
-    """The camera is really 2 m high; nobody was told, or was told wrong."""
-    for told in (None, HEIGHT_M):
-        scale = find("lidar", measured(lidar=20, height_m=2.0), told)
-        np.testing.assert_allclose(scale.lengths, STEPS_M, rtol=0.02)
+    """The camera is really 2 m high; the height given is missing or wrong."""
+    for given in (None, HEIGHT_M):
+        scale = find("lidar", measured(lidar=20, height_m=2.0), given)
+        assert_lengths(scale, TRUE_M, rtol=0.02)
 
 
-def test_a_later_estimate_rescales_everything_and_a_refusal_nothing():
+def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
+    """Steps of three frames in the middle, and frames 40 to 45 without a step at all."""
+    steps = [*SINGLE[:15], *((k, k + 3) for k in range(15, 39, 3)), (39, 40), *SINGLE[45:]]
+    scale = find("camera-height", measured(bias=0.7, steps=steps))
+    assert_lengths(scale, {ends: metres(ends) for ends in steps}, rtol=0.02)
+    np.testing.assert_allclose(scale.per_frame, 1 / UNIT, rtol=0.03)
+    assert scale.estimate.frames_used == len(steps)
+    unscaled = find("camera-height", measured(road=False, planes=False, steps=steps))
+    assert_lengths(unscaled, {ends: UNIT * metres(ends) for ends in steps}, rtol=1e-6)
+
+
+def test_lengths_are_unscaled_by_the_unit_at_their_first_frames():
+    """The unit of learned depth drifts by a tenth; lengths by it alone are those of the motions."""
+    steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
+    drifting = np.linspace(1.0, 1.1, FRAMES)
+    planes = [GroundPlane(HEIGHT_M * UNIT / unit, DOWN, 1.0) for unit in drifting]
+    scale = find("camera-height", replace(measured(road=False, steps=steps), planes=planes))
+    assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
+    for ends in steps:
+        assert scale.lengths[ends].value == pytest.approx(UNIT * metres(ends), rel=1e-4)
+
+
+def test_a_step_inside_of_a_longer_one_is_no_link_and_has_no_length():
+    steps = [*SINGLE[:10], (10, 13), (11, 12), *SINGLE[13:]]
+    scale = find("camera-height", measured(steps=steps))
+    assert_lengths(scale, {ends: metres(ends) for ends in steps if ends != (11, 12)}, rtol=0.02)
+
+
+def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
+    scale = find("camera-height", measured())
+    drifting = Scale(scale.mode, scale.estimate, np.arange(1.0, FRAMES + 1), {})
+    assert drifting.unit_at(step((4, 7), 1.0, "essential")) == 5.0
+    backwards = RelativePose(9, 6, np.eye(4), np.ones(6), "network")
+    assert drifting.unit_at(backwards) == 7.0
+
+
+def test_a_later_estimate_scales_everything_and_a_failure_nothing():
     scale = find("none", measured())
     doubled = scale.in_unit_of(ScaleEstimate(2.0, 0.1, 9))
-    np.testing.assert_allclose(doubled.lengths, 2.0 * scale.lengths)
+    assert_lengths(doubled, {ends: 2.0 * length for ends, length in lengths(scale).items()}, rtol=1e-12)
     np.testing.assert_allclose(doubled.per_frame, 2.0 * scale.per_frame)
     assert isinstance(doubled.estimate, ScaleEstimate) and doubled.estimate.frames_used == 9
     refused = scale.in_unit_of(MeasurementFailure("it stands"))
-    np.testing.assert_array_equal(refused.lengths, scale.lengths)
+    assert refused.lengths == scale.lengths
+    np.testing.assert_array_equal(refused.per_frame, scale.per_frame)
     assert refused.estimate == MeasurementFailure("it stands")

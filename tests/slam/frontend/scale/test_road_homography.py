@@ -1,3 +1,7 @@
+"""The length of a step by the homography of a drawn road."""
+
+from __future__ import annotations
+
 import cv2
 import numpy as np
 import pytest
@@ -12,8 +16,7 @@ from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = RoadConfig()
 HEIGHT_M = 1.65
-V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
-RAYS = np.stack([(U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy, np.ones(U.shape)], axis=-1)
+RAYS = CAMERA.rays(CAMERA.pixel_grid())
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def pitched(pitch_deg: float) -> np.ndarray:
 def measure(
     texture, step: np.ndarray, pitch_deg: float = 0.0, config=CONFIG, car_ahead=False
 ) -> RoadStep | MeasurementFailure:
-    """One step of a camera that looks down by ``pitch_deg``; the aligner is told the direction only."""
+    """One step of a camera that looks down by ``pitch_deg``; only the direction of its motion is given."""
     T_body_camera = pitched(-pitch_deg)
     previous = render(T_body_camera, texture, 0, car_ahead)
     current = render(step @ T_body_camera, texture, 1, car_ahead)
@@ -84,8 +87,8 @@ def test_a_car_ahead_does_not_shorten_the_step(texture):
 def test_a_car_that_covers_the_road_is_refused(texture):
     """All that the strip shows far ahead drives as fast as the camera, and below it the road is even."""
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    refusal = RoadHomography(CONFIG, CAMERA).measure(*behind_a_car(texture, rows=90), step)
-    assert isinstance(refusal, MeasurementFailure) and "stands still" in refusal.reason
+    failure = RoadHomography(CONFIG, CAMERA).measure(*behind_a_car(texture, rows=90), step)
+    assert isinstance(failure, MeasurementFailure) and "stands still" in failure.reason
 
 
 def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(texture):
@@ -103,16 +106,34 @@ def test_what_is_no_road_is_refused_with_a_reason(texture):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
-    refusal = RoadHomography(CONFIG, CAMERA).measure(*noise, step)
-    assert isinstance(refusal, MeasurementFailure) and "looks different" in refusal.reason
+    failure = RoadHomography(CONFIG, CAMERA).measure(*noise, step)
+    assert isinstance(failure, MeasurementFailure) and "looks different" in failure.reason
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
-    refusal = RoadHomography(CONFIG, sky).measure(*noise, step)
-    assert isinstance(refusal, MeasurementFailure) and "too little of the road" in refusal.reason
-    refusal = measure(texture, step, pitch_deg=3.0, config=RoadConfig(max_tilt_deg=0.01, tilt_sigma_deg=5.0))
-    assert isinstance(refusal, MeasurementFailure) and "tilted" in refusal.reason
+    failure = RoadHomography(CONFIG, sky).measure(*noise, step)
+    assert isinstance(failure, MeasurementFailure) and "too little of the road" in failure.reason
+    failure = measure(texture, step, pitch_deg=3.0, config=RoadConfig(max_tilt_deg=0.01, tilt_sigma_deg=5.0))
+    assert isinstance(failure, MeasurementFailure) and "tilted" in failure.reason
 
 
 def test_the_answer_is_the_same_every_time(texture):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     one, other = measure(texture, step), measure(texture, step)
     assert one.length_heights == other.length_heights
+
+
+def test_directions_of_motion_are_kept_by_a_state(texture):
+    """A camera that looks down by 3 degrees learns its pitch, and its state keeps it."""
+    T_body_camera = pitched(-3.0)
+    T_step = se3.invert(T_body_camera) @ se3.make(np.eye(3), np.array([0.0, 0.0, 1.0])) @ T_body_camera
+    frames = [render(se3.make(np.eye(3), np.array([0.0, 0.0, k])) @ T_body_camera, texture, k) for k in range(3)]
+    level = se3.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    whole, first = RoadHomography(CONFIG, CAMERA), RoadHomography(CONFIG, CAMERA)
+    for road in (whole, first):
+        road.measure(frames[0], frames[1], T_step)
+    resumed = RoadHomography(CONFIG, CAMERA, directions=first.state())
+    expected, measured = (road.measure(frames[1], frames[2], level) for road in (whole, resumed))
+    assert isinstance(expected, RoadStep) and isinstance(measured, RoadStep)
+    assert measured.length_heights == expected.length_heights
+    without = RoadHomography(CONFIG, CAMERA).measure(frames[1], frames[2], level)
+    assert not isinstance(without, RoadStep) or without.length_heights != expected.length_heights
+    assert len(first.state()) == 1 and len(resumed.state()) == 2

@@ -1,10 +1,17 @@
+"""Lengths of all steps of a drive from ratios, road and learned depth."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
 from slam.config import LengthConfig
-from slam.frontend.scale.step_lengths import StepEvidence, length_ratio, marginals, solve_lengths
+from slam.frames import Ends, RelativePose
+from slam.frontend.scale.step_lengths import StepEvidence, gather_evidence, length_ratio, marginals, solve_lengths
 from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.motion import Motion
+from slam.se3 import from_rotation_vector
 
 CONFIG = LengthConfig()
 STEPS = 200
@@ -26,7 +33,7 @@ def noisy(sigma: float, seed: int = 1) -> np.ndarray:
     return np.log(TRUE) + sigma * np.random.default_rng(seed).normal(size=STEPS)
 
 
-def test_triangulation_carries_a_rare_road_through_the_drive():
+def test_triangulation_carries_rare_road_lengths_through_the_drive():
     """Where the road is seen in one step of forty and learned depth is twice too long, lengths are still right."""
     road = np.where(np.arange(STEPS) % 40 == 20, np.log(TRUE), np.nan)
     measured = evidence(
@@ -62,7 +69,7 @@ def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
 
 
-def test_learned_depth_bridges_a_gap_in_the_unit_that_it_was_seen_to_have():
+def test_learned_depth_spans_a_gap_in_the_unit_measured_around_it():
     """Steps 80 to 119 have neither road nor ratio, and learned lengths are 30 % short all along."""
     gap = (np.arange(STEPS) >= 80) & (np.arange(STEPS) < 120)
     tied = ratios()
@@ -73,9 +80,9 @@ def test_learned_depth_bridges_a_gap_in_the_unit_that_it_was_seen_to_have():
         evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=learned, **tied), CONFIG
     )
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.05)
-    believed = solve_lengths(evidence(learned=learned), CONFIG)
-    np.testing.assert_allclose(believed.length, 0.7 * TRUE, rtol=1e-6)
-    np.testing.assert_allclose(believed.unit_correction, 1.0, atol=1e-6)
+    learned_only = solve_lengths(evidence(learned=learned), CONFIG)
+    np.testing.assert_allclose(learned_only.length, 0.7 * TRUE, rtol=1e-6)
+    np.testing.assert_allclose(learned_only.unit_correction, 1.0, atol=1e-6)
 
 
 def test_steps_that_nothing_measured_have_no_length():
@@ -107,8 +114,44 @@ def test_ratio_of_lengths_from_common_points():
     assert again is not None and again[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
 
 
+def motion(ends: Ends, metres: float, unit: float, points_between: np.ndarray | None) -> Motion:
+    """A step whose points lie at depths ``(M,)`` in the camera in which it begins; None is not triangulated."""
+    T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres]))
+    pose = RelativePose(*ends, T, np.full(6, 0.01), "essential")
+    if points_between is None:
+        return Motion(pose)
+    depth = points_between - ends[0]  # every frame is a metre further on
+    return Motion(pose, triangulated(np.arange(len(depth)), depth / metres, (depth - metres) / metres), np.zeros(3))
+
+
+def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
+    """Frames a metre apart, a step over three frames between steps of one, and learned depth that drifts."""
+    links = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (7, 8)]
+    points = np.random.default_rng(0).uniform(20.0, 40.0, 50)
+    motions = {ends: motion(ends, float(ends[1] - ends[0]), 0.1, points) for ends in links if ends != (6, 7)}
+    absolute = {(2, 5): (3.1, 0.05), (5, 6): (1.2, 0.06), (6, 7): (9.0, 0.06), (3, 4): (1.0, 0.06)}
+    unit = np.linspace(10.0, 20.0, 9)
+    evidence = gather_evidence(links, motions, absolute, unit)
+    nan = np.nan
+    expected = np.log([nan, 1.0, 3.0, 1.0 / 3.0, nan, nan])
+    np.testing.assert_allclose(evidence.ratio, expected, atol=1e-9)
+    lengths = np.array([1.0, 1.0, 3.0, 1.0, nan, 1.0])
+    np.testing.assert_allclose(evidence.learned, np.log(0.1 * lengths * unit[[0, 1, 2, 5, 6, 7]]))
+    np.testing.assert_allclose(evidence.absolute, np.log([nan, nan, 3.1, 1.2, nan, nan]))
+    np.testing.assert_allclose(evidence.absolute_sigma, [nan, nan, 0.05, 0.06, nan, nan])
+
+
+def test_a_step_that_is_not_triangulated_gives_no_evidence() -> None:
+    points = np.random.default_rng(0).uniform(20.0, 40.0, 50)
+    links = [(0, 1), (1, 2), (2, 3)]
+    motions = {ends: motion(ends, 1.0, 0.1, None if ends == (1, 2) else points) for ends in links}
+    evidence = gather_evidence(links, motions, {(1, 2): (1.0, 0.05)}, np.ones(4))
+    assert np.isnan(evidence.ratio).all() and np.isnan(evidence.absolute).all()
+    np.testing.assert_array_equal(np.isnan(evidence.learned), [False, True, False])
+
+
 def test_sigmas_are_those_of_the_whole_system() -> None:
-    """The chains of small complements say what inverting everything says."""
+    """The chains of Schur complements give the same as inverting the whole matrix."""
     rng = np.random.default_rng(0)
     steps = 7
     pairs = [(k, steps + k) for k in range(steps)]
@@ -129,7 +172,7 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
-def test_lengths_tied_to_their_neighbours_add_up_as_they_say() -> None:
+def test_correlated_sigmas_are_how_far_sums_of_lengths_err() -> None:
     """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up to what the lengths' errors do."""
     middle = slice(80, 120)
     alone, together = [], []
@@ -151,7 +194,7 @@ def test_lengths_tied_to_their_neighbours_add_up_as_they_say() -> None:
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
-def test_sigmas_say_how_far_lengths_err() -> None:
+def test_sigmas_are_how_far_lengths_err() -> None:
     """Also in the middle of a gap of the road, where only triangulation and learned depth go on."""
     errors, sigmas = [], []
     for seed in range(20):

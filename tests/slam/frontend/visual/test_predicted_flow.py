@@ -1,3 +1,7 @@
+"""Optical flow predicted on a drawn road, and corners tracked through it."""
+
+from __future__ import annotations
+
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +24,7 @@ def road_depth() -> np.ndarray:
     return np.where(below > 0.02, HEIGHT / np.maximum(below, 0.02), np.nan).astype(np.float32)
 
 
-def where_it_goes(pixels: np.ndarray) -> np.ndarray:
+def moved(pixels: np.ndarray) -> np.ndarray:
     """Of pixels ``(M, 2)`` on the road, after the camera went forwards by ``LENGTH``."""
     depth = HEIGHT * CAMERA.fy / (pixels[:, 1] - CAMERA.cy)
     centre = np.array([CAMERA.cx, CAMERA.cy])
@@ -52,49 +56,49 @@ def predicted_flow(length: float = LENGTH) -> PredictedFlow:
     return PredictedFlow(FORWARDS, length, road_depth(), CAMERA)
 
 
-def test_what_is_foreseen_right_stands_where_it_stood(frames):
-    first, second = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in frames)
+def test_an_image_warped_back_by_the_right_flow_looks_like_the_earlier_one(frames):
+    first, second = (frame.grey for frame in frames)
     near = np.s_[60:95, 80:240]
-    undone = predicted_flow().undone(second)
+    warped = predicted_flow().warp_back(second)
 
-    def unlike(image: np.ndarray) -> float:
+    def difference(image: np.ndarray) -> float:
         return float(np.abs(image[near].astype(float) - first[near]).mean())
 
-    assert unlike(undone) < 0.5 * unlike(second)
+    assert difference(warped) < 0.5 * difference(second)
 
 
-def test_pixels_go_where_the_road_goes():
+def test_pixels_move_as_the_road_does():
     pixels = np.array([[100.0, 70.0], [200.5, 81.25], [160.0, 64.0]], np.float32)
-    np.testing.assert_allclose(predicted_flow().in_current(pixels), where_it_goes(pixels), atol=0.02)
+    np.testing.assert_allclose(predicted_flow().in_current(pixels), moved(pixels), atol=0.02)
     assert predicted_flow().in_current(np.zeros((0, 2), np.float32)).shape == (0, 2)
 
 
-def test_without_depth_only_the_turn_is_foreseen():
+def test_without_depth_only_the_rotation_is_predicted():
     turn, _ = cv2.Rodrigues(np.array([0.0, -0.02, 0.0]))
     unknown = np.full((120, 320), np.nan, np.float32)
-    moved = PredictedFlow(UnitRelativePose(turn, FORWARDS.direction), 5.0, unknown, CAMERA).in_current(
+    rotated = PredictedFlow(UnitRelativePose(turn, FORWARDS.direction), 5.0, unknown, CAMERA).in_current(
         np.array([[160.0, 40.0]], np.float32)
     )
-    np.testing.assert_allclose(moved, [[160.0 - 240.0 * np.tan(0.02), 40.0]], atol=1e-3)
+    np.testing.assert_allclose(rotated, [[160.0 - 240.0 * np.tan(0.02), 40.0]], atol=1e-3)
 
 
 def errors(tracks: Tracks) -> np.ndarray:
     on_the_road = (tracks.previous[:, 1] > 60) & (tracks.previous[:, 1] < 95)
-    return tracks.current[on_the_road] - where_it_goes(tracks.previous[on_the_road])
+    return tracks.current[on_the_road] - moved(tracks.previous[on_the_road])
 
 
-def test_corners_on_the_road_are_found_where_they_are(frames):
+def test_corners_on_the_road_are_tracked_through_the_predicted_flow(frames):
     """Also with a length that is wrong by a tenth, as learned depth is."""
     config = GeometryConfig()
     plain = errors(CornerTracker(config).track(*frames))
-    foreseen = errors(CornerTracker(config).track(*frames, predicted_flow(0.9 * LENGTH)))
-    right_plain, right_foreseen = ((np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, foreseen))
-    assert right_foreseen > max(2 * right_plain, 25)
-    assert abs(np.median(foreseen[:, 1])) < 0.15
+    predicted = errors(CornerTracker(config).track(*frames, predicted_flow(0.9 * LENGTH)))
+    right_plain, right_predicted = ((np.abs(each).max(axis=1) < 0.3).sum() for each in (plain, predicted))
+    assert right_predicted > max(2 * right_plain, 25)
+    assert abs(np.median(predicted[:, 1])) < 0.15
 
 
-def test_a_wrong_prediction_is_not_followed(frames):
-    """What was foreseen of a standing camera loses against the windows as they are."""
+def test_a_wrong_prediction_does_no_harm(frames):
+    """A flow predicted for a camera that in truth stands loses against the windows as they are."""
     config = GeometryConfig()
     still = [frames[0], Frame(1, 0.1, frames[0].image)]
     tracks = CornerTracker(config).track(*still, predicted_flow())

@@ -1,3 +1,7 @@
+"""Residuals across and along epipolar lines, and their slopes by finite differences."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 

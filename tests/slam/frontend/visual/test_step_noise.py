@@ -1,3 +1,7 @@
+"""Noise of steps by the rotation jitter, the rotation and the neighbours of a drive."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
@@ -16,36 +20,36 @@ def steps(turns_rad: np.ndarray) -> dict[int, np.ndarray]:
     return {k: from_rotation_vector(turn, np.array([0.0, 0.0, 1.0])) for k, turn in enumerate(turns_rad)}
 
 
-def turns(shake_rad: np.ndarray, count: int = 400) -> np.ndarray:
-    """A slalom, which is no shake, under white noise of three sigmas."""
+def turns(jitter_rad: np.ndarray, count: int = 400) -> np.ndarray:
+    """A slalom, which is smooth, with white noise of three sigmas."""
     smooth = np.stack([np.zeros(count), 0.03 * np.sin(np.arange(count) / 30.0), np.zeros(count)], axis=1)
-    return smooth + np.random.default_rng(0).normal(size=(count, 3)) * shake_rad
+    return smooth + np.random.default_rng(0).normal(size=(count, 3)) * jitter_rad
 
 
-def turned(shake_rad: np.ndarray, count: int = 400) -> dict[int, np.ndarray]:
-    return dict(enumerate(turns(shake_rad, count)))
+def rotations(jitter_rad: np.ndarray, count: int = 400) -> dict[int, np.ndarray]:
+    return dict(enumerate(turns(jitter_rad, count)))
 
 
-def test_shake_is_what_a_smooth_motion_does_not_explain():
-    shake_rad = np.array([1e-3, 2e-4, 5e-4])
-    np.testing.assert_allclose(rotation_jitter(turned(shake_rad)), shake_rad, rtol=0.2)
-    assert rotation_jitter(turned(np.zeros(3))).max() < 1e-5
+def test_jitter_is_what_a_smooth_motion_does_not_explain():
+    jitter_rad = np.array([1e-3, 2e-4, 5e-4])
+    np.testing.assert_allclose(rotation_jitter(rotations(jitter_rad)), jitter_rad, rtol=0.2)
+    assert rotation_jitter(rotations(np.zeros(3))).max() < 1e-5
 
 
-def test_a_few_jolts_do_not_shake_a_drive():
-    shaken = turns(np.array([1e-3, 1e-3, 1e-3]))
-    shaken[::50] += 0.1
-    np.testing.assert_allclose(rotation_jitter(dict(enumerate(shaken))), 1e-3, rtol=0.4)
+def test_a_few_jumps_do_not_change_the_jitter_of_a_drive():
+    jittery = turns(np.array([1e-3, 1e-3, 1e-3]))
+    jittery[::50] += 0.1
+    np.testing.assert_allclose(rotation_jitter(dict(enumerate(jittery))), 1e-3, rtol=0.4)
 
 
-def test_gaps_are_left_out_and_few_steps_say_nothing():
-    drive = turned(np.full(3, 1e-3))
+def test_gaps_are_left_out_and_few_steps_have_no_jitter():
+    drive = rotations(np.full(3, 1e-3))
     np.testing.assert_allclose(rotation_jitter({k: r for k, r in drive.items() if k % 40 != 7}), 1e-3, rtol=0.3)
     np.testing.assert_array_equal(rotation_jitter({k: r for k, r in drive.items() if k % 4}), 0.0)
     np.testing.assert_array_equal(rotation_jitter({}), 0.0)
 
 
-def test_a_jolt_is_the_step_that_does_not_fit_and_not_its_neighbours():
+def test_the_neighbour_residual_is_large_at_a_jump_and_not_beside_it():
     even = {k: np.array([0.0, 0.01 * k, 0.0]) for k in range(9)}
     even[4] = even[4] + [0.05, 0.0, 0.0]
     sizes = np.array([neighbour_residual(even, k) for k in range(9)])
@@ -55,33 +59,33 @@ def test_a_jolt_is_the_step_that_does_not_fit_and_not_its_neighbours():
     np.testing.assert_array_equal(neighbour_residual({3: np.ones(3)}, 3), 0.0)
 
 
-def test_noise_is_shares_of_shake_and_turn():
-    shaken = turns(np.full(3, 1e-3))
-    noise, shake = inflate_step_sigmas(steps(shaken), own(400), CONFIG), rotation_jitter(dict(enumerate(shaken)))
+def test_sigmas_are_ratios_of_jitter_and_rotation():
+    jittery = turns(np.full(3, 1e-3))
+    noise, jitter = inflate_step_sigmas(steps(jittery), own(400), CONFIG), rotation_jitter(dict(enumerate(jittery)))
     assert noise.keys() == set(range(400))
-    calm = min(noise.values(), key=lambda n: n.direction.sum())
-    assert calm.direction[0] == pytest.approx(CONFIG.jitter_direction_ratio * np.linalg.norm(shake), rel=0.1)
-    assert calm.direction[2] < 0.1 * calm.direction[0], "an error along the motion is one of length"
+    smallest = min(noise.values(), key=lambda n: n.direction.sum())
+    assert smallest.direction[0] == pytest.approx(CONFIG.jitter_direction_ratio * np.linalg.norm(jitter), rel=0.1)
+    assert smallest.direction[2] < 0.1 * smallest.direction[0], "an error along the motion is one of length"
     for step in noise.values():
-        assert (step.rotation >= CONFIG.jitter_rotation_ratio * shake).all()
+        assert (step.rotation >= CONFIG.jitter_rotation_ratio * jitter).all()
 
 
-def test_sharp_turns_and_jolts_widen_their_own_steps():
+def test_sharp_turns_and_jumps_widen_their_own_steps():
     smooth = np.zeros((60, 3))
     smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
-    jolted = smooth.copy()
-    jolted[30, 0] += np.deg2rad(1.0)
-    before, after = (inflate_step_sigmas(steps(turned), own(60), CONFIG) for turned in (smooth, jolted))
+    jumping = smooth.copy()
+    jumping[30, 0] += np.deg2rad(1.0)
+    before, after = (inflate_step_sigmas(steps(turned), own(60), CONFIG) for turned in (smooth, jumping))
     assert before[16].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[16, 1], rel=0.1)
     assert after[30].rotation[0] == pytest.approx(CONFIG.neighbour_rotation_ratio * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
 
 
-def test_what_corners_know_of_is_not_counted_twice():
-    shaken = steps(turns(np.full(3, 1e-3)))
-    alone, known = (inflate_step_sigmas(shaken, own(400, sigma), CONFIG) for sigma in (0.0, 1.5e-3))
-    calm = [step.rotation[0] for step in known.values()]
-    assert np.median(calm) < 0.03e-3, "white noise of the corners' own size shakes nothing"
+def test_noise_that_corners_explain_is_not_counted_twice():
+    jittery = steps(turns(np.full(3, 1e-3)))
+    alone, known = (inflate_step_sigmas(jittery, own(400, sigma), CONFIG) for sigma in (0.0, 1.5e-3))
+    pitch = [step.rotation[0] for step in known.values()]
+    assert np.median(pitch) < 0.03e-3, "white noise of the corners' own size is no jitter"
     assert all((known[k].rotation <= alone[k].rotation).all() for k in alone)
     assert all((known[k].direction <= alone[k].direction).all() for k in alone)
     assert inflate_step_sigmas({}, {}, CONFIG) == {}

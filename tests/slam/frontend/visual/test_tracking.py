@@ -1,3 +1,7 @@
+"""Corners tracked through drawn images that slide by whole pixels."""
+
+from __future__ import annotations
+
 import cv2
 import numpy as np
 import pytest
@@ -14,13 +18,13 @@ SHIFT_PX = 4
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    """A wide picture that slides to the left by whole pixels."""
+    """A wide image that slides to the left by whole pixels."""
     noise = np.random.default_rng(0).integers(0, 255, (120, 300), np.uint8)
     wide = np.repeat(cv2.GaussianBlur(noise, (0, 0), 1.5)[..., None], 3, axis=2)
     return [Frame(k, 0.1 * k, np.ascontiguousarray(wide[:, SHIFT_PX * k :][:, :200])) for k in range(6)]
 
 
-def test_tracks_move_with_the_picture_and_keep_their_names(frames):
+def test_tracks_move_with_the_image_and_keep_their_ids(frames):
     tracker = CornerTracker(CONFIG)
     first, second = tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])
     for tracks in (first, second):
@@ -32,7 +36,7 @@ def test_tracks_move_with_the_picture_and_keep_their_names(frames):
     np.testing.assert_array_equal(first.current[one], second.previous[other])
 
 
-def test_new_corners_fill_what_slides_into_view(frames):
+def test_new_corners_are_detected_in_what_slides_into_view(frames):
     tracker = CornerTracker(CONFIG)
     for k in range(5):
         tracks = tracker.track(frames[k], frames[k + 1])
@@ -54,7 +58,7 @@ def test_two_trackers_agree(frames):
     np.testing.assert_array_equal(one.track_ids, other.track_ids)
 
 
-def test_few_corners_are_sought_again_under_another_exposure(frames):
+def test_few_corners_are_tracked_again_with_equal_exposure(frames):
     dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
     once = CornerTracker(CONFIG.model_copy(update={"few_corners": 0})).track(frames[0], dark)
     again = CornerTracker(CONFIG.model_copy(update={"few_corners": 1000})).track(frames[0], dark)
@@ -63,22 +67,44 @@ def test_few_corners_are_sought_again_under_another_exposure(frames):
     assert np.median(error) < 0.1
 
 
-def test_corners_are_found_again_two_frames_later_where_they_were_foreseen(frames):
+def test_corners_are_tracked_across_two_frames_through_the_predicted_flow(frames):
     tracker = CornerTracker(CONFIG)
     tracks = [tracker.track(frames[0], frames[1]), tracker.track(frames[1], frames[2])]
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     depth, sliding = np.full((120, 200), 10.0, np.float32), UnitRelativePose(np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    foreseen = PredictedFlow(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
-    across = tracker.ask_across(frames[0], frames[2], foreseen)()
+    predicted = PredictedFlow(sliding, 2 * SHIFT_PX * 10.0 / 100.0 + 0.05, depth, camera)  # half a pixel too far
+    across = tracker.track_across(frames[0], frames[2], predicted)()
     assert len(across.track_ids) > 0.8 * len(tracks[0].track_ids)
     assert np.isin(across.track_ids, tracks[0].track_ids).all()
     error = np.abs(across.previous - across.current - [2 * SHIFT_PX, 0]).max(axis=1)
     assert np.median(error) < 0.02 and error.max() < 0.5
 
 
-def test_corners_that_nobody_followed_are_not_found_across(frames):
+def test_corners_that_were_not_tracked_on_are_not_tracked_across(frames):
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     nothing = PredictedFlow(
         UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
     )
-    assert len(CornerTracker(CONFIG).ask_across(frames[0], frames[2], nothing)().track_ids) == 0
+    assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing)().track_ids) == 0
+
+
+def test_a_tracker_goes_on_from_its_state(frames):
+    whole, first = CornerTracker(CONFIG), CornerTracker(CONFIG)
+    for k in range(3):
+        whole.track(frames[k], frames[k + 1])
+        first.track(frames[k], frames[k + 1])
+    state = first.state()
+    second = CornerTracker(CONFIG, state=state)
+    for k in (3, 4):
+        expected, tracks = whole.track(frames[k], frames[k + 1]), second.track(frames[k], frames[k + 1])
+        np.testing.assert_array_equal(tracks.current, expected.current)
+        np.testing.assert_array_equal(tracks.track_ids, expected.track_ids)
+    assert state is first.state() and max(state.corners) == 3  # a state is a value
+
+
+def test_corners_of_old_frames_are_dropped(frames):
+    config = CONFIG.model_copy(update={"steps": (1,), "rotation_baseline_steps": 2})
+    tracker = CornerTracker(config)
+    for k in range(5):
+        tracker.track(frames[k], frames[k + 1])
+    assert sorted(tracker.state().corners) == [2, 3, 4, 5]

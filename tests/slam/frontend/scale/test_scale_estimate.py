@@ -1,0 +1,98 @@
+"""The scale of learned depth from ground planes over time, or from a reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.config import ScaleConfig
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.scale.scale_estimate import (
+    ScaleEstimate,
+    estimate_scale,
+    resolve_mode,
+    scale_from_reference,
+    scale_from_road,
+    scale_track,
+)
+
+CONFIG = ScaleConfig()
+HEIGHT = 0.37
+DOWN = np.array([0.0, 1.0, 0.0])
+
+
+def planes_of(heights) -> list[GroundPlane | MeasurementFailure]:
+    return [GroundPlane(height, DOWN, 1.0) for height in heights]
+
+
+def test_scale_is_within_one_percent_of_noisy_heights_with_outliers():
+    rng = np.random.default_rng(0)
+    heights = HEIGHT * np.exp(0.01 * rng.normal(size=20))
+    heights[::7] *= 1.5
+    estimate = scale_from_road(planes_of(heights), 1.65, CONFIG)
+    assert isinstance(estimate, ScaleEstimate)
+    assert estimate.value == pytest.approx(1.65 / HEIGHT, rel=0.01)
+    assert estimate.frames_used >= 15
+    assert 0 < estimate.spread < 0.02
+
+
+def test_without_a_height_the_unit_is_the_camera_height():
+    roads = planes_of([0.5] * 9)
+    assert scale_from_road(roads, None, CONFIG).value == pytest.approx(2.0)
+    assert scale_from_road(roads, 1.65, CONFIG).value == pytest.approx(3.3)
+
+
+def test_over_time_the_median_rejects_wild_frames():
+    rng = np.random.default_rng(0)
+    ratios = 2.0 * np.exp(0.02 * rng.normal(size=200))
+    ratios[:50] = rng.uniform(4, 9, 50)
+    ratios[60:70] = [np.nan, np.inf, -1.0, 0.0, np.nan] * 2
+    estimate = estimate_scale(ratios, CONFIG)
+    assert estimate.value == pytest.approx(2.0, rel=0.01)
+    assert estimate.spread == pytest.approx(0.02, rel=0.4)
+    assert 120 <= estimate.frames_used <= 140
+
+
+def test_too_few_frames_give_no_scale():
+    failure = estimate_scale(np.array([1.0, 1.1, np.nan, 1.0]), CONFIG)
+    assert isinstance(failure, MeasurementFailure)
+    assert "only 3 frames" in failure.reason
+    assert isinstance(scale_from_road([MeasurementFailure("dark")] * 30, 1.65, CONFIG), MeasurementFailure)
+
+
+def test_the_track_follows_a_drifting_unit_and_spans_frames_without_a_plane():
+    heights = np.where(np.arange(200) < 100, 0.50, 0.52)
+    roads = planes_of(heights)
+    roads[10:40] = [MeasurementFailure("no road")] * 30
+    estimate = scale_from_road(roads, 1.0, CONFIG)
+    track = scale_track(roads, 1.0, estimate, CONFIG)
+    assert track.shape == (200,)
+    assert track[0] == pytest.approx(2.0)
+    assert track[60] == pytest.approx(2.0)
+    assert track[-1] == pytest.approx(1 / 0.52)
+
+
+def test_reference_compares_the_first_path_lengths():
+    true = np.tile(np.eye(4), (100, 1, 1))
+    true[:, 2, 3] = np.arange(100)
+    unscaled = true.copy()
+    unscaled[:50, 2, 3] *= 0.25
+    estimate = scale_from_reference(unscaled, true, CONFIG)
+    assert estimate.value == pytest.approx(4.0)
+    assert estimate.frames_used == 50
+    assert isinstance(scale_from_reference(true * 0 + np.eye(4), true, CONFIG), MeasurementFailure)
+
+
+@pytest.mark.parametrize(
+    ("configured", "height", "mode"),
+    [
+        ("auto", 1.65, "camera-height"),
+        ("auto", None, "none"),
+        ("none", 1.65, "none"),
+        ("reference", None, "reference"),
+        ("lidar", 1.65, "lidar"),
+    ],
+)
+def test_auto_stands_for_camera_height_where_it_is_known(configured, height, mode):
+    assert resolve_mode(ScaleConfig(mode=configured), height) == mode

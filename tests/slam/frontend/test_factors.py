@@ -1,0 +1,149 @@
+"""Factors in one unit from everything measured, and the odometry that they chain to; steps may skip frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from erfsfm.pose_noise import PoseNoise
+from slam.config import FrontendConfig, GeometryConfig
+from slam.frames import Ends, RelativePose, SnippetPoses
+from slam.frontend.factors import Unscaled, chain_odometry, make_factors
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.network_factors import NETWORK_SOURCE
+from slam.frontend.scale.metric_scale import Scale, StepLength
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.motion import Motion
+from slam.se3 import FloatArray, chain, from_rotation_vector, invert
+
+FRAMES = 12
+METRES = 4.0  # per unscaled length
+NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
+NOISE = PoseNoise(
+    frame=(0.01,) * 6,
+    turn=(0.0,) * 6,
+    length=(0.0,) * 6,
+    disagreement=(0.0,) * 6,
+    correlation=(0.5,) * 6,
+    pose_sha256="",
+    measured_on=["simulated/600"],
+    pairs=990,
+)
+
+
+def drive(step: float = 1.0) -> FloatArray:
+    """A gentle curve with steps of some length."""
+    turns = np.tile([0.0, 0.05, 0.0], (FRAMES - 1, 1))
+    return chain(from_rotation_vector(turns, np.tile([0.0, 0.0, step], (FRAMES - 1, 1))))
+
+
+TRUE = drive()
+
+
+def pose(first: int, last: int, source: str = "essential", T: FloatArray = TRUE) -> RelativePose:
+    return RelativePose(first, last, invert(T[first]) @ T[last], np.full(6, 0.01), source)
+
+
+def table(steps: list[Ends], T: FloatArray) -> StepTable:
+    return StepTable.of([Motion(pose(*ends, T=T), NO_POINTS, np.full(3, 0.002)) for ends in steps])
+
+
+def snippets(T: FloatArray) -> list[SnippetPoses]:
+    found = []
+    for target in range(2, FRAMES - 2):
+        sources = tuple(k for k in range(target - 2, target + 3) if k != target)
+        found.append(SnippetPoses(target, sources, invert(T[list(sources)]) @ T[target]))
+    return found
+
+
+def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
+    known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
+    return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known)
+
+
+def factors(
+    measured: Unscaled, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
+) -> list[RelativePose]:
+    return make_factors(measured, scale, lidar, noise, FrontendConfig(use=use), GeometryConfig())
+
+
+STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]
+
+
+def test_everything_measured_becomes_a_factor_in_the_unit_of_the_scale() -> None:
+    small = drive(1.0 / METRES)
+    interpolated = [pose(7, 8, "interpolated", small)]
+    lidar = (pose(3, 4, "lidar"),)  # in metres already
+    found = factors(Unscaled(table(STEPS, small), snippets(small), interpolated), scale(), lidar)
+    assert {factor.source for factor in found} == {"essential", "interpolated", "lidar", NETWORK_SOURCE}
+    for factor in found:
+        np.testing.assert_allclose(factor.T_from_to, invert(TRUE[factor.from_index]) @ TRUE[factor.to_index], atol=1e-9)
+    assert [factor.ends for factor in found if factor.source == "essential"] == STEPS
+    sigmas = {factor.source: factor.sigmas for factor in found}
+    np.testing.assert_allclose(sigmas["interpolated"][3:], METRES * 0.01)
+    np.testing.assert_allclose(sigmas["lidar"], 0.01)
+
+
+def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
+    """Learned depth makes every step three times too long; a step of one frame and one of three have own lengths."""
+    wrong = drive(3.0 / METRES)
+    lengths = {(0, 1): np.linalg.norm(pose(0, 1).T_from_to[:3, 3]), (2, 5): np.linalg.norm(pose(2, 5).T_from_to[:3, 3])}
+    unscaled = {ends: float(length) / METRES for ends, length in lengths.items()}
+    found = {f.ends: f for f in factors(Unscaled(table(STEPS, wrong), [], []), scale(unscaled))}
+    for ends in lengths:
+        np.testing.assert_allclose(found[ends].T_from_to, pose(*ends).T_from_to, atol=1e-9)
+        assert found[ends].student_t_dof == GeometryConfig().student_t_dof
+        assert found[ends].correlated_sigmas is not None
+        assert found[ends].sigmas[5] == pytest.approx(0.02 * lengths[ends], rel=0.05)
+        assert found[ends].graph_sigmas[5] == pytest.approx(0.03 * lengths[ends], rel=0.05)
+    np.testing.assert_allclose(found[1, 2].T_from_to[2, 3], 3.0 * pose(1, 2).T_from_to[2, 3], rtol=1e-9)
+    assert found[1, 2].student_t_dof == np.inf
+
+
+@pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None)])
+def test_the_network_serves_where_no_path_of_steps_leads(use: str, noise: PoseNoise | None) -> None:
+    found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale(), use=use, noise=noise)
+    pairs = {tuple(sorted(f.ends)) for f in found if f.source == NETWORK_SOURCE}
+    assert {(2, 3), (3, 4), (4, 5), (2, 4), (3, 5), (7, 8), (7, 9), (6, 8)} <= pairs
+    assert not pairs & {(0, 1), (1, 2), (0, 2), (5, 6), (6, 7), (5, 7), (8, 9)}
+
+
+def test_noise_measured_beside_the_weights_keeps_every_pair() -> None:
+    found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale())
+    assert {(5, 6), (6, 7), (7, 8)} <= {f.ends for f in found if f.source == NETWORK_SOURCE}
+
+
+def network_trajectory() -> FloatArray:
+    """Unscaled, and turned the wrong way, so that its steps can be recognised."""
+    turns = np.tile([0.0, -0.1, 0.0], (FRAMES - 1, 1))
+    return chain(from_rotation_vector(turns, np.tile([0.0, 0.0, 0.5], (FRAMES - 1, 1))))
+
+
+def test_odometry_chains_steps_that_skip_frames() -> None:
+    """Frames 3 and 4 lie inside of a step and hang on the network; frame 5 hangs on frame 2, not on these."""
+    T = chain_odometry([pose(*ends) for ends in STEPS], network_trajectory(), scale())
+    for k in (0, 1, 2, 5, 6, 7):
+        np.testing.assert_allclose(T[k], TRUE[k], atol=1e-9)
+    T_step = from_rotation_vector(np.array([0.0, -0.1, 0.0]), np.array([0.0, 0.0, 0.5 * METRES]))
+    np.testing.assert_allclose(T[3], T[2] @ T_step, atol=1e-9)
+    np.testing.assert_allclose(T[4], T[3] @ T_step, atol=1e-9)
+    np.testing.assert_allclose(T[8], T[7] @ T_step, atol=1e-9)
+    np.testing.assert_allclose(T[9], T[8] @ pose(8, 9).T_from_to, atol=1e-9)
+    np.testing.assert_allclose(T[11], T[9] @ T_step @ T_step, atol=1e-9)
+
+
+def test_odometry_takes_the_step_from_the_nearest_frame_and_the_last_of_these() -> None:
+    wrong = drive(3.0)
+    mixed = [pose(0, 2, T=wrong), pose(1, 2, T=wrong), pose(1, 2), pose(0, 1), pose(0, 2, T=wrong)]
+    np.testing.assert_allclose(chain_odometry(mixed, network_trajectory(), scale())[2], TRUE[2], atol=1e-9)
+
+
+def test_odometry_without_geometry_is_the_scaled_network() -> None:
+    T_network = network_trajectory()
+    by_network = [pose(0, 1, NETWORK_SOURCE)]
+    T = chain_odometry(by_network, T_network, scale())
+    np.testing.assert_allclose(T[:, :3, 3], METRES * T_network[:, :3, 3], atol=1e-9)
+    np.testing.assert_allclose(T[:, :3, :3], T_network[:, :3, :3], atol=1e-9)

@@ -1,0 +1,152 @@
+"""Rotations of steps corrected by relative rotations across several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slam.frames import Ends, RelativePose
+from slam.frontend.rotation_smoothing import smooth_rotations
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.se3 import FloatArray, invert, make
+
+SIGMA = np.deg2rad(0.02)
+STEPS = 40
+NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
+T_CURRENT_PREVIOUS = np.array([0.1, 0.0, -1.2])  # translation of every step
+
+
+def small(rng: np.random.Generator, sigma: float) -> FloatArray:
+    return Rotation.from_rotvec(rng.normal(0.0, sigma, 3)).as_matrix()
+
+
+def true_rotations(rng: np.random.Generator) -> list[FloatArray]:
+    """``R_current_previous`` of a drive that turns by up to 4 degrees a step."""
+    return [
+        Rotation.from_euler("y", 4.0 * np.sin(0.3 * k), degrees=True).as_matrix() @ small(rng, 0.005)
+        for k in range(STEPS)
+    ]
+
+
+def table_of(rotations: Mapping[Ends, FloatArray]) -> StepTable:
+    """Triangulated steps with these ``R_current_previous``."""
+    sigmas = np.repeat([SIGMA, 0.01], 3)
+    return StepTable.of(
+        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), NO_POINTS, np.zeros(3))
+        for ends, R in rotations.items()
+    )
+
+
+def single(rotations: list[FloatArray]) -> StepTable:
+    return table_of({(k, k + 1): R for k, R in enumerate(rotations)})
+
+
+def rotations_of(table: StepTable) -> dict[Ends, FloatArray]:
+    return {motion.ends: invert(motion.relative_pose.T_from_to)[:3, :3] for motion in table}
+
+
+def error_deg(table: StepTable, truth: list[FloatArray]) -> float:
+    """Of the rotation of the whole drive."""
+    R, R_true, rotations = np.eye(3), np.eye(3), rotations_of(table)
+    for k in range(STEPS):
+        R, R_true = rotations[k, k + 1] @ R, truth[k] @ R_true
+    return float(np.rad2deg(Rotation.from_matrix(R @ R_true.T).magnitude()))
+
+
+def drive(
+    bias: FloatArray, baseline_noise: float, seed: int = 0
+) -> tuple[StepTable, list[RelativeRotation], list[FloatArray]]:
+    """Steps whose rotations err by ``bias`` each, and rotations across two steps that err by no more than that."""
+    rng = np.random.default_rng(seed)
+    truth, off = true_rotations(rng), Rotation.from_rotvec(bias).as_matrix()
+    sigmas = np.full(3, SIGMA)
+    steps = single([off @ small(rng, 0.1 * SIGMA) @ R for R in truth])
+    across = [
+        RelativeRotation(k, k + 2, off @ small(rng, baseline_noise) @ truth[k + 1] @ truth[k], sigmas)
+        for k in range(STEPS - 1)
+    ]
+    return steps, across, truth
+
+
+def test_without_relative_rotations_steps_stay_as_they_were() -> None:
+    steps, _, _ = drive(np.zeros(3), 0.0)
+    assert smooth_rotations(steps, []) is steps
+
+
+def test_true_steps_and_relative_rotations_stay_true() -> None:
+    truth = true_rotations(np.random.default_rng(0))
+    across = [RelativeRotation(k, k + 2, truth[k + 1] @ truth[k], np.full(3, SIGMA)) for k in range(STEPS - 1)]
+    smoothed = rotations_of(smooth_rotations(single(truth), across))
+    for k in range(STEPS):
+        np.testing.assert_allclose(smoothed[k, k + 1], truth[k], atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_bias_of_every_measurement_counts_half_as_often_over_two_steps(axis: int) -> None:
+    steps, across, truth = drive(SIGMA * np.eye(3)[axis], 0.1 * SIGMA)
+    assert error_deg(smooth_rotations(steps, across), truth) < 0.65 * error_deg(steps, truth)
+
+
+def test_a_relative_rotation_that_is_far_off_is_an_outlier() -> None:
+    steps, across, truth = drive(np.zeros(3), 0.1 * SIGMA)
+    before = error_deg(smooth_rotations(steps, across), truth)
+    wrong = Rotation.from_euler("y", 5.0, degrees=True).as_matrix() @ across[10].R_to_from
+    across[10] = RelativeRotation(10, 12, wrong, across[10].sigmas)
+    assert error_deg(smooth_rotations(steps, across), truth) < before + 0.02
+
+
+def test_relative_rotations_across_a_step_that_was_not_measured_are_not_used() -> None:
+    steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
+    gap = StepTable({ends: motion for ends, motion in steps.motions.items() if ends != (20, 21)})
+    smoothed = rotations_of(smooth_rotations(gap, across))
+    assert list(smoothed) == list(gap.motions)
+    elsewhere = [rotation for rotation in across if not rotation.from_index <= 20 < rotation.to_index]
+    assert len(elsewhere) == len(across) - 2
+    for ends, R in rotations_of(smooth_rotations(gap, elsewhere)).items():
+        np.testing.assert_array_equal(R, smoothed[ends])
+
+
+def test_steps_alone_on_both_sides_of_a_gap_are_kept() -> None:
+    steps, across, _ = drive(np.zeros(3), 0.1 * SIGMA)
+    alone = StepTable({ends: steps.motions[ends] for ends in ((0, 1), (20, 21))})
+    assert smooth_rotations(alone, across) is alone
+
+
+def test_steps_that_are_not_triangulated_stay_and_are_not_crossed() -> None:
+    steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
+    by_points = Motion(steps.motions[20, 21].relative_pose)
+    smoothed = smooth_rotations(steps.replaced({(20, 21): by_points}), across)
+    assert smoothed.motions[20, 21] is by_points
+    without = smooth_rotations(StepTable({e: m for e, m in steps.motions.items() if e != (20, 21)}), across)
+    for ends, R in rotations_of(without).items():
+        np.testing.assert_array_equal(R, rotations_of(smoothed)[ends])
+
+
+def test_translations_stay_as_the_current_camera_sees_them() -> None:
+    steps, across, _ = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
+    smoothed = smooth_rotations(steps, across)
+    for before, after in zip(steps, smoothed, strict=True):
+        assert np.abs(after.relative_pose.T_from_to[:3, :3] - before.relative_pose.T_from_to[:3, :3]).max() > 0
+        seen = invert(after.relative_pose.T_from_to)[:3, 3]
+        np.testing.assert_allclose(seen, T_CURRENT_PREVIOUS, atol=1e-12)
+        np.testing.assert_array_equal(after.relative_pose.sigmas, before.relative_pose.sigmas)
+
+
+def test_steps_that_skip_frames_are_smoothed_like_others() -> None:
+    """The same drive, whose frames are numbered three apart: every step skips two frames."""
+    steps, across, truth = drive(np.array([SIGMA, 0.0, 0.0]), 0.1 * SIGMA)
+    expected = rotations_of(smooth_rotations(steps, across))
+    sparse = table_of({(3 * k, 3 * k + 3): R for (k, _), R in rotations_of(steps).items()})
+    sparse_across = [
+        RelativeRotation(3 * each.from_index, 3 * each.to_index, each.R_to_from, each.sigmas) for each in across
+    ]
+    for (first, _), R in rotations_of(smooth_rotations(sparse, sparse_across)).items():
+        np.testing.assert_allclose(R, expected[first // 3, first // 3 + 1], atol=1e-12)
+    ends_inside = [RelativeRotation(k, k + 4, truth[0], np.full(3, SIGMA)) for k in range(0, 60, 3)]
+    assert smooth_rotations(sparse, ends_inside) is sparse

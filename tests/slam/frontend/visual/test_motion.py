@@ -1,0 +1,77 @@
+"""A motion keeps its rotation and direction when its length or its rotation comes from elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam import se3
+from slam.frames import RelativePose
+from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.visual.motion import Motion, pose_sigmas
+from slam.frontend.visual.step_noise import StepNoise
+
+NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
+NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
+ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])
+T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0]))
+
+
+def triangulated_motion() -> Motion:
+    sigmas = pose_sigmas(T_PREVIOUS_CURRENT, ROTATION_SIGMAS, DIRECTION_SIGMAS, 0.05)
+    pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
+    return Motion(pose, NO_POINTS, DIRECTION_SIGMAS)
+
+
+def motion_by_points() -> Motion:
+    return Motion(RelativePose(4, 5, T_PREVIOUS_CURRENT, np.full(6, 0.01), "pnp"))
+
+
+def test_ends_and_length_are_those_of_the_relative_pose() -> None:
+    motion = triangulated_motion()
+    assert motion.ends == (4, 5)
+    assert motion.length_unscaled == pytest.approx(np.hypot(0.1, 2.0))
+
+
+def test_another_length_keeps_rotation_and_direction() -> None:
+    motion = triangulated_motion()
+    scaled = motion.with_length(1.0, 0.03, 0.09, NO_NOISE)
+    np.testing.assert_array_equal(scaled.T_from_to[:3, :3], T_PREVIOUS_CURRENT[:3, :3])
+    np.testing.assert_allclose(scaled.T_from_to[:3, 3], T_PREVIOUS_CURRENT[:3, 3] / np.hypot(0.1, 2.0), atol=1e-12)
+    np.testing.assert_array_equal(scaled.sigmas[:3], motion.relative_pose.sigmas[:3])
+    assert 0.0299 <= scaled.sigmas[5] < 0.035
+    assert scaled.correlated_sigmas is not None
+    np.testing.assert_array_equal(scaled.correlated_sigmas[:3], scaled.sigmas[:3])
+    assert 0.0899 <= scaled.correlated_sigmas[5] < 0.095
+    assert (scaled.ends, scaled.source) == ((4, 5), "essential")
+    np.testing.assert_array_equal(motion.relative_pose.T_from_to, T_PREVIOUS_CURRENT)
+
+
+def test_a_motion_without_a_direction_of_its_own_takes_no_other_length() -> None:
+    with pytest.raises(ValueError, match="by pnp has no direction"):
+        motion_by_points().with_length(1.0, 0.03, 0.09, NO_NOISE)
+
+
+def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
+    motion = triangulated_motion()
+    own = motion.with_length(2.0, 0.03, 0.09, NO_NOISE).sigmas
+    added = StepNoise(np.array([0.01, 0.02, 0.0]), np.array([0.05, 0.05, 0.0]))
+    noisier = motion.with_length(2.0, 0.03, 0.09, added).sigmas
+    np.testing.assert_allclose(noisier[:3], np.hypot(own[:3], [0.01, 0.02, 0.0]))
+    np.testing.assert_allclose(noisier[3:5], np.hypot(own[3:5], 2.0 * 0.05), rtol=0.01)
+    assert noisier[5] == pytest.approx(own[5], rel=0.02)
+
+
+def test_another_rotation_keeps_the_translation_as_the_current_camera_sees_it() -> None:
+    R = se3.from_rotation_vector(np.array([0.02, -0.01, 0.03]), np.zeros(3))[:3, :3]
+    rotated = triangulated_motion().with_rotation(R)
+    T_current_previous = se3.invert(rotated.relative_pose.T_from_to)
+    np.testing.assert_allclose(T_current_previous[:3, :3], R, atol=1e-12)
+    np.testing.assert_allclose(T_current_previous[:3, 3], se3.invert(T_PREVIOUS_CURRENT)[:3, 3], atol=1e-12)
+    np.testing.assert_array_equal(rotated.relative_pose.sigmas, triangulated_motion().relative_pose.sigmas)
+
+
+def test_no_sigma_of_a_translation_is_zero() -> None:
+    ahead = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 2.0]))
+    sigmas = pose_sigmas(ahead, ROTATION_SIGMAS, np.array([0.004, 0.0, 0.0]), 0.05)
+    np.testing.assert_allclose(sigmas, [*ROTATION_SIGMAS, 0.008, 0.002, 0.1])

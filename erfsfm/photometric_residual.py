@@ -6,7 +6,6 @@ for every snippet.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 
 import cv2
@@ -17,6 +16,14 @@ _SIZE = (104, 32)  # width, height
 _LEAST_PIXELS = 100
 _NEAREST = np.float32(1e-6)
 _LEAST_DIFFERENCE = 1e-3  # grey levels
+
+
+Thumbnail = NDArray[np.float32]
+
+
+def thumbnail(grey: NDArray[np.uint8]) -> Thumbnail:
+    """Grey levels ``(H, W)`` of a frame at the size at which residuals are computed."""
+    return np.asarray(cv2.resize(grey, _SIZE, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 class PhotometricResidual:
@@ -36,27 +43,25 @@ class PhotometricResidual:
         u, v = np.meshgrid(*(np.arange(side, dtype=np.float64) for side in _SIZE))
         x, y = (u - self._centre[0]) / self._focal[0], (v - self._centre[1]) / self._focal[1]
         self._rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float32)  # (3, P)
-        self._seen: deque[tuple[NDArray[np.uint8], NDArray[np.float32]]] = deque(maxlen=8)
 
-    def shares(
+    def ratios(
         self,
-        images: Sequence[NDArray[np.uint8]],
+        thumbnails: Sequence[Thumbnail],
         disparity_target: NDArray[np.float32],
         T_source_target: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Mean absolute difference of target and warped source over that of target and source as it is.
 
         Args:
-            images: N + 1 frames ``(H, W, 3)`` uint8 RGB in time order, the target in the middle.
+            thumbnails: of N + 1 frames in time order, the target in the middle.
             disparity_target: 1/depth of the target in the unit of the poses, of any size.
             T_source_target: ``(N, 4, 4)``, target camera to source camera, row k for the k-th source in time order.
 
         Returns:
             ``(N,)``: 0 if warping explains the whole difference, 1 if none of it, or if too few pixels overlap.
         """
-        sources = np.stack([self._small(image) for image in images])
-        target = sources[len(images) // 2]
-        sources = np.delete(sources, len(images) // 2, axis=0)  # (N, h, w)
+        middle = len(thumbnails) // 2
+        target, sources = thumbnails[middle], np.delete(np.stack(thumbnails), middle, axis=0)  # (N, h, w)
         near = cv2.resize(disparity_target, _SIZE, interpolation=cv2.INTER_AREA).ravel()
         R, t = (part.astype(np.float32) for part in (T_source_target[:, :3, :3], T_source_target[:, :3, 3:]))
         x, y, z = (R @ self._rays + t * near).swapaxes(0, 1)  # (N, P) each
@@ -69,12 +74,3 @@ class PhotometricResidual:
         pixels = both.sum(axis=(1, 2))
         left, was = ((np.abs(target - other) * both).sum(axis=(1, 2)) / pixels.clip(1) for other in (warped, sources))
         return np.where(pixels < _LEAST_PIXELS, 1.0, left / np.maximum(was, _LEAST_DIFFERENCE)).astype(np.float64)
-
-    def _small(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        for known, grey in self._seen:
-            if known is image:
-                return grey
-        small = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), _SIZE, interpolation=cv2.INTER_AREA)
-        grey = np.asarray(small, dtype=np.float32)
-        self._seen.append((image, grey))
-        return grey

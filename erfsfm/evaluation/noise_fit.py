@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
@@ -20,7 +21,7 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak, windows
-from erfsfm.photometric_residual import PhotometricResidual
+from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses
 
 LEVELS = (0.5, 0.9, 0.95)
@@ -95,7 +96,8 @@ def measure(networks: PoseDepthNetworks, recording: Recording) -> PairErrors:
     for target, images in enumerate(windows(networks, recording), start=half):
         sources = [k for k in range(target - half, target + half + 1) if k != target]
         T_source_target = networks.poses(images)
-        shares = residual.shares(images, np.reciprocal(networks.depth(images[half])), T_source_target)
+        thumbnails = [thumbnail(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images]
+        shares = residual.ratios(thumbnails, np.reciprocal(networks.depth(images[half])), T_source_target)
         snippets.append((target, sources, T_source_target, shares))
     return pair_errors(recording.frames_name, snippets, T_world_camera)
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.inference import depth_at, limit_torch_threads
-from erfsfm.photometric_residual import PhotometricResidual
+from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
 from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
 
@@ -90,7 +91,8 @@ class NetworkPredictor:
         """Photometric residual ``(N,)`` of each source, as a share of the images' difference."""
 
         def measure() -> Answer:
-            return (self._residual.shares([frame.image for frame in frames], disparity, T_source_target),)
+            thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
+            return (self._residual.ratios(thumbnails, disparity, T_source_target),)
 
         given: list[Given] = [*frames, disparity, T_source_target, repr(self._intrinsics)]
         (residuals,) = self._get_or_compute("photometric residual", given, measure)

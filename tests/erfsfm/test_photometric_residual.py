@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.photometric_residual import PhotometricResidual
+from erfsfm.photometric_residual import PhotometricResidual, Thumbnail, thumbnail
 
 WIDTH, HEIGHT = 416, 128
 K = np.array([[240.0, 0.0, 207.5], [0.0, 240.0, 63.5], [0.0, 0.0, 1.0]])
@@ -29,11 +30,15 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> NDArray[np.float64]:
     return T
 
 
-def share(moved: NDArray[np.float64], believed: NDArray[np.float64], depth: float = DEPTH) -> float:
-    """Of a camera that moved, with another pose ``T_source_target`` believed of it; the target stands at the origin."""
+def seen(T_world_camera: NDArray[np.float64]) -> Thumbnail:
+    return thumbnail(cv2.cvtColor(wall(T_world_camera), cv2.COLOR_RGB2GRAY))
+
+
+def share(moved: NDArray[np.float64], assumed: NDArray[np.float64], depth: float = DEPTH) -> float:
+    """Of a camera that moved, and another pose ``T_source_target`` assumed; the target stands at the origin."""
     residual = PhotometricResidual(K, WIDTH, HEIGHT)
     disparity = np.full((HEIGHT, WIDTH), 1 / depth, np.float32)
-    shares = residual.shares([wall(moved), wall(at()), wall(at())], disparity, np.stack([believed, np.eye(4)]))
+    shares = residual.ratios([seen(moved), seen(at()), seen(at())], disparity, np.stack([assumed, np.eye(4)]))
     return float(shares[0])
 
 
@@ -55,10 +60,10 @@ def test_the_wronger_the_more_is_left(wrong: NDArray[np.float64]) -> None:
 def test_depth_and_translation_share_their_unit() -> None:
     """Both in another unit are the same motion; one of them alone is not."""
     moved = at(x=0.4)
-    believed = np.linalg.inv(moved)
-    believed[:3, 3] *= 0.25
-    assert share(moved, believed, depth=0.25 * DEPTH) == pytest.approx(share(moved, np.linalg.inv(moved)), abs=1e-6)
-    assert share(moved, believed) > 0.5
+    assumed = np.linalg.inv(moved)
+    assumed[:3, 3] *= 0.25
+    assert share(moved, assumed, depth=0.25 * DEPTH) == pytest.approx(share(moved, np.linalg.inv(moved)), abs=1e-6)
+    assert share(moved, assumed) > 0.5
 
 
 def test_what_is_not_seen_in_both_says_nothing() -> None:
@@ -70,7 +75,7 @@ def test_rows_follow_the_sources_in_time_order() -> None:
     residual = PhotometricResidual(K, WIDTH, HEIGHT)
     disparity = np.full((32, 104), 1 / DEPTH, np.float32)
     true = [np.linalg.inv(at(x=x)) for x in (-0.4, -0.2, 0.2, 0.4)]
-    images = [wall(at(x=x)) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
+    images = [seen(at(x=x)) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
     swapped = np.stack([true[0], true[1], true[3], true[2]])
-    shares = residual.shares(images, disparity, swapped)
+    shares = residual.ratios(images, disparity, swapped)
     assert (shares[:2] < 0.1).all() and (shares[2:] > 0.3).all()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
@@ -27,6 +28,13 @@ import pytest  # noqa: E402
 def _home_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Keep evo and others from leaving settings in the user's home."""
     os.environ["HOME"] = str(tmp_path_factory.mktemp("home"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signals_as_in_a_terminal() -> None:
+    """Tests that are started with nohup inherit an ignored SIGHUP."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)

@@ -38,7 +38,7 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
 
 
 def unfinished_name(path: Path) -> str | None:
-    """The name of the file that a killed process was writing to ``path``; None where ``path`` is no such rest."""
+    """The name of the file that a killed process was writing to ``path``; None where ``path`` is no such leftover."""
     match = _PARTIAL.fullmatch(path.name)
     return match["name"] if match else None
 

@@ -171,7 +171,7 @@ class SelfSupervision(lightning.LightningModule):
 
 
 def learning_rate_factor(schedule: str, progress: float) -> float:
-    """Share of the learning rate at a share of the run; a cosine ends at 2 %."""
+    """Factor on the learning rate after a fraction of the run; a cosine ends at 2 %."""
     if schedule == "cosine":
         return 0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2
     return 0.1 if schedule == "step" and progress >= 0.75 else 1.0

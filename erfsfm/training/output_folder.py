@@ -12,7 +12,7 @@ from erfsfm.errors import ConfigError, TrainingError
 from erfsfm.files import write_atomically
 
 CONFIG = "config.yaml"
-_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # what a run leaves that failed before its first weights
+_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # left by a run that failed before its first weights
 
 
 class OutputFolder:

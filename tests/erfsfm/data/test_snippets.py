@@ -214,7 +214,7 @@ def test_weights_mix_kinds_of_data(
 
 
 def test_recordings_without_a_share_are_refused(coded: Path) -> None:
-    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no share: name it there"):
+    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no weight: name it there"):
         SnippetDraws(discover(coded), experiment(weights={"folder/a": 1}), 1)
 
 
@@ -466,5 +466,5 @@ def test_ranges_and_gaps(tmp_path: Path, write_root: Callable[..., Path]) -> Non
 
     assert names() == ["simulated/3[0:4]", "simulated/3[5:8]", "simulated/3[9:12]"]
     assert names(ranges={"simulated/3": "2:7"}) == ["simulated/3[2:4]", "simulated/3[5:7]"]
-    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that there are"):
+    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that the recording has"):
         names(ranges={"simulated/3": "12:"})

@@ -261,7 +261,7 @@ def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: Modul
     ]
     table = cells(page.speed_tables(results))
     assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
-    assert ["loop 610", "sim", "networks asked", "25.0", "50.0", "25.0"] in table
+    assert ["loop 610", "sim", "networks computed", "25.0", "50.0", "25.0"] in table
     assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
     assert (table[-2][-2:], table[-1][-2:]) == (["loops", "read"], ["10.00", "40.00"])
     assert table[-1][table[-2].index("loops closed")] == "3"

@@ -44,7 +44,7 @@ def test_true_depth_gives_the_true_path(tool: ModuleType) -> None:
     frames = [street.render(k) for k in range(12)]
     K = street.K
     camera = Intrinsics(416, 128, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    T_first_camera = tool.registered([frame.depth for frame in frames], camera, far_m=40.0, voxel_m=1.0, share=0.3)
+    T_first_camera = tool.registered([frame.depth for frame in frames], camera, far_m=40.0, voxel_m=1.0, ratio=0.3)
     error = np.linalg.norm(T_first_camera[:, :3, 3] - street.T_world_camera[:, :3, 3], axis=1)
     assert error.max() < 0.1 * np.linalg.norm(street.T_world_camera[-1, :3, 3])
 

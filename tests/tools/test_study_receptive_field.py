@@ -23,11 +23,11 @@ def study_rows(better: float) -> list:
 
 
 def test_a_large_gain_is_named_and_noise_is_not():
-    said = study.verdict(study_rows(better=0.3)).splitlines()
+    said = study.conclusions(study_rows(better=0.3)).splitlines()
     (gain,) = [line for line in said if "dfcv2` against `posenet`: snippet RE" in line]
     assert gain.endswith("better.")
     assert not [
-        line for line in study.verdict(study_rows(better=0.0)).splitlines() if line.endswith(("better.", "worse."))
+        line for line in study.conclusions(study_rows(better=0.0)).splitlines() if line.endswith(("better.", "worse."))
     ]
 
 

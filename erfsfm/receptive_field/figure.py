@@ -82,7 +82,7 @@ def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     if weight.max() > 0:
         axis.contour(_smoothed_core(weight), levels=[0.5], colors=_MEASURED, linewidths=1.0)
     ratio = row.weighed.share_holding(HELD)
-    extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "empty: no pixel influences the output"
+    extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "nothing: no pixel influences the output"
     axis.set_title(f"weights: {row.weights}; {extent}", fontsize=7.5, loc="left", pad=3)
 
 

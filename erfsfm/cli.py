@@ -292,7 +292,7 @@ def evaluate_depth(
     from erfsfm.inference import DepthPosePredictor
 
     if fidelity == "paper" and split is None:
-        raise ConfigError("--fidelity paper needs KITTI's LiDAR depth: --split eigen or a file of frames")
+        raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
     predictor = DepthPosePredictor.from_weights(weights, device)
     if split is None:
         _print_result(depth_protocol(predictor, dataset, allow_leak), as_json)

@@ -131,7 +131,9 @@ def steps(path: Path) -> FloatArray:
     return se3.invert(T_world_camera[:-1]) @ T_world_camera[1:]
 
 
-def test_rotations_of_the_shipped_networks_follow_the_road(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
+def test_rotations_of_the_shipped_networks_follow_the_road(
+    learned: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
     metrics = check_run(learned)
     assert metrics["provenance"]["leak"] is False
     network, truth = steps(learned / "trajectory_network.kitti.txt"), steps(learned / "reference.kitti.txt")

@@ -237,5 +237,5 @@ def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
+        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train again") from error
     return tensors

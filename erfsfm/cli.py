@@ -170,7 +170,7 @@ def receptive_field(
     else:
         files = list_images(images)[:5] if images.is_dir() else []
         if len(files) < 5:
-            raise DataError(f"--images wants a folder of five consecutive images; {images} has {len(files)}")
+            raise DataError(f"--images needs a folder of five consecutive images; {images} has {len(files)}")
         snippet = [resize_image(read_image(file), height, width) for file in files]
     torch.manual_seed(seed)
     learned = None if weights == "none" else (weights, load_model(weights))

@@ -157,7 +157,7 @@ def _override(tree: dict[str, Any], text: str) -> None:
     dotted, equals, written = text.partition("=")
     parts = dotted.strip().split(".")
     if not equals or not all(parts):
-        raise ConfigError(f"--set wants section.key=value; got '{text}'")
+        raise ConfigError(f"--set needs section.key=value; got '{text}'")
     try:
         value = parse_yaml(written)
     except YamlError as error:

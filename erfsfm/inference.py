@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which imports this module alone
+from erfsfm.checkpoint import commit as commit  # for slam, which imports only this module
 from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically

@@ -165,10 +165,10 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
     try:
         return PoseNoise.model_validate(read_yaml(path))
     except YamlError as error:
-        raise CheckpointError(f"{error}; remove it, and measure anew with erfsfm calibrate-noise") from error
+        raise CheckpointError(f"{error}; remove it, and measure again with erfsfm calibrate-noise") from error
     except ValidationError as error:
         raise CheckpointError(
-            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure anew with erfsfm "
+            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure again with erfsfm "
             "calibrate-noise"
         ) from error
 

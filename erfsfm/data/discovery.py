@@ -1,6 +1,6 @@
 """Recordings under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders and videos.
 
-Discovery looks at folder names, at the first image of each recording, and counts the frames of videos. A recording
+Discovery reads folder names and the first image of each recording, and counts the frames of videos. A recording
 with missing frame numbers is split there, so that no snippet spans a gap in time.
 """
 
@@ -40,7 +40,7 @@ def discover(root: Path) -> list[Recording]:
     if not found:
         entries = ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
         raise DataError(
-            f"nothing to learn from in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
+            f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
             f"(2011_09_26/..._sync/image_02), or images or a video with camera.yaml; found "
             f"{entries or 'an empty folder'}"
         )

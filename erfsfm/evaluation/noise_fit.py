@@ -186,7 +186,7 @@ def _fit_component(errors: Sequence[PairErrors], k: int) -> FloatArray:
 
 
 def _correlation(errors: Sequence[PairErrors], spread: Sequence[FloatArray], k: int) -> float:
-    """Correlation of both directions' errors, gross ones cut at three sigmas, between 0 and 1."""
+    """Correlation of both directions' errors, clipped at three sigmas, between 0 and 1."""
     whitened = np.concatenate([e.single[:, :, k] / s[:, k, None] for e, s in zip(errors, spread, strict=True)])
     both = np.clip(whitened[np.isfinite(whitened).all(axis=1)], -3, 3)
     if len(both) < 2:

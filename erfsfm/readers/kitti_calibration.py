@@ -24,7 +24,7 @@ _SHIPPED = {
 }
 ASPECT_TOLERANCE = 0.01
 CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
-_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes alike
+_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
 
 
 class CalibrationFile:

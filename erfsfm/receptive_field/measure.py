@@ -84,7 +84,7 @@ def measure_fields(
     learned: tuple[str, Model] | None = None,
     device: torch.device | None = None,
 ) -> list[FieldRow]:
-    """Fields of presets; with our dilated pose network also the paper's, which skips three pixels of four.
+    """Fields of presets; with the default dilated pose network also the paper's, which skips three pixels of four.
 
     Args:
         names: keys of `PRESETS`.

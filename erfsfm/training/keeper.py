@@ -80,7 +80,7 @@ class WeightKeeper(Callback):
         if not _all_finite(module):
             raise TrainingError(
                 f"weights are NaN or infinite at step {step}: lower training.learning_rate, or set "
-                "training.gradient_clip or training.precision=32-true, and start anew; older weights are in last/"
+                "training.gradient_clip or training.precision=32-true, and start again; older weights are in last/"
             )
         self._saved_step = step
         model = self._model(module, step)

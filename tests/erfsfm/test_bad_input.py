@@ -192,7 +192,7 @@ def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: 
     config = load_experiment("tiny", [text for text in SMALL if "=" in text])
     (run / "config.yaml").write_text(dump_yaml(config))
     error = refusal(*TRAIN, *SMALL, "--dataset", root, "--output", run, "--resume")
-    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew" in error
+    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start again" in error
 
 
 def test_initial_weights_of_another_architecture(
@@ -219,7 +219,7 @@ def test_weights_cut_in_half(refusal: Refusal, tmp_path: Path, weights: Path, ve
     output = {"predict": "depth", "export": "net.onnx", "receptive-field": "field.png"}[verb]
     error = refusal(verb, *given, "--weights", weights, "--output", tmp_path / output)
     assert "depth.safetensors is damaged" in error
-    assert "copy it again or train anew" in error
+    assert "copy it again or train again" in error
     assert not (tmp_path / output).exists()
 
 

@@ -218,12 +218,12 @@ def test_a_root_without_recordings(tmp_path: Path, content: list[str]) -> None:
             (tmp_path / name).mkdir(parents=True)
         else:
             (tmp_path / name).write_text("")
-    assert "nothing to learn from" in refusal(tmp_path)
+    assert "no recording" in refusal(tmp_path)
 
 
 def test_a_file_is_no_root(tmp_path: Path) -> None:
     (tmp_path / "x.zip").write_bytes(b"PK")
-    assert "nothing to learn from" in refusal(tmp_path / "x.zip")
+    assert "no recording" in refusal(tmp_path / "x.zip")
 
 
 def test_empty_image_folder(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Trained networks on disk: a folder with two safetensors files and a readable record.
 
-``model.yaml`` says what was trained, on what, by which command; ``depth.safetensors`` and
+``model.yaml`` records what was trained, on what, by which command; ``depth.safetensors`` and
 ``pose.safetensors`` hold numbers only, so that loading never executes code.
 """
 
@@ -33,7 +33,7 @@ FILES = ("depth.safetensors", "pose.safetensors")
 
 
 class ModelRecord(Section):
-    """Everything about a pair of networks but their weights."""
+    """Metadata of a pair of networks: all but their weights."""
 
     model_config = ConfigDict(allow_inf_nan=True)  # a metric may be undefined
 
@@ -59,7 +59,7 @@ class Model:
 
 
 class Absent(nn.Module):
-    """Placeholder where a folder holds only one of the two networks; using it is an error of one line."""
+    """Placeholder where a folder holds only one of the two networks; using it raises an error."""
 
     def __init__(self, kind: NetworkKind, folder: Path) -> None:
         super().__init__()
@@ -162,7 +162,7 @@ def find_weights(name_or_folder: str | Path) -> Path:
 
 
 def weights_sha256(folder: Path) -> str:
-    """One fingerprint of the weight files."""
+    """SHA-256 of both weight files together."""
     digest = hashlib.sha256()
     for path in (folder / name for name in FILES):
         digest.update(path.read_bytes() if path.exists() else b"")
@@ -237,5 +237,5 @@ def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train anew") from error
+        raise CheckpointError(f"{path} is damaged ({error}); copy it again or train again") from error
     return tensors

@@ -45,7 +45,7 @@ def options(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
     ] = False,
 ) -> None:
-    """Options before a verb."""
+    """Options before a command."""
 
 
 @app.command()
@@ -55,7 +55,7 @@ def train(
         list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
     ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint in OUTPUT")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     seed: Annotated[int | None, typer.Option(help="overrides training.seed")] = None,
     device: Device = "auto",
@@ -134,10 +134,10 @@ def networks(
 
 @app.command("receptive-field")
 def receptive_field(
-    network: Annotated[list[str] | None, typer.Option(help="preset; repeat; all if left out")] = None,
-    output: Annotated[Path, typer.Option(help="the picture: png, pdf or svg")] = Path("receptive-field.png"),
+    network: Annotated[list[str] | None, typer.Option(help="preset; repeat; default: all")] = None,
+    output: Annotated[Path, typer.Option(help="the figure: png, pdf or svg")] = Path("receptive-field.png"),
     images: Annotated[
-        Path | None, typer.Option(help="a folder, whose first five images are used; else a drawn street")
+        Path | None, typer.Option(help="a folder, first five images used; default: a synthetic street")
     ] = None,
     weights: Annotated[str, typer.Option(help="learned weights for their own presets; none: all untrained")] = "none",
     fidelity: Fidelity = "default",
@@ -170,7 +170,7 @@ def receptive_field(
     else:
         files = list_images(images)[:5] if images.is_dir() else []
         if len(files) < 5:
-            raise DataError(f"--images wants a folder of five consecutive images; {images} has {len(files)}")
+            raise DataError(f"--images needs a folder of five consecutive images; {images} has {len(files)}")
         snippet = [resize_image(read_image(file), height, width) for file in files]
     torch.manual_seed(seed)
     learned = None if weights == "none" else (weights, load_model(weights))
@@ -187,9 +187,9 @@ def receptive_field(
 @app.command()
 def convert(
     files: Annotated[list[Path], typer.Argument(help="a depth checkpoint, a pose checkpoint, or both: .pth.tar")],
-    output: Annotated[Path, typer.Option(help="receives the weights; then what --weights takes")],
+    output: Annotated[Path, typer.Option(help="receives the weights; a folder for --weights")],
     dilated: Annotated[
-        bool, typer.Option("--dilated", help="the pose network is ERF's dilated one, which the file does not say")
+        bool, typer.Option("--dilated", help="the pose network is the dilated one; not recorded in the file")
     ] = False,
     width: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 416,
     height: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 128,
@@ -197,7 +197,7 @@ def convert(
         list[str] | None, typer.Option(help="recording seen in training, e.g. kitti_odometry/00; repeat")
     ] = None,
 ) -> None:
-    """Weights of SfMLearner-PyTorch and ERF-SfMLearner into ours; nothing in the files is executed.
+    """Convert weights of SfMLearner-PyTorch and ERF-SfMLearner; no code in the files is executed.
 
     Example: erfsfm convert dispnet_model_best.pth.tar exp_pose_model_best.pth.tar --output weights/old
     """
@@ -208,14 +208,14 @@ def convert(
         size = sum(value.numel() for value in old.tensors.values())
         typer.echo(f"{old.kind}: {old.preset}, {size:,} weights from {old.path}")
     if not trained_on:
-        typer.echo("training data unknown: a leak cannot be noticed (--trained-on names it)", err=True)
+        typer.echo("training data unknown: leaks cannot be detected (--trained-on names it)", err=True)
     typer.echo(f"weights in {output}: use them with --weights {output}")
 
 
 @app.command()
 def export(
     weights: Weights = "default",
-    output: Annotated[Path, typer.Option(help="the depth network; the pose network goes beside it")] = Path(
+    output: Annotated[Path, typer.Option(help="depth network's file; the pose network goes beside it")] = Path(
         "erfsfm.onnx"
     ),
     format_: Annotated[Literal["onnx"], typer.Option("--format", help="of the files")] = "onnx",
@@ -292,7 +292,7 @@ def evaluate_depth(
     from erfsfm.inference import DepthPosePredictor
 
     if fidelity == "paper" and split is None:
-        raise ConfigError("--fidelity paper is about KITTI's LiDAR depth: it needs --split eigen or a file of frames")
+        raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
     predictor = DepthPosePredictor.from_weights(weights, device)
     if split is None:
         _print_result(depth_protocol(predictor, dataset, allow_leak), as_json)
@@ -311,7 +311,7 @@ def evaluate_pose(
     seed: UnusedSeed = 0,
     as_json: Json = False,
 ) -> None:
-    """Five-frame snippet ATE and RE, beside a straight constant motion as a baseline.
+    """Five-frame snippet ATE and RE, beside constant velocity straight ahead as a baseline.
 
     Example: erfsfm evaluate pose --weights default --dataset KITTI --sequence 09 --sequence 10
     """

@@ -16,7 +16,7 @@ Fidelity = Literal["default", "paper"]
 
 
 class NetworkConfig(Section):
-    """Which networks, how wide, how faithful."""
+    """Presets of the networks, their widths and their fidelity to the paper."""
 
     depth: str = Field(default="depthnet", description="preset of the depth network, see erfsfm networks")
     pose: str = Field(default="posenet", description="preset of the pose network, see erfsfm networks")
@@ -76,7 +76,7 @@ class DataConfig(Section):
     weather: float = Field(
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
     )
-    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images, MB a process")
+    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images, MB per process")
     workers: int = Field(default=1, ge=0, description="data loader processes; 0: in the training process")
 
 
@@ -130,9 +130,9 @@ class TeacherConfig(Section):
     alone_steps: int = Field(
         default=0,
         ge=0,
-        description="first steps without photometric error, which converges only from close by; 0: none",
+        description="first steps without photometric error, which needs a good initial guess; 0: none",
     )
-    cache: Path | None = Field(default=None, description="folder that keeps the measurements between runs")
+    cache: Path | None = Field(default=None, description="cache folder of the measurements")
 
     @property
     def weights(self) -> dict[str, float]:
@@ -184,7 +184,7 @@ class TrainingConfig(Section):
 
 
 class ExperimentConfig(Section):
-    """One experiment, complete."""
+    """One complete experiment."""
 
     network: NetworkConfig = Field(default_factory=NetworkConfig)
     data: DataConfig = Field(default_factory=DataConfig)
@@ -203,7 +203,7 @@ class ExperimentConfig(Section):
 
 
 def config_folders() -> list[Path]:
-    """Where named configurations lie: in the wheel, or in the source tree."""
+    """Folders of the named configurations: in the wheel, or in the source tree."""
     package = Path(__file__).resolve().parent
     return [package / "_configs", package.parent / "configs" / "erfsfm"]
 

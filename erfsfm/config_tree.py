@@ -72,7 +72,7 @@ def load_config(
         model: what the configuration must be.
         file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
-        shipped: folders of named configurations, the first one that knows a name wins.
+        shipped: folders of named configurations, the first one that has a name wins.
         old_names: of earlier releases.
 
     Raises:
@@ -123,7 +123,7 @@ def dump_yaml(config: BaseModel) -> str:
 
 
 def dump_explained(config: BaseModel) -> str:
-    """Likewise, for sections of keys without further levels: every key with its meaning as a comment."""
+    """As `dump_yaml`, with the description of every key as a comment; sections without nested sections only."""
     lines: list[str] = []
     for name, section in config:
         summary = (type(section).__doc__ or "").partition("\n")[0].rstrip(".").replace("``", "")
@@ -157,7 +157,7 @@ def _override(tree: dict[str, Any], text: str) -> None:
     dotted, equals, written = text.partition("=")
     parts = dotted.strip().split(".")
     if not equals or not all(parts):
-        raise ConfigError(f"--set wants section.key=value; got '{text}'")
+        raise ConfigError(f"--set needs section.key=value; got '{text}'")
     try:
         value = parse_yaml(written)
     except YamlError as error:

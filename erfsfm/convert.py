@@ -2,7 +2,7 @@
 
 One file holds one network: DispNetS or PoseExpNet. Nothing in it is executed. The names of plain layers are
 those of the published code; deformable layers are recognised by their structure, whatever their names.
-Plain and dilated networks have the same weights: the user must say which it was.
+Plain and dilated networks have the same weights: the user must tell which it was.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def convert(
         files: a depth checkpoint, a pose checkpoint, or one of each in any order.
         output: made if absent; must not hold weights yet.
         dilated: the pose network was the dilated one.
-        size: (height, width) of the images that the networks were trained on; the files do not say.
-        trained_on: recordings seen in training; the files do not say.
+        size: (height, width) of the images that the networks were trained on; not recorded in the files.
+        trained_on: recordings seen in training; not recorded in the files.
         command: for the record.
 
     Raises:
@@ -82,13 +82,13 @@ def convert(
         networks[network.kind] = network
     if dilated and "pose" not in networks:
         raise CheckpointError(
-            "dilated was asked for, but no pose network was given; the reference's dilated DispNetS cannot run"
+            "dilated needs a pose network, and no pose network was given; the reference's dilated DispNetS cannot run"
         )
     record = ModelRecord(
         network=_config(networks, size),
         networks="both" if len(networks) == 2 else next(iter(networks)),
         trained_on=list(trained_on) or ["unknown"],
-        licence="unknown: ask those who trained them",
+        licence="unknown: ask the authors of the weights",
         version=erfsfm.__version__,
         commit=commit(),
         command=command,
@@ -124,7 +124,7 @@ def read_old(path: Path, dilated: bool = False) -> OldNetwork:
     renamed, stages = _rename(path, kind, tensors)
     preset = _DEFORMABLE[kind].get(stages)
     if preset is None:
-        raise CheckpointError(f"{path} has deformable layers in conv {stages}; no network of the paper has just these")
+        raise CheckpointError(f"{path} has deformable layers in conv {stages}; no network of the paper has these")
     if dilated and kind == "pose":
         if stages:
             raise CheckpointError(f"{path} is deformable, not dilated: leave out --dilated")

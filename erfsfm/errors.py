@@ -18,7 +18,7 @@ class DataError(ErfsfmError):
 
 
 class TrainingError(ErfsfmError):
-    """Training cannot start or go on."""
+    """Training cannot start or continue."""
 
 
 class ExportError(ErfsfmError):

@@ -118,7 +118,7 @@ def _export(
     if not difference <= TOLERANCE:
         raise ExportError(
             f"{path} was not written: onnxruntime differs from PyTorch by {difference:.1e} of the largest output of "
-            f"{preset}, more than {TOLERANCE:.0e}; tell the authors the versions of torch, onnx and onnxruntime"
+            f"{preset}, more than {TOLERANCE:.0e}; report the versions of torch, onnx and onnxruntime"
         )
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return Exported(path, kind, preset, difference)

@@ -13,7 +13,7 @@ _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
 
 def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = True) -> None:
-    """Let ``fill`` write a file beside ``path``, then put it in place at once; missing parent folders are made.
+    """Let ``fill`` write a temporary file beside ``path``, then rename it; missing parent folders are made.
 
     The temporary name ends as ``path`` does, for writers that look at the suffix.
 
@@ -38,7 +38,7 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
 
 
 def unfinished_name(path: Path) -> str | None:
-    """The name of the file that a killed process was writing to ``path``; None where ``path`` is no such rest."""
+    """The name of the file that a killed process was writing to ``path``; None where ``path`` is no such leftover."""
     match = _PARTIAL.fullmatch(path.name)
     return match["name"] if match else None
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which imports this module alone
+from erfsfm.checkpoint import commit as commit  # for slam, which imports only this module
 from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
-from erfsfm.readers.images import read_image as read_image  # images come in as they are read for training
+from erfsfm.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.readers.images import resize_image
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ def choose_device(choice: str) -> torch.device:
     if choice not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device must be auto, cpu or cuda; got '{choice}'")
     if choice == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device cuda was asked for, but this machine or this build of torch has none; use cpu")
+        raise ConfigError("device cuda is not available on this machine or in this build of torch; use cpu")
     return torch.device("cuda" if choice != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -123,7 +123,7 @@ class DepthPosePredictor:
         return depth_at(self.disparity(image), height, width)
 
     def prepare(self, image: NDArray[np.uint8]) -> PreparedImage:
-        """An image ``(H, W, 3)`` uint8 RGB as the networks take it; one that is asked about again is prepared once."""
+        """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""
         return PreparedImage(self._input(image))
 
     @torch.inference_mode()

@@ -72,5 +72,9 @@ class PhotometricResidual:
         places = zip(sources, u.reshape(sources.shape), v.reshape(sources.shape), strict=True)
         warped = np.stack([cv2.remap(source, columns, rows, cv2.INTER_LINEAR) for source, columns, rows in places])
         pixels = both.sum(axis=(1, 2))
-        left, was = ((np.abs(target - other) * both).sum(axis=(1, 2)) / pixels.clip(1) for other in (warped, sources))
-        return np.where(pixels < _LEAST_PIXELS, 1.0, left / np.maximum(was, _LEAST_DIFFERENCE)).astype(np.float64)
+        residual, unwarped = (
+            (np.abs(target - other) * both).sum(axis=(1, 2)) / pixels.clip(1) for other in (warped, sources)
+        )
+        return np.where(pixels < _LEAST_PIXELS, 1.0, residual / np.maximum(unwarped, _LEAST_DIFFERENCE)).astype(
+            np.float64
+        )

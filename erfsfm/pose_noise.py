@@ -24,22 +24,23 @@ from erfsfm.files import write_atomically
 from erfsfm.yaml_file import YamlError, read_yaml
 
 FloatArray = NDArray[np.float64]
-# target, sources, T_source_target (N, 4, 4), photometric residuals (N,); without these, nothing counts as explained
+# target, sources, T_source_target (N, 4, 4), photometric residuals (N,); None: residuals of 1
 Snippet = tuple[int, Sequence[int], FloatArray, FloatArray | None]
 NOISE_FILE = "noise.yaml"
 
-_Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_Six = tuple[_Share, _Share, _Share, _Share, _Share, _Share]
+_Six = tuple[_NonNegative, _NonNegative, _NonNegative, _NonNegative, _NonNegative, _NonNegative]
 
 
 class PoseNoise(Section):
     """Sigmas of one direct pose, rotation x, y, z (radians) then translation x, y, z (the networks' unit).
 
-    They add in squares: ``frame`` for each frame between the two, ``turn`` of the angle turned (for the translation:
-    of the angle a frame, times the length), ``length`` of the length moved, ``disagreement`` of what the measurements
-    in both directions differ by, ``residual`` of the photometric residual (``erfsfm.photometric_residual``; for the
-    translation times the length). ``correlation`` is that of the whitened errors of both directions.
+    Their parts add in quadrature: ``frame`` for each frame between the two, ``turn`` times the rotation angle (for the
+    translation: the angle a frame, times the length), ``length`` times the length moved, ``disagreement`` times the
+    difference of the measurements in both directions, ``residual`` times the photometric residual
+    (``erfsfm.photometric_residual``; for the translation times the length). ``correlation`` is that of the whitened
+    errors of both directions.
     """
 
     format: Literal[1] = 1
@@ -106,18 +107,18 @@ def pair_poses(snippets: Sequence[Snippet]) -> list[PairPose]:
     """Every measured pair of frames, once."""
     measured: dict[tuple[int, int], list[tuple[FloatArray, float]]] = {}
     for target, sources, T_source_target, residuals in snippets:
-        left = np.ones(len(sources)) if residuals is None else residuals
+        ratios = np.ones(len(sources)) if residuals is None else residuals
         T_target_source = np.linalg.inv(T_source_target)
         for k, source in enumerate(sources):
             forward = source < target
             pair = (source, target) if forward else (target, source)
             T_first_last = np.asarray((T_source_target if forward else T_target_source)[k], dtype=np.float64)
-            measured.setdefault(pair, []).append((T_first_last, float(left[k])))
+            measured.setdefault(pair, []).append((T_first_last, float(ratios[k])))
     if not measured:
         return []
     pairs, directions = zip(*sorted(measured.items()), strict=True)
     poses = [np.stack([T for T, _ in each]) for each in directions]
-    residual = np.array([np.mean([share for _, share in each]) for each in directions])
+    residual = np.array([np.mean([ratio for _, ratio in each]) for each in directions])
     T_first_last = _middle(*(np.stack([each[k] for each in poses]) for k in (0, -1)))
     features = _features(np.array(pairs), poses, T_first_last, residual)
     return [PairPose(*pair, *known) for pair, *known in zip(pairs, T_first_last, poses, features, strict=True)]
@@ -130,13 +131,13 @@ def _features(
     frames = (pairs[:, 1] - pairs[:, 0]).astype(np.float64)
     moved = tangent(T_first_last)
     turn, length = np.linalg.norm(moved[:, :3], axis=1), np.linalg.norm(moved[:, 3:], axis=1)
-    differ = np.abs(difference(np.stack([each[0] for each in poses]), np.stack([each[-1] for each in poses])))
-    differ[[len(each) == 1 for each in poses]] = 0.0
+    disagreement = np.abs(difference(np.stack([each[0] for each in poses]), np.stack([each[-1] for each in poses])))
+    disagreement[[len(each) == 1 for each in poses]] = 0.0
 
     def six(rotation: FloatArray, translation: FloatArray) -> FloatArray:
         return np.stack([rotation] * 3 + [translation] * 3, axis=1)
 
-    rows = [six(frames, frames), six(turn, turn / frames * length), six(length, length), differ]
+    rows = [six(frames, frames), six(turn, turn / frames * length), six(length, length), disagreement]
     return np.stack([*rows, six(residual, residual * length)], axis=1)
 
 
@@ -164,10 +165,10 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
     try:
         return PoseNoise.model_validate(read_yaml(path))
     except YamlError as error:
-        raise CheckpointError(f"{error}; remove it, and measure anew with erfsfm calibrate-noise") from error
+        raise CheckpointError(f"{error}; remove it, and measure again with erfsfm calibrate-noise") from error
     except ValidationError as error:
         raise CheckpointError(
-            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure anew with erfsfm "
+            f"{path} is not a noise record: {first_problem(error)}; remove it, and measure again with erfsfm "
             "calibrate-noise"
         ) from error
 

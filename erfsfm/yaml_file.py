@@ -1,4 +1,4 @@
-"""YAML as every part of the project reads it: without code, each key once, in bounded time, errors in one line."""
+"""The YAML loader of both packages: no code, no duplicate keys, bounded time, errors in one line."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def parse_yaml(text: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML with limits, where ``1e-4`` is a number and a key may stand once."""
+    """Safe YAML with limits, where ``1e-4`` is a number and duplicate keys are refused."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)

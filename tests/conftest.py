@@ -1,4 +1,4 @@
-"""Quiet, repeatable surroundings for every test, and the way to the real recordings."""
+"""Fixtures of every test: a quiet, repeatable environment, the folder of real recordings, a check of run folders."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ import pytest  # noqa: E402
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _home_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _separate_home(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Keep evo and others from leaving settings in the user's home."""
     os.environ["HOME"] = str(tmp_path_factory.mktemp("home"))
 
@@ -39,7 +39,7 @@ def _signals_as_in_a_terminal() -> None:
 
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
-    """The same chance in every test; torch only where a test has loaded it."""
+    """The same random seeds in every test; torch only where a test has loaded it."""
     random.seed(0)
     np.random.seed(0)
     if "torch" in sys.modules:
@@ -82,7 +82,7 @@ _METRICS = {
         **dict.fromkeys(("accuracy_median_m", "completeness"), float),
     },
 }
-# may be null only where they are null for a reason; these never are
+# never null
 _ALWAYS = {"schema", "status", "provenance", "frames", "name", "timing", "mode", "nodes", "factors", *_PROVENANCE}
 _STEMS = ("trajectory_network", "trajectory_odometry", "trajectory_optimised")
 _FILES = (
@@ -92,8 +92,8 @@ _FILES = (
 _MAP_FILES = ("map_mesh.ply", "map_cloud.ply")
 
 
-def _mistakes(node: Any, wanted: Any, where: str) -> list[str]:
-    """What of a part of ``metrics.json`` is not as the design has it."""
+def _violations(node: Any, wanted: Any, where: str) -> list[str]:
+    """Violations of the schema of ``metrics.json`` in one of its parts."""
     if not isinstance(wanted, Mapping):
         right = isinstance(node, (int, float) if wanted is float else wanted) and (wanted is bool or node is not True)
         return [] if right else [f"{where} is {node!r}, not {wanted.__name__}"]
@@ -105,7 +105,7 @@ def _mistakes(node: Any, wanted: Any, where: str) -> list[str]:
         if key not in node:
             found.append(f"{place} is missing")
         elif node[key] is not None:
-            found += _mistakes(node[key], kind, place)
+            found += _violations(node[key], kind, place)
         elif key in _ALWAYS:
             found.append(f"{place} is null")
         elif not isinstance(node.get(f"{key}_reason"), str) or not node[f"{key}_reason"]:
@@ -122,7 +122,7 @@ def check_run() -> Callable[[Path], dict[str, Any]]:
             raise AssertionError(f"metrics.json holds {word}")
 
         metrics: dict[str, Any] = json.loads((path / "metrics.json").read_text(), parse_constant=refuse)
-        assert _mistakes(metrics, _METRICS, "metrics") == []
+        assert _violations(metrics, _METRICS, "metrics") == []
         assert (metrics["schema"], metrics["status"]) == (1, "ok")
         maps = _MAP_FILES if metrics["map"]["triangles"] else ()
         stems = (*_STEMS, "reference") if metrics["sequence"]["length_m"] is not None else _STEMS

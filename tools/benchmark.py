@@ -1,10 +1,10 @@
-"""How good and how fast: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
+"""Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
 accuracy measures simulated worlds and KITTI sequences, ablation turns off one part at a time, speed measures time and
-memory. Every run is a process and a folder of its own under --output. One that ended well is not repeated as long as
-sources, weights and options stay the same, so that a killed benchmark goes on where it was; one that failed is a row
-that says why. --jobs and --scheduler want Dask: pip install 'erfsfm-slam[benchmark]'. A scheduler's workers see the
-same files at the same paths.
+memory. Every run is a process and a folder of its own under --output. A successful one is not repeated as long as
+sources, weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its
+reason. --jobs and --scheduler need Dask: pip install 'erfsfm-slam[benchmark]'. A scheduler's workers need the same
+files at the same paths.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -30,7 +30,7 @@ from slam.storage.files import write_atomically
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Plan the runs, perform those that are missing, write tables."""
+    """Plan the runs, execute those that are missing, write tables."""
     options = _parser().parse_args(words)
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)
@@ -129,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
         if fast:
             add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
         else:
-            add("--jobs", type=int, default=1, help="runs at a time; more than one wants Dask")
+            add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
             add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
     return parser
 

@@ -36,7 +36,7 @@ from slam.storage.cache import CacheNamespace, DiskCache, without_cache
 from slam.trajectory import Trajectory
 
 SEED = 0
-EDGE_SHARE = 0.12  # relative step of depth around a pixel, as where the map leaves edges out
+EDGE_RATIO = 0.12  # relative step of depth around a pixel beyond which it is an edge, as in map fusion
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -94,7 +94,7 @@ def true_depth(folder: Path, frame: int) -> DepthMap:
 
 
 def registered(
-    depths: Sequence[DepthMap], intrinsics: Intrinsics, far_m: float, voxel_m: float, share: float
+    depths: Sequence[DepthMap], intrinsics: Intrinsics, far_m: float, voxel_m: float, ratio: float
 ) -> FloatArray:
     """``T_first_camera`` ``(N, 4, 4)``, metres, of depth maps in time order; the rest as in ``cloud``."""
     settings = load_kiss_icp_config(None)
@@ -106,23 +106,23 @@ def registered(
     rng = np.random.default_rng(SEED)
     T_first_camera = []
     for depth in depths:
-        odometry.register_frame(cloud(depth, intrinsics, far_m, share, rng), np.array([]))
+        odometry.register_frame(cloud(depth, intrinsics, far_m, ratio, rng), np.array([]))
         T_first_camera.append(odometry.last_pose.copy())
     return np.asarray(invert(T_first_camera[0]) @ np.stack(T_first_camera), dtype=np.float64)
 
 
-def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, rng: np.random.Generator) -> FloatArray:
+def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, ratio: float, rng: np.random.Generator) -> FloatArray:
     """Points ``(P, 3)`` in the camera, metres, of some of the pixels that are near and not at an edge of depth.
 
-    The pixels are drawn anew for every frame: with the same rays in each, the road would be the same rings of points in
+    Pixels are drawn again for every frame: with the same rays in each, the road would be the same rings of points in
     every cloud, which biases registration towards no motion.
     """
     height, width = depth.shape
     camera = intrinsics.resized(width, height)
     window = np.ones((3, 3), np.uint8)
-    smooth = cv2.dilate(depth, window) < (1 + EDGE_SHARE) * cv2.erode(depth, window)
+    smooth = cv2.dilate(depth, window) < (1 + EDGE_RATIO) * cv2.erode(depth, window)
     kept = rng.permutation(np.flatnonzero(smooth & (depth < far_m)))
-    kept = kept[: round(share * len(kept))]
+    kept = kept[: round(ratio * len(kept))]
     v, u = np.divmod(kept, width)
     z = depth.ravel()[kept].astype(np.float64)
     return np.column_stack([z * (u - camera.cx) / camera.fx, z * (v - camera.cy) / camera.fy, z])
@@ -131,16 +131,16 @@ def cloud(depth: DepthMap, intrinsics: Intrinsics, far_m: float, share: float, r
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--dataset", type=Path, help="as for erfsfm-slam run; the embedded sequence without it")
+    add("--dataset", type=Path, help="as for erfsfm-slam run; default: the embedded sequence")
     add("--sequence")
     add("--frames", metavar="A:B", help="half-open")
     add("--weights", default="default")
     add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="of the run")
-    add("--cache", type=Path, help="folder that keeps the networks' answers")
+    add("--cache", type=Path, help="cache folder of the networks' outputs")
     add("--true-depth", type=Path, metavar="FOLDER", help="16-bit depth maps (metres x 256) to register as a control")
     add("--far-m", type=float, default=40.0, help="points beyond are left out")
     add("--voxel-m", type=float, default=1.0, help="voxel of kiss-icp's map")
-    add("--share", type=float, default=0.1, help="of the pixels that become points")
+    add("--share", type=float, default=0.1, help="fraction of the pixels that become points")
     add("--columns", type=int, default=160, help="width of the table")
     return parser
 

@@ -28,7 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--dataset", type=Path, help="of the run; the embedded sequence without it")
+    parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")
     parser.add_argument("--sequence")
     parser.add_argument("--weights", default="default")
     arguments = parser.parse_args()

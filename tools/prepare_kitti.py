@@ -1,7 +1,7 @@
 """Shrink KITTI once: an odometry root or raw drives at another size, in the same layout, with the intrinsics moved.
 
 Training decodes images again and again; at 416x128 a drive takes a tenth of the space and time. Every file appears
-whole or not at all, and a run that was stopped goes on where it was: files that are there are kept.
+whole or not at all, and an interrupted run can be repeated: existing files are kept.
 
 Example: python tools/prepare_kitti.py KITTI small --width 416 --height 128 --workers 4
 """
@@ -125,7 +125,7 @@ def _called(drive: Path, names: list[str]) -> bool:
 
 
 def _check_mark(output: Path, size: Size) -> None:
-    """One output, one size: half of another would go unnoticed."""
+    """Refuse an output that was begun at another image size."""
     mark, wanted = output / MARK, {"width": size.width, "height": size.height}
     if mark.exists():
         had = json.loads(mark.read_text())
@@ -163,7 +163,7 @@ def _write(job: Job) -> None:
 
 
 def _write_calibration(drive: Path, target: Path, size: Size, odometry: bool) -> None:
-    """Moved intrinsics, written anew each time: they are small and follow from the source alone."""
+    """Moved intrinsics, written again each time: they are small and depend on the source alone."""
     if odometry:
         folders = [drive / camera for camera in CAMERAS if (drive / camera).is_dir()]
         if not folders:
@@ -200,7 +200,7 @@ def _write_lines(path: Path, lines: list[tuple[str, str]], texts: list[str]) -> 
 
 
 def _moved(key: str, text: str, full: Size, small: Size) -> str:
-    """A projection matrix of the resized image: u' = (u + 1/2) s - 1/2, so that pixels' centres stay theirs."""
+    """A projection matrix of the resized image: u' = (u + 1/2) s - 1/2, so that pixel centres map to pixel centres."""
     numbers = [float(number) for number in text.split()]
     if len(numbers) != 12:
         raise DataError(f"row {key} of the calibration must have 12 numbers; got {len(numbers)}")

@@ -1,7 +1,7 @@
 """Does a wider receptive field help? Every variant from scratch under one budget, several seeds, unseen worlds.
 
 Pose variants are trained beside the plain depth network, depth variants beside the plain pose network. Finished
-trainings are not repeated, broken ones go on where they stopped, so the same command may be given again.
+trainings are not repeated and interrupted ones are resumed, so the same command may be given again.
 
 Example: python tools/study_receptive_field.py --worlds worlds --unseen unseen --report docs/receptive-field-study.md
 """
@@ -38,8 +38,8 @@ PAIRS = [(DEPTH[0], pose) for pose in POSE] + [(depth, POSE[0]) for depth in DEP
 
 PAGE = """# Does a wider receptive field help?
 
-The paper's question, asked of our own networks: every variant trained from scratch under one budget and measured on
-worlds that none of them saw. Pose variants stand beside the plain depth network, depth variants beside the plain pose
+The paper's question, for the networks here: every variant is trained from scratch under one budget and measured on
+worlds that none of them saw. Pose variants are paired with the plain depth network, depth variants with the plain pose
 network.
 
 `{command}`
@@ -61,7 +61,7 @@ seeds. CPU seconds are those of one training, with {threads} thread{plural}, dat
 
 ## What follows
 
-{verdict}
+{conclusions}
 """
 
 
@@ -86,13 +86,13 @@ def main() -> None:
     parser.add_argument("--config", default="study", help="budget and objective")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes to the configuration")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--output", type=Path, default=Path("runs/study"), help="keeps every training")
+    parser.add_argument("--output", type=Path, default=Path("runs/study"), help="receives every training")
     parser.add_argument("--report", type=Path, default=Path("docs/receptive-field-study.md"))
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
 
     rows = []
-    for seed in range(arguments.seeds):  # seed by seed, so that an early look compares like with like
+    for seed in range(arguments.seeds):  # seed by seed, so that partial results compare the same seeds
         for depth, pose in PAIRS:
             config = load_experiment(
                 arguments.config,
@@ -160,7 +160,7 @@ def write_page(report: Path, rows: Sequence[StudyRow], config: ExperimentConfig,
         pose=table(rows, "pose", network.pose_width),
         depth=table(rows, "depth", network.depth_width),
         figure=f"images/{figure.name}",
-        verdict=verdict(rows),
+        conclusions=conclusions(rows),
     )
     write_atomically(report, lambda path: path.write_text(page))
 
@@ -197,7 +197,7 @@ def spread(values: Sequence[float], digits: int) -> str:
     return f"{np.mean(values):.{digits}f} ± {deviation:.{digits}f}"
 
 
-def verdict(rows: Sequence[StudyRow]) -> str:
+def conclusions(rows: Sequence[StudyRow]) -> str:
     """Each variant against the plain one, by Welch's t-test."""
     lines = []
     for kind, fields in (("pose", ("ate", "re")), ("depth", ("abs_rel",))):

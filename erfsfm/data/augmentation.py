@@ -16,7 +16,7 @@ Maps = list[NDArray[np.float32]]
 def augment(
     images: Images, maps: Maps, camera: Camera, config: DataConfig, fidelity: Fidelity, rng: np.random.Generator
 ) -> tuple[Images, Maps, Camera, bool]:
-    """Flip, scale-crop and recolour a snippet, all frames alike.
+    """Flip, scale-crop and recolour a snippet, all frames in the same way.
 
     Args:
         images: ``(H, W, 3)`` uint8 each.
@@ -57,7 +57,7 @@ def _scale_crop(
 
 
 def _recolour(images: Images, strength: float, rng: np.random.Generator) -> Images:
-    """Brightness, contrast and gamma by one look-up table per channel, grey gains kept close."""
+    """Brightness, contrast and gamma by one look-up table per channel; gains of the channels differ little."""
     gain = 1 + rng.uniform(-strength, strength)
     gamma = 1 + rng.uniform(-strength, strength)
     contrast = 1 + rng.uniform(-strength, strength)

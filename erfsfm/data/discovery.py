@@ -1,6 +1,6 @@
-"""What lies under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders and videos.
+"""Recordings under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders and videos.
 
-Discovery looks at folder names, at the first image of each recording, and counts the frames of videos. A recording
+Discovery reads folder names and the first image of each recording, and counts the frames of videos. A recording
 with missing frame numbers is split there, so that no snippet spans a gap in time.
 """
 
@@ -28,7 +28,7 @@ def discover(root: Path) -> list[Recording]:
     """All recordings under a root, two folders deep, sorted by name.
 
     Raises:
-        DataError: nothing there to learn from.
+        DataError: no recording found.
     """
     if not root.exists():
         raise DataError(f"no data set at {root}: the path does not exist")
@@ -40,7 +40,7 @@ def discover(root: Path) -> list[Recording]:
     if not found:
         entries = ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
         raise DataError(
-            f"nothing to learn from in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
+            f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
             f"(2011_09_26/..._sync/image_02), or images or a video with camera.yaml; found "
             f"{entries or 'an empty folder'}"
         )
@@ -92,7 +92,7 @@ def _depth(sequence: Path, images: tuple[Path, ...]) -> tuple[Path, ...] | None:
 
 
 def _own(root: Path) -> list[Recording]:
-    """One's own images, or videos, with their camera.yaml; nothing where there is neither."""
+    """A user's images or videos with their camera.yaml; empty where there is neither."""
     is_video = root.is_file() and root.suffix.lower() in VIDEO_SUFFIXES
     home = root.parent if is_video else root
     if not (home / CAMERA_FILE).is_file():

@@ -1,4 +1,4 @@
-"""KITTI raw drives as recordings to learn from; their layout stands in `erfsfm.readers.kitti_drives`.
+"""KITTI raw drives as training recordings; `erfsfm.readers.kitti_drives` describes their layout.
 
 Images may be smaller than the original: the calibration follows them.
 """

@@ -1,6 +1,6 @@
-"""A recording to learn from: consecutive frames, their camera, and truth where it is known.
+"""A training recording: consecutive frames, their camera, and ground truth where it is known.
 
-An image is decoded when a snippet asks for it.
+Images are decoded on demand.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames of one drive: ``images`` are their files, one and the same again and again where it is a ``video``.
+    """Frames of one drive: ``images`` are their files; of a ``video`` each is the video file.
 
-    ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which files beside the
-    images count. ``depth`` and ``poses_file`` are truth, where it is known: poses of camera 0, which this camera sees
-    at ``t_camera_cam0``. ``sequence`` is the name of its folder in an odometry root, ``oxts`` the folder of the
-    GPS/IMU's packets, one a frame. A part of a recording with gaps knows how many images come before it (``skipped``)
-    and how many there are in all (``stored``), for pose files that have rows for these alone.
+    ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which the files
+    beside the images are indexed. ``depth`` and ``poses_file`` are ground truth where it is known; the poses are of
+    camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its folder in an
+    odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a recording with gaps,
+    ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these alone.
     """
 
     name: str

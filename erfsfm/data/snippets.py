@@ -1,7 +1,7 @@
 """Windows of consecutive frames with the target in the middle, as training samples.
 
 Sample number i is a pure function of the seed and i: which recording, which window, which
-variation. A run that resumes at step k therefore sees exactly what it would have seen.
+augmentation. A run resumed at step k therefore draws the same samples as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from erfsfm.teacher.structure import StructureCache
 
 logger = logging.getLogger(__name__)
 
-_DEFAULT_VALIDATION = DataConfig().validation  # may name nothing among the data: not everybody simulates
+_DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Snippet:
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
-    """Random snippets from draw number ``first_draw`` to ``draws``, whole batches dealt out to devices and workers."""
+    """Random snippets number ``first_draw`` to ``draws``; whole batches are distributed to devices and workers."""
 
     def __init__(
         self, recordings: Sequence[Recording], config: ExperimentConfig, draws: int, first_draw: int = 0, rank: int = 0
@@ -88,9 +88,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
             sample["T_source_target"] = torch.from_numpy(T_source_target)
             sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
-        share = self._config.data.weather
-        if share > 0:
-            sample["shown"] = _stacked(weathered(images, rng) if rng.random() < share else images)
+        probability = self._config.data.weather
+        if probability > 0:
+            sample["shown"] = _stacked(weathered(images, rng) if rng.random() < probability else images)
         return sample
 
 
@@ -185,7 +185,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):
             names = _some([recording.name for recording in found])
-            raise DataError(f"data.ranges names '{key}', but no recording is called so; found {names}")
+            raise DataError(f"data.ranges names '{key}', but no recording has that name; found {names}")
     _require_begun(found, [*ranges, *listed, *held_out])
     training: list[Recording] = []
     validation: list[Recording] = []
@@ -198,7 +198,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not training:
         names = _some([recording.name for recording in found])
         raise DataError(
-            f"nothing left to train on: every recording found ({names}) is excluded, validates or tests; see "
+            f"nothing left to train on: every recording found ({names}) is excluded or used to validate or test; see "
             "data.exclude, data.validation, data.split and data.leave_out"
         )
     if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
@@ -222,27 +222,27 @@ def _some(names: Sequence[str]) -> str:
 
 def _chosen(recording: Recording, ranges: Sequence[FrameRange], listed: Sequence[FrameRange]) -> list[Recording]:
     """What to train on of a recording: its ranges, else what the split lists of it, else all where there is no list."""
-    for spans in (ranges, listed):
-        if any(span.counted_in(recording.name) is not None for span in spans):
-            return _parts(recording, spans)
+    for candidates in (ranges, listed):
+        if any(frames.counted_in(recording.name) is not None for frames in candidates):
+            return _parts(recording, candidates)
     return [] if listed else [recording]
 
 
-def _parts(recording: Recording, spans: Sequence[FrameRange]) -> list[Recording]:
-    """What spans name of a recording."""
-    same = [span.counted_in(recording.name) for span in spans]
-    parts = [recording.within(span.start, span.stop) for span in same if span is not None]
+def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
+    """The parts of a recording that frame ranges name."""
+    same = [frames.counted_in(recording.name) for frames in ranges]
+    parts = [recording.within(frames.start, frames.stop) for frames in same if frames is not None]
     return [part for part in parts if part is not None]
 
 
-def _require_begun(found: Sequence[Recording], spans: Sequence[FrameRange]) -> None:
-    """Refuse spans that begin after the last frame of the recording they name."""
-    for span in spans:
-        same = [(recording, span.counted_in(recording.name)) for recording in found]
+def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> None:
+    """Refuse frame ranges that begin after the last frame of the recording they name."""
+    for each in ranges:
+        same = [(recording, each.counted_in(recording.name)) for recording in found]
         named = [(recording.start + len(recording), frames) for recording, frames in same if frames is not None]
         if named and all(frames.start >= end for end, frames in named):
             end, frames = max(named, key=lambda pair: pair[0])
-            raise DataError(f"{frames} begins after the {end} frames that there are")
+            raise DataError(f"{frames} begins after the {end} frames that the recording has")
 
 
 def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
@@ -252,22 +252,20 @@ def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Reco
         return recordings
     kept = [part for r in recordings for part in (moving_parts(r) if r.name.startswith("kitti_raw/") else [r])]
     lost = sum(map(len, recordings)) - sum(map(len, kept))
-    blind = sum(recording.oxts is None for recording in raw)
+    without_speed = sum(recording.oxts is None for recording in raw)
     logger.info(
-        "left out %d of %d frames of KITTI raw, in which the car stands by the speed of its GPS/IMU%s",
+        "left out %d of %d frames of KITTI raw, in which the car stands still by its GPS/IMU speed%s",
         lost,
         sum(map(len, raw)),
-        f" ({blind} of {len(raw)} recordings have none: by their images)" if blind else "",
+        f" ({without_speed} of {len(raw)} recordings have none: by image differences)" if without_speed else "",
     )
     if not kept:
-        raise DataError(
-            "the car stands still in every frame found: data.static_frames=keep trains on them all the same"
-        )
+        raise DataError("the car stands still in every frame found: data.static_frames=keep trains on them")
     return kept
 
 
 def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
-    """Chance of each recording: by its windows, then by the configured share of its kind."""
+    """Chance of each recording: by its windows, then by the configured weight of its kind."""
     windows: NDArray[np.float64] = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
     if not config.weights:
         return np.asarray(windows / windows.sum())
@@ -279,5 +277,5 @@ def _probabilities(recordings: list[Recording], length: int, config: DataConfig)
         total += np.where(chosen, weight * windows / windows[chosen].sum(), 0)
     if not total.all():
         name = recordings[int(np.argmin(total))].name
-        raise DataError(f"data.weights gives '{name}' no share: name it there, or leave its data set out")
+        raise DataError(f"data.weights gives '{name}' no weight: name it there, or leave its data set out")
     return np.asarray(total / total.sum())

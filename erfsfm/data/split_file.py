@@ -21,7 +21,7 @@ _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")
 
 
 class Split(Section):
-    """A division of recordings; a list that is left out names none."""
+    """A division of recordings; a missing list is empty."""
 
     train: list[str] = Field(default_factory=list, description="recordings or frame ranges; none: all that are found")
     validation: list[str] = Field(default_factory=list, description="recordings or frame ranges that only validate")

@@ -1,4 +1,4 @@
-"""Which recordings and frames a network saw, and whether an evaluation would look at them again.
+"""The leak record: frames a network was trained on, and their overlap with those of an evaluation.
 
 Names are those of `erfsfm.readers.frame_range`.
 """
@@ -16,13 +16,13 @@ def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
 
     def leaks(name: str) -> bool:
         wanted = FrameRange.parse(name)
-        return any(wanted.covers(span) for span in ranges)
+        return any(wanted.covers(each) for each in ranges)
 
     return [name for name in names if leaks(name)]
 
 
 def merge(names: Iterable[str]) -> list[str]:
-    """A short, sorted record: neighbouring simulated seeds become spans, doubles vanish."""
+    """A short, sorted record: neighbouring simulated seeds become ranges, duplicates go."""
     seeds: set[int] = set()
     others: set[str] = set()
     for name in names:
@@ -31,10 +31,10 @@ def merge(names: Iterable[str]) -> list[str]:
             others.add(str(FrameRange.parse(name)))
         else:
             seeds |= set(range(span[0], span[1] + 1))
-    return _spans(sorted(seeds)) + sorted(others)
+    return _seed_ranges(sorted(seeds)) + sorted(others)
 
 
-def _spans(seeds: list[int]) -> list[str]:
+def _seed_ranges(seeds: list[int]) -> list[str]:
     runs: list[list[int]] = []
     for seed in seeds:
         if runs and runs[-1][-1] + 1 == seed:

@@ -21,14 +21,14 @@ _SMALL = (104, 32)  # columns, rows: coarse enough to average noise away
 
 
 def moving_parts(recording: Recording) -> list[Recording]:
-    """The stretches of a recording in which the car moves, in order; all of it where it never stands."""
+    """The stretches of a recording in which the car moves, in order; all of it where it never stops."""
     moving = (~_still(recording)).astype(np.int8)
-    edges = np.flatnonzero(np.diff(moving, prepend=0, append=0))  # starts and ends by turns
+    edges = np.flatnonzero(np.diff(moving, prepend=0, append=0))  # starts and ends, alternating
     return [recording.part(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
 def _still(recording: Recording) -> NDArray[np.bool_]:
-    """Whether the car stands, ``(N,)``."""
+    """Whether the car stands still, ``(N,)``."""
     if recording.oxts is None:
         return _unchanged(recording)
     return _speeds(recording.oxts, recording.start, len(recording)) < STILL_M_S
@@ -43,7 +43,7 @@ def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
 def _unchanged(recording: Recording) -> NDArray[np.bool_]:
     """Whether an image hardly differs from the frame before, by its median absolute change of grey level, ``(N,)``.
 
-    The median is robust to traffic. The median change itself is taken off first, as a change of exposure. The first
+    The median is robust to traffic. The median change itself is subtracted first, as a change of exposure. The first
     frame has the result of the second.
     """
     columns, rows = _SMALL

@@ -1,4 +1,4 @@
-"""Frames of a video, decoded in order once and kept at the size that the networks want."""
+"""Frames of a video, decoded in order once and kept at the networks' input size."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from erfsfm.readers.video import VideoFrames
 
 
 class Video:
-    """A video file with random access to shrunken frames.
+    """A video file with random access to downscaled frames.
 
-    Training asks for frames in any order, and a seek in compressed video is slow. Hence the first frame asked for
-    decodes the file from its beginning to its end, and all of it is kept, shrunken, in a temporary file that the system
-    pages in and out: 160 kB a frame at 416x128. Each process that asks keeps its own.
+    Training reads frames in any order, and a seek in compressed video is slow. Hence the first access decodes the file
+    from its beginning to its end, and all frames are kept, downscaled, in a temporary file that the system pages in and
+    out: 160 kB a frame at 416x128. Each process has its own.
     """
 
     def __init__(self, path: Path) -> None:

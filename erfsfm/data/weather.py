@@ -15,7 +15,7 @@ _BLUR_SAMPLES = 6  # images averaged into a blurred one
 
 
 def weathered(images: Images, rng: np.random.Generator) -> Images:
-    """The same views under random weather; pixels keep their place.
+    """The same views under random weather; positions of pixels do not change.
 
     Args:
         images: ``(H, W, 3)`` uint8 each, in time order.
@@ -36,13 +36,13 @@ def _blurred(images: Pictures, rng: np.random.Generator) -> Pictures:
     """Motion blur of a camera that translates and rotates during the exposure."""
     height, width = images[0].shape[:2]
     approach = float(rng.uniform(0, 0.08))
-    turn = float(rng.normal(0, 0.01)) * width
+    yaw = float(rng.normal(0, 0.01)) * width
     rise = float(rng.normal(0, 0.005)) * height
     centre = np.array([width - 1, height - 1]) / 2
     moves = []
-    for share in np.linspace(-0.5, 0.5, _BLUR_SAMPLES):
-        zoom = 1 + share * approach
-        shift = (1 - zoom) * centre + share * np.array([turn, rise])
+    for time in np.linspace(-0.5, 0.5, _BLUR_SAMPLES):
+        zoom = 1 + time * approach
+        shift = (1 - zoom) * centre + time * np.array([yaw, rise])
         moves.append(np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]]))
     border = cv2.BORDER_REPLICATE
     blurred = [

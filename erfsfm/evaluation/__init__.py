@@ -1,1 +1,1 @@
-"""How good depth and motion are, in the protocols of the papers."""
+"""Depth and pose metrics in the protocols of the papers."""

@@ -58,7 +58,7 @@ def depth_errors(
     Args:
         predicted: z-depth ``(H, W)``, positive.
         true_depth: z-depth in metres ``(H, W)``, 0 where unknown.
-        cap_m: truth beyond is left out; the prediction is clipped to it.
+        cap_m: farther truth is not compared; the prediction is clipped to it.
         crop: part of the image that is compared.
         scaling: ``median`` multiplies the prediction by the ratio of the medians, a number by that number.
         clipping: ``after`` scaling is the field's rule; ``before``, and never after, is the paper's code.

@@ -80,9 +80,9 @@ def calibrate(
     rows = []
     for k, held_out in enumerate(errors):
         others = errors[:k] + errors[k + 1 :] or errors
-        shares = coverage(held_out, fit(others, pose_sha256))
+        ratios = coverage(held_out, fit(others, pose_sha256))
         names = [f"coverage_{100 * level:.0f}" for level in LEVELS]
-        rows.append({"recording": held_out.recording, "pairs": len(held_out), **dict(zip(names, shares, strict=True))})
+        rows.append({"recording": held_out.recording, "pairs": len(held_out), **dict(zip(names, ratios, strict=True))})
     return fit(errors, pose_sha256), rows
 
 
@@ -97,8 +97,8 @@ def measure(networks: PoseDepthNetworks, recording: Recording) -> PairErrors:
         sources = [k for k in range(target - half, target + half + 1) if k != target]
         T_source_target = networks.poses(images)
         thumbnails = [thumbnail(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images]
-        shares = residual.ratios(thumbnails, np.reciprocal(networks.depth(images[half])), T_source_target)
-        snippets.append((target, sources, T_source_target, shares))
+        ratios = residual.ratios(thumbnails, np.reciprocal(networks.depth(images[half])), T_source_target)
+        snippets.append((target, sources, T_source_target, ratios))
     return pair_errors(recording.frames_name, snippets, T_world_camera)
 
 
@@ -152,7 +152,7 @@ def fit(errors: Sequence[PairErrors], pose_sha256: str) -> PoseNoise:
 
 
 def coverage(errors: PairErrors, noise: PoseNoise) -> list[float]:
-    """Share of pairs whose whitened squared error lies inside the 50, 90 and 95 % quantile of chi-square(6)."""
+    """Fraction of pairs whose whitened squared error lies inside the 50, 90 and 95 % quantile of chi-square(6)."""
     count = np.isfinite(errors.single[:, :, 0]).sum(axis=1)[:, None]
     merged = (1 + (count - 1) * np.array(noise.correlation)) / count
     squared = (errors.mean**2 / ((noise.coefficients**2 * errors.features**2).sum(axis=1) * merged)).sum(axis=1)
@@ -186,7 +186,7 @@ def _fit_component(errors: Sequence[PairErrors], k: int) -> FloatArray:
 
 
 def _correlation(errors: Sequence[PairErrors], spread: Sequence[FloatArray], k: int) -> float:
-    """Correlation of both directions' errors, gross ones cut at three sigmas, between 0 and 1."""
+    """Correlation of both directions' errors, clipped at three sigmas, between 0 and 1."""
     whitened = np.concatenate([e.single[:, :, k] / s[:, k, None] for e, s in zip(errors, spread, strict=True)])
     both = np.clip(whitened[np.isfinite(whitened).all(axis=1)], -3, 3)
     if len(both) < 2:

@@ -17,8 +17,8 @@ Fidelity = Literal["default", "paper"]
 
 # The reference code sizes its error array by images instead of snippets: length - 1 rows stay zero.
 _PAPER_ZERO_ROWS = 4
-# Predicted motion below this share of the true one is rounding: fitting a scale to it would reward noise.
-_STILL_SHARE = 1e-10
+# Predicted over true motion below which the prediction is rounding noise, to which no scale is fitted.
+_STILL_RATIO = 1e-10
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SnippetErrors:
 def snippet_errors(
     T_first_k_pred: FloatArray, T_first_k_true: FloatArray, fidelity: Fidelity = "default"
 ) -> SnippetErrors:
-    """Errors of predicted snippets, each brought to the truth's scale on its own.
+    """Errors of predicted snippets, each after its own least-squares scale.
 
     s   = sum(g . p) / sum(p . p)                    over the positions of one snippet
     ATE = sqrt(sum |g - s p|^2) / K                  K frames: not a root mean square
@@ -132,7 +132,7 @@ def _position_errors(predicted: FloatArray, truth: FloatArray) -> FloatArray:
     """ATE ``(S,)`` of positions ``(S, K, 3)``."""
     energy = (predicted**2).sum(axis=(1, 2))
     agreement = (truth * predicted).sum(axis=(1, 2))
-    moves = energy > _STILL_SHARE**2 * (truth**2).sum(axis=(1, 2))
+    moves = energy > _STILL_RATIO**2 * (truth**2).sum(axis=(1, 2))
     scale = np.divide(agreement, energy, out=np.zeros_like(energy), where=moves)
     residual = truth - scale[:, None, None] * predicted
     ate: FloatArray = np.sqrt((residual**2).sum(axis=(1, 2))) / predicted.shape[1]

@@ -1,4 +1,4 @@
-"""Whole evaluations: trained networks on recordings with truth, beside a baseline that uses no image."""
+"""Evaluation protocols: trained networks on recordings with ground truth, beside a baseline that uses no image."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, ev
 def pose_protocol(
     networks: PoseDepthNetworks, root: Path, sequences: Sequence[str], fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
-    """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and a straight
-    constant motion.
+    """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and
+    constant velocity straight ahead.
 
     In paper fidelity the truth is that of camera 0, whichever camera took the images.
 
@@ -99,7 +99,7 @@ def pose_protocol(
         parts = [whole.within(span.start, span.stop) for whole in wholes]
         chosen = [part for part in parts if part is not None]
         if not chosen:
-            raise DataError(f"{name} names no frame that there is: found {', '.join(w.frames_name for w in wholes)}")
+            raise DataError(f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}")
         for recording in chosen:
             T_world_camera = recording.true_poses(fidelity)
             if T_world_camera is None:
@@ -120,7 +120,7 @@ def _pose_rows(
 ) -> list[dict[str, Any]]:
     length = networks.sources + 1
     if length != 5:
-        raise DataError(f"the snippet protocol wants networks with 4 sources; these have {networks.sources}")
+        raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
     true = snippets_from_trajectory(T_world_camera, length)
     if len(true) == 0:
         raise DataError(f"{recording.name} has {len(recording)} frames; a snippet needs {length}")

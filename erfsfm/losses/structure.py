@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-SURE = 1.5  # most over least
+MAX_BOUND_RATIO = 1.5  # most over least
 FARTHEST = 100.0  # camera heights: weights do not grow beyond
 STILL = 0.01  # network units: added to the length of a step, against division by zero
 
@@ -31,10 +31,10 @@ class Bounds:
 
     def log_scale(self, disparity: Tensor) -> Tensor:
         """Mean of log disparity minus log measured ``(B, 1, 1, 1)``, over pixels with narrow bounds; 0 without any."""
-        sure = (self.least > 0) & (self.most < SURE * self.least)
-        middle = torch.where(sure, (self.least * self.most).sqrt(), 1)
-        difference = torch.where(sure, disparity.log() - middle.log(), 0).sum(dim=(1, 2, 3), keepdim=True)
-        return difference / sure.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
+        narrow = (self.least > 0) & (self.most < MAX_BOUND_RATIO * self.least)
+        middle = torch.where(narrow, (self.least * self.most).sqrt(), 1)
+        difference = torch.where(narrow, disparity.log() - middle.log(), 0).sum(dim=(1, 2, 3), keepdim=True)
+        return difference / narrow.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
 
 
 def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
@@ -48,9 +48,9 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
         log_scale: log of the disparity's scale over that of the bounds, ``(B, 1, 1, 1)``.
     """
     has_most = torch.isfinite(bounds.most)
-    said = disparity.log() - log_scale
-    below = (bounds.least.clamp(min=1e-6).log() - said).clamp(min=0)
-    above = (said - bounds.most.clamp(min=1e-6).log()).clamp(min=0)
+    scaled = disparity.log() - log_scale
+    below = (bounds.least.clamp(min=1e-6).log() - scaled).clamp(min=0)
+    above = (scaled - bounds.most.clamp(min=1e-6).log()).clamp(min=0)
     nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
     weight = torch.where(has_most | (bounds.least > 0), nearest.rsqrt(), 0)
     distance: Tensor = (weight * (below + above)).sum() / weight.sum().clamp(min=1)

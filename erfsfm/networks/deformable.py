@@ -214,7 +214,7 @@ def _compiled_kernel() -> ModuleType | None:
     except ImportError as error:
         logger.info("deformable convolution in plain PyTorch (%s); pip install 'erfsfm-slam[fast]' speeds it up", error)
         return None
-    logger.info("deformable convolution with Numba: compiled on first use, some seconds, and kept")
+    logger.info("deformable convolution with Numba: compiled on first use (some seconds) and cached")
     return deformable_kernel
 
 

@@ -132,14 +132,14 @@ def _neighbours(place: float, size: int) -> tuple[int, int, float, float, float,
     A pixel outside the image has the index of the one inside, no weight and no derivative.
     """
     low = math.floor(place)
-    share = place - low
+    fraction = place - low
     low_inside = 1.0 if low >= 0 else 0.0
     high_inside = 1.0 if low + 1 < size else 0.0
     return (
         max(int(low), 0),
         min(int(low) + 1, size - 1),
-        low_inside * (1 - share),
-        high_inside * share,
+        low_inside * (1 - fraction),
+        high_inside * fraction,
         -low_inside,
         high_inside,
     )

@@ -31,7 +31,7 @@ class MeasuredField:
         pixel: (row, column) of the output pixel in the last encoder layer.
         map_size: (height, width) of that layer.
         top: first image row with a gradient; so are `left`, and `bottom`, `right` the last ones.
-        coverage: share of the image's pixels with a gradient.
+        coverage: fraction of the image's pixels with a gradient.
         gradient: gradient magnitude summed over the input channels, ``(H, W)``.
     """
 
@@ -55,7 +55,7 @@ class MeasuredField:
         return self.right - self.left + 1
 
     def share_holding(self, weight: float) -> float:
-        """Ratio of the image's pixels, the fewest that hold this share of the gradient; 0 for an empty field."""
+        """Least fraction of the image's pixels that holds this fraction of the gradient; 0 for an empty field."""
         total = self.gradient.double().flatten().sort(descending=True).values.cumsum(0)
         if total[-1] == 0:
             return 0.0
@@ -123,8 +123,8 @@ def measured(
         network: any depth or pose network.
         size: image (height, width).
         pixel: (row, column) of the observed output; its map's centre if None.
-        offsets_px: how far deformable taps are pushed outwards from the kernel's centre, rows and
-            columns alike, in pixels of the layer's input; ``learned`` keeps the network's own offsets.
+        offsets_px: how far deformable taps are pushed outwards from the kernel's centre, along both
+            axes, in pixels of the layer's input; ``learned`` keeps the network's own offsets.
         stages: observe the output of this many encoder stages, all if None.
     """
     encoder = copy.deepcopy(network.encoder).double().eval()
@@ -173,7 +173,7 @@ def field_of(
         encoder: the encoder as it is.
         image: its input, ``(1, C, H, W)``.
         pixel: (row, column) of the observed output; its map's centre if None.
-        rounding: share of the largest gradient up to which a gradient counts as zero.
+        rounding: ratio to the largest gradient up to which a gradient counts as zero.
         stages: observe the output of this many stages, all if None.
     """
     image = image.detach().clone().requires_grad_()

@@ -65,7 +65,7 @@ def _widened(value: Tensor, shape: torch.Size, name: str) -> Tensor:
         twice, once = value.split([value.shape[1] - single, single], dim=1) if single in (0, 1) else (value, value)
         value = torch.cat([twice.repeat_interleave(2, dim=1) / 2, once], dim=1)
     if value.shape != shape:
-        raise ConfigError(f"'{name}' can be taken over at its width or twice of it, not as {tuple(shape)}")
+        raise ConfigError(f"'{name}' can be transferred to its width or twice of it, not as {tuple(shape)}")
     if value.dim() > 1:
         value = value + PARTING * value.std() * torch.randn_like(value)
     return value.transpose(0, 1).contiguous() if transposed else value

@@ -1,4 +1,4 @@
-"""``camera.yaml``: the calibration of one's own camera."""
+"""``camera.yaml``: the calibration of a user's own camera."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ class CameraFile(BaseModel):
         return self.model == "fisheye" or any(self.distortion)
 
     def height_or(self, default: float | None) -> float | None:
-        """The camera's height in metres: None where unknown, ``default`` where the file does not say."""
+        """The camera's height in metres: None where unknown, ``default`` where the file has none."""
         if self.camera_height_m is None:
             return default
         return None if isinstance(self.camera_height_m, str) else self.camera_height_m
 
 
 def read_camera_file(path: Path) -> CameraFile:
-    """Read and check a ``camera.yaml``; an unlikely camera is warned of.
+    """Read and check a ``camera.yaml``; an unlikely camera is logged as a warning.
 
     Raises:
         DataError: naming the file and the key that is missing, unknown, written twice or wrong.

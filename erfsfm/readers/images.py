@@ -1,4 +1,4 @@
-"""Image files: which a folder holds, read completely or not at all, and the one way of resizing them."""
+"""Image files: which a folder holds, read completely or not at all, and the resizing that all parts share."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def resize_image(image: Image, height: int, width: int) -> Image:
-    """An image ``(H, W, 3)`` at ``height x width``, without crop: the one way in training and in inference."""
+    """An image ``(H, W, 3)`` at ``height x width``, without crop; the same in training and in inference."""
     if image.shape[:2] == (height, width):
         return image
     shrinks = image.shape[0] >= height and image.shape[1] >= width

@@ -24,7 +24,7 @@ _SHIPPED = {
 }
 ASPECT_TOLERANCE = 0.01
 CAMERA_HEIGHT_M = 1.65  # of the car's cameras above the road
-_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes alike
+_SCALE_TOLERANCE = 0.15  # of a principal point from the middle, along both axes
 
 
 class CalibrationFile:
@@ -84,7 +84,7 @@ class CalibrationFile:
     def pinhole(self, key: str, width: int, height: int) -> Pinhole:
         """The camera of a projection matrix of ``calib.txt``, for images of the given size.
 
-        The file does not say its own size: it is that of the images where the principal point is near their middle.
+        The file has no image size: it is that of the images where the principal point is near their middle.
 
         Raises:
             DataError: no pinhole, an impossible one, or one of images of another size.

@@ -39,7 +39,7 @@ ODOMETRY_DRIVES = {
 
 @dataclass(frozen=True)
 class OdometryRoot:
-    """Where a root keeps its sequences; ``base`` is the folder with ``sequences`` and ``poses``."""
+    """An odometry root; ``base`` is the folder with ``sequences`` and ``poses``."""
 
     base: Path
     sequences: Path
@@ -111,5 +111,5 @@ def find_drives(dataset: Path) -> dict[str, Path]:
 
 
 def drive_name(text: str) -> str:
-    """A drive as the user writes it (with its date folder, with ``_sync``, or without) as we name it."""
+    """The canonical name of a drive that a user writes with or without its date folder and ``_sync``."""
     return Path(text).name.removesuffix("_sync")

@@ -24,7 +24,7 @@ class NumberedFiles:
     Attributes:
         paths: the N files that exist, at least one.
         rows: ``(N,)``, increasing from 0, the row of each.
-        first: number of row 0, by which files beside these count (times, poses, packets).
+        first: number of row 0, by which files beside these are indexed (times, poses, packets).
     """
 
     paths: tuple[Path, ...]
@@ -91,7 +91,7 @@ def by_number(paths: list[Path]) -> NumberedFiles:
 
 
 def by_name(paths: list[Path]) -> NumberedFiles:
-    """A user's files, at least one, in order: gaps are known where the names end in numbers that go up one by one.
+    """A user's files, at least one, in order: gaps are detected where names end in numbers that go up one by one.
 
     Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
 

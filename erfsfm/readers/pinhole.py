@@ -1,4 +1,4 @@
-"""A pinhole camera's numbers: how they follow a resize of the image, and which cannot be those of a real camera."""
+"""Intrinsics of a pinhole camera: their change under a resize of the image, and a check for impossible values."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Pinhole:
 
 
 def impossible(camera: Pinhole) -> str | None:
-    """What no camera has: a focal length out of all bounds, or a principal point outside the image."""
+    """The problem with intrinsics that no camera has: focal length out of bounds, principal point outside the image."""
     size = f"{camera.width}x{camera.height}"
     least, most = FOCAL_RATIO_LIMITS
     longer = max(camera.width, camera.height)
@@ -67,7 +67,7 @@ def require_plausible(camera: Pinhole, where: str) -> None:
 
     Args:
         camera: as read.
-        where: the file, and the row of it, that say so.
+        where: the file, and the row of it, for the message.
 
     Raises:
         DataError: see `impossible`.

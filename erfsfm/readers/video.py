@@ -25,8 +25,8 @@ _QUIET = "-8"  # AV_LOG_QUIET
 class VideoFrames:
     """The frames of a video, in any order.
 
-    A seek in compressed video may land beside the frame asked for, so where it lands is checked against
-    the time at which that frame was seen before; else the video is decoded again from its start. The last
+    A seek in compressed video may land on another frame, so its time is checked against the time recorded
+    for the wanted frame; where they differ, the video is decoded again from its start. The last
     frames stay in memory. Not for use from several threads.
     """
 
@@ -110,7 +110,7 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # the one line of error is ours
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # errors are reported by DataError alone
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise DataError(

@@ -1,1 +1,1 @@
-"""Receptive fields of the networks: measurement, figure, and a drawn street as input."""
+"""Receptive fields of the networks: measurement, figure, and a synthetic street as input."""

@@ -19,7 +19,7 @@ from erfsfm.receptive_field.measure import HELD, FieldRow
 _WIDTH_IN = 12.0
 _DIM = 0.3  # brightness of pixels that are never read
 _BOX, _MEASURED, _HEAT = "#ffd23f", "#3ec7f2", "inferno"
-_COMB_SHARE = 0.5  # a field that reads less of its own box than this is shown magnified
+_COMB_RATIO = 0.5  # a field that reads less of its own box than this is shown magnified
 _COMB_PX = 13
 _UNREAD = (24, 32, 64)
 
@@ -46,7 +46,7 @@ def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) 
     figure.suptitle(
         "Receptive field of the middle output of the last encoder layer\n"
         "left: bright pixels can reach it; blue: their bounding box; dashed: theoretical box, where it ends inside "
-        f"the image.  right: how much each pixel counts; line: {HELD:.0%} of it",
+        f"the image.  right: gradient magnitude; line: {HELD:.0%} of it",
         fontsize=9,
     )
     kind = path.suffix.removeprefix(".") or "png"
@@ -60,7 +60,7 @@ def _draw_seen(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     field = row.seen
     if field.rows:
         axis.add_patch(_rectangle(field.top, field.left, field.rows, field.columns, _MEASURED, "-"))
-        if field.coverage * read.size < _COMB_SHARE * field.rows * field.columns:
+        if field.coverage * read.size < _COMB_RATIO * field.rows * field.columns:
             _magnify(axis, read, image)
     axis.add_patch(_rectangle(top, left, row.side_px, row.side_px, _BOX, (0, (4, 4))))
     taps = f", taps pushed {row.offsets_px:g} px" if row.offsets_px else ""
@@ -81,9 +81,9 @@ def _draw_weighed(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:
     axis.imshow(strength, cmap=_HEAT, alpha=np.clip(1.6 * strength, 0, 0.95), vmin=0, vmax=1)
     if weight.max() > 0:
         axis.contour(_smoothed_core(weight), levels=[0.5], colors=_MEASURED, linewidths=1.0)
-    share = row.weighed.share_holding(HELD)
-    said = f"{HELD:.0%} in {share:.1%} of the image" if share else "nothing: no pixel of this image moves the output"
-    axis.set_title(f"weights: {row.weights}; {said}", fontsize=7.5, loc="left", pad=3)
+    ratio = row.weighed.share_holding(HELD)
+    extent = f"{HELD:.0%} in {ratio:.1%} of the image" if ratio else "nothing: no pixel influences the output"
+    axis.set_title(f"weights: {row.weights}; {extent}", fontsize=7.5, loc="left", pad=3)
 
 
 def _smoothed_core(weight: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ class FieldRow:
         side_at_rest_px: theoretical side at zero offsets.
         corner: image row and column of the theoretical box, taps moved.
         seen: support of the pixel's gradient, with constant weights.
-        union_share: share of the image in the support of any pixel of the layer.
+        union_share: fraction of the image in the support of any pixel of the layer.
         weighed: effective field on an image, with the weights named by `weights`.
         weights: name of the learned weights, or ``untrained``.
     """
@@ -60,7 +60,7 @@ class FieldRow:
     weights: str
 
     def summary(self) -> dict[str, Any]:
-        """The numbers by name, pixels and shares of the image."""
+        """The numbers by name, in pixels and fractions of the image."""
         return {
             "name": self.name,
             "fidelity": self.fidelity,
@@ -84,7 +84,7 @@ def measure_fields(
     learned: tuple[str, Model] | None = None,
     device: torch.device | None = None,
 ) -> list[FieldRow]:
-    """Fields of presets; with our dilated pose network also the paper's, which skips three pixels of four.
+    """Fields of presets; with the default dilated pose network also the paper's, which skips three pixels of four.
 
     Args:
         names: keys of `PRESETS`.
@@ -98,7 +98,7 @@ def measure_fields(
         ConfigError: an unknown name, or a snippet that is not five images.
     """
     if len(snippet) != 5:
-        raise ConfigError(f"a receptive field is looked at on 5 consecutive images; got {len(snippet)}")
+        raise ConfigError(f"receptive fields are measured on 5 consecutive images; got {len(snippet)}")
     wanted: list[tuple[str, Fidelity]] = []
     for name in names:
         wanted.append((name, fidelity))
@@ -113,8 +113,8 @@ def field_table(rows: Sequence[FieldRow]) -> str:
     for row in (row.summary() for row in rows):
         name = row["name"] + (" (paper)" if row["fidelity"] == "paper" else "")
         box = f"{row['columns']} x {row['rows']}"
-        shares = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
-        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{shares}  {row['weights']}")
+        ratios = f"{row['share']:>8.1%}{row['share_of_all_outputs']:>13.1%}{row['effective_share_95']:>9.1%}"
+        lines.append(f"{name:32}{row['theoretical_px']:>6} px{box:>16}{ratios}  {row['weights']}")
     return "\n".join(lines)
 
 
@@ -158,7 +158,7 @@ def _with_weights(name: str, fidelity: Fidelity, learned: tuple[str, Model] | No
 
 
 def _union_share(network: Network, size: tuple[int, int], offsets_px: float, map_size: tuple[int, int]) -> float:
-    """Share of the image's pixels with a gradient to any output pixel."""
+    """Fraction of the image's pixels with a gradient to any output pixel."""
     pixels = itertools.product(range(map_size[0]), range(map_size[1]))
     fields = [measured(network, size, pixel, offsets_px).gradient > 0 for pixel in pixels]
     return float(torch.stack(fields).any(dim=0).double().mean())

@@ -1,4 +1,4 @@
-"""A drawn street, the input where no images are given: a road between two textured walls."""
+"""A synthetic street, the input where no images are given: a road between two textured walls."""
 
 from __future__ import annotations
 

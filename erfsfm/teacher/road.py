@@ -11,16 +11,16 @@ Array = NDArray[np.float32]
 TOLERANCE = 0.05  # of the distance
 TRIALS = 100
 LEAST_POINTS = 150
-LEAST_SHARE = 0.25  # of the points looked at
-LEAST_UPRIGHT = 0.95  # cosine between the road's normal and the image's down
-ROWS = (0.62, 0.9)  # part of the image that a road fills and where it does not rush by
+LEAST_RATIO = 0.25  # inliers over candidate points
+LEAST_UPRIGHT = 0.95  # cosine between the road's normal and the camera's y axis
+ROWS = (0.62, 0.9)  # part of the image that a road fills and where its flow can be measured
 COLUMNS = (0.3, 0.7)
 AROUND = (0.3, 0.1)  # of the image's height and width, in which a pixel's neighbours lie
-LEAST_AROUND = 0.1  # share of them that is known
-LEAST_AGREEING = 0.7  # share of the known ones that lies on the road
-SIGMAS_UNDER = 2.0  # by which what lies under the road is clearly there
-RIM_PX = 5  # side of the square that grows around it
-NEAR = 0.2  # of the depth, within which a pixel may lie on the road: single ones are noisy
+LEAST_AROUND = 0.1  # fraction of them that is known
+LEAST_AGREEING = 0.7  # fraction of the known ones that lies on the road
+SIGMAS_UNDER = 2.0  # by which a pixel under the road is significant
+RIM_PX = 5  # side of the dilation kernel around such pixels
+NEAR = 0.2  # relative depth tolerance of a single pixel of the road, which is noisy
 
 
 def road_plane(
@@ -67,7 +67,7 @@ def road_plane(
     line = lines[(np.abs(some @ lines.T - 1) < TOLERANCE).sum(axis=0).argmax()]
     for _ in range(3):
         on_plane = flat[np.abs(flat @ line - 1) < TOLERANCE]
-        if len(on_plane) < max(LEAST_POINTS, LEAST_SHARE * len(flat)):
+        if len(on_plane) < max(LEAST_POINTS, LEAST_RATIO * len(flat)):
             return None
         line = np.linalg.lstsq(on_plane, np.ones(len(on_plane)), rcond=None)[0]
     return np.asarray(line[0] * across + line[1] * down)
@@ -84,8 +84,8 @@ def on_road(inverse_depth: Array, known: NDArray[np.bool_], road: Array) -> NDAr
     height, width = inverse_depth.shape
     window = (2 * int(AROUND[1] * width / 2) + 1, 2 * int(AROUND[0] * height / 2) + 1)
     agreeing = known & (np.abs(inverse_depth - road) < NEAR * road)
-    share = [cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT) for mask in (known, agreeing)]
-    level = (road > 0) & (share[0] > LEAST_AROUND) & (share[1] > LEAST_AGREEING * share[0])
+    ratio = [cv2.blur(mask.astype(np.float32), window, borderType=cv2.BORDER_CONSTANT) for mask in (known, agreeing)]
+    level = (road > 0) & (ratio[0] > LEAST_AROUND) & (ratio[1] > LEAST_AGREEING * ratio[0])
     return np.asarray(level & ~(known & (np.abs(inverse_depth - road) > NEAR * road)))
 
 

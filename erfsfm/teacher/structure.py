@@ -21,7 +21,7 @@ from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
 from erfsfm.teacher.two_view import MotionAndDepth, rays, two_view
 
 VERSION = 4
-SURE = 5.0  # inverse depth over its sigma
+MIN_SNR = 5.0  # inverse depth over its sigma
 OUTLIER = 3.0  # sigmas from the average
 LEAST_SHARED = 100  # pixels
 
@@ -33,8 +33,8 @@ class TeacherStructure:
     Attributes:
         T_source_target: ``(N, 4, 4)``, NaN where nothing was measured; where only the translation's length
             is unknown, the translation alone is NaN.
-        least: smallest inverse depth that agrees with the images, ``(H, W)`` float16, 0 where any does.
-        most: largest one, infinite where any does.
+        least: smallest inverse depth that agrees with the images, ``(H, W)`` float16, 0 where unbounded.
+        most: largest one, infinite where unbounded.
     """
 
     T_source_target: NDArray[np.float32]
@@ -55,9 +55,9 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
             T[:3, 3] *= length
     inverse_depth, sigma = _average(views, lengths, grey[middle].shape)
     forward = _forward(T_source_target)
-    sure = inverse_depth > SURE * sigma
+    reliable = inverse_depth > MIN_SNR * sigma
     p = rays(inverse_depth.shape[0], inverse_depth.shape[1], K)
-    plane = None if forward is None else road_plane(inverse_depth, sure, p, forward)
+    plane = None if forward is None else road_plane(inverse_depth, reliable, p, forward)
     height, at_least = 1.0, np.zeros_like(inverse_depth)
     if plane is None:
         sigma[:] = np.inf
@@ -68,7 +68,7 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
         road = p @ plane.astype(np.float32)
         under = under_road(inverse_depth, sigma, road)
         sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
-        level = on_road(inverse_depth, sure, road) & ~under
+        level = on_road(inverse_depth, reliable, road) & ~under
         inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
     T_source_target[:, :3, 3] /= height
     with np.errstate(over="ignore"):
@@ -128,18 +128,18 @@ def _write(path: Path, structure: TeacherStructure) -> None:
 
 def _relative_lengths(views: Sequence[MotionAndDepth | None]) -> list[float]:
     """Length of each view's translation over that of the most certain view; 0 if still, NaN if unknown."""
-    sure = [None if v is None or v.still else v.inverse_depth > SURE * v.sigma for v in views]
-    counts = [0 if s is None else int(s.sum()) for s in sure]
+    reliable = [None if v is None or v.still else v.inverse_depth > MIN_SNR * v.sigma for v in views]
+    counts = [0 if s is None else int(s.sum()) for s in reliable]
     best = int(np.argmax(counts))
-    reference, sure_reference = views[best], sure[best]
+    reference, reliable_reference = views[best], reliable[best]
     lengths: list[float] = []
-    for view, sure_view in zip(views, sure):
-        if view is None or reference is None or sure_reference is None:
+    for view, reliable_view in zip(views, reliable):
+        if view is None or reference is None or reliable_reference is None:
             lengths.append(0.0 if view is not None and view.still else np.nan)
-        elif sure_view is None:
+        elif reliable_view is None:
             lengths.append(0.0)
         else:
-            both = sure_view & sure_reference
+            both = reliable_view & reliable_reference
             ratio = view.inverse_depth[both] / reference.inverse_depth[both]
             lengths.append(float(np.median(ratio)) if both.sum() >= LEAST_SHARED else np.nan)
     return lengths

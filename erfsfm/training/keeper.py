@@ -1,4 +1,4 @@
-"""Weights kept of a run: the latest, the best, and their records."""
+"""Weights that a run writes: the latest, the best, and their records."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class WeightKeeper(Callback):
     """Writes weights folders: the latest, the best, and those with the best poses.
 
     The step of the last improvement is read from the record of the best weights, so that a run that is
-    killed and resumed stops where it would have stopped.
+    killed and resumed stops at the same step as an uninterrupted one.
     """
 
     def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
@@ -80,7 +80,7 @@ class WeightKeeper(Callback):
         if not _all_finite(module):
             raise TrainingError(
                 f"weights are NaN or infinite at step {step}: lower training.learning_rate, or set "
-                "training.gradient_clip or training.precision=32-true, and start anew; older weights are in last/"
+                "training.gradient_clip or training.precision=32-true, and start again; older weights are in last/"
             )
         self._saved_step = step
         model = self._model(module, step)

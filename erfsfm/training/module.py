@@ -60,7 +60,7 @@ class SelfSupervision(lightning.LightningModule):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
-                "training.gradient_clip, then go on with --resume; the weights so far are in last/"
+                "training.gradient_clip, then continue with --resume; the weights so far are in last/"
             )
         self._refuse_constant(result.disparities[0].detach())
         self.log("loss", result.total.detach(), prog_bar=True)
@@ -77,7 +77,7 @@ class SelfSupervision(lightning.LightningModule):
             raise TrainingError(
                 f"the depth has been one constant for {_CONSTANT_STEPS} steps (spread {spread:.1g} at step "
                 f"{self.global_step}): nothing is learned from it; lower training.learning_rate or "
-                "loss.smoothness_weight and start anew; the weights so far are in last/"
+                "loss.smoothness_weight and start again; the weights so far are in last/"
             )
 
     def _config_of_step(self) -> ExperimentConfig:
@@ -171,7 +171,7 @@ class SelfSupervision(lightning.LightningModule):
 
 
 def learning_rate_factor(schedule: str, progress: float) -> float:
-    """Share of the learning rate at a share of the run; a cosine ends at 2 %."""
+    """Factor on the learning rate after a fraction of the run; a cosine ends at 2 %."""
     if schedule == "cosine":
         return 0.02 + 0.98 * (1 + math.cos(math.pi * progress)) / 2
     return 0.1 if schedule == "step" and progress >= 0.75 else 1.0

@@ -23,7 +23,7 @@ from erfsfm.losses.regularisation import (
 )
 from erfsfm.losses.structure import Bounds, outside, translation_disagreement
 
-HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are hundredths, like fresh outputs
+HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are then as small as initial outputs
 
 
 @dataclass(frozen=True)

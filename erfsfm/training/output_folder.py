@@ -12,7 +12,7 @@ from erfsfm.errors import ConfigError, TrainingError
 from erfsfm.files import write_atomically
 
 CONFIG = "config.yaml"
-_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # what a run leaves that failed before its first weights
+_BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # left by a run that failed before its first weights
 
 
 class OutputFolder:
@@ -33,7 +33,7 @@ class OutputFolder:
         if not self.path.is_dir():
             raise TrainingError(f"--output {self.path} is a file, not a folder: choose another --output")
         if self.checkpoint.is_file() or (self.path / "model.yaml").is_file():
-            raise TrainingError(f"{self.path} holds a run already: go on with --resume or choose another --output")
+            raise TrainingError(f"{self.path} holds a run already: continue with --resume or choose another --output")
         names = {entry.name for entry in self.path.iterdir() if ".partial." not in entry.name}
         foreign = sorted(names - _BEGUN)
         if not foreign and names and not self._has_our_config():
@@ -64,7 +64,7 @@ class OutputFolder:
         if begun.training.optimiser != config.training.optimiser:
             raise ConfigError(
                 f"{written} began with training.optimiser {begun.training.optimiser}, whose state another cannot take "
-                f"over; got {config.training.optimiser}: resume with the same one, or start anew from its weights"
+                f"over; got {config.training.optimiser}: resume with the same one, or start again from its weights"
             )
         return steps
 
@@ -92,5 +92,5 @@ def _steps_of(checkpoint: Path) -> int:
         return int(state["global_step"])
     except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, TypeError, KeyError) as error:
         raise TrainingError(
-            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew in another --output"
+            f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start again in another --output"
         ) from error

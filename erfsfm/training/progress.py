@@ -25,7 +25,7 @@ class ProgressLine(Callback):
         )
 
     def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Begin where the run begins, which after a resume is not zero."""
+        """Begin at the first step of the run, which after a resume is not zero."""
         self._task = self._progress.add_task(
             "", total=trainer.max_steps, completed=trainer.global_step, speed="", loss="-"
         )
@@ -34,7 +34,7 @@ class ProgressLine(Callback):
     def on_train_batch_end(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """One step further."""
+        """Advance by one step."""
         speed = self._progress.tasks[self._task].speed
         self._progress.update(
             self._task,
@@ -50,5 +50,5 @@ class ProgressLine(Callback):
     def on_exception(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
     ) -> None:
-        """Leave the line, so that the error stands below it."""
+        """Leave the line, so that the error is printed below it."""
         self._progress.stop()

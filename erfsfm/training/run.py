@@ -54,7 +54,7 @@ def train(
         output: receives ``config.yaml``, the best weights at its top (see `decisive`), those with the best
             poses under ``best_pose/`` where true poses validate, the latest under ``last/``,
             ``checkpoints/last.ckpt`` for ``resume``, and CSV and TensorBoard logs under ``logs/``.
-        resume: go on from ``checkpoints/last.ckpt``.
+        resume: continue from ``checkpoints/last.ckpt``.
         device: ``auto``, ``cpu`` or ``cuda``.
         command: recorded in the weights.
         quiet: no progress bar.
@@ -123,7 +123,7 @@ def _fit(
         raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.errors.DataError: ")) from error
     except SystemExit as error:
         # Lightning turns Ctrl-C into an exit
-        raise TrainingError(f"interrupted at step {trainer.global_step}: go on with --resume") from error
+        raise TrainingError(f"interrupted at step {trainer.global_step}: continue with --resume") from error
 
 
 def _start_from(module: SelfSupervision, name: str) -> list[str]:

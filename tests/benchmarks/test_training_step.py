@@ -1,7 +1,7 @@
-"""The training step beside one with the same loss written down in a straight line: ``make benchmark``.
+"""The training step compared with a plain implementation of the same loss: ``make benchmark``.
 
-The straight line takes one source after the other and PyTorch's own pooling, as a first version would;
-both must give the same loss. Nothing here asserts a time.
+The plain implementation loops over the sources and uses PyTorch's own pooling; both must give the same loss.
+Nothing here asserts a time.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def structural(a: Tensor, b: Tensor) -> Tensor:
     return ((1 - above / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))) / 2).clamp(0, 1)
 
 
-def straight_line(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> Tensor:
+def plain_loss(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> Tensor:
     loss, total = config.loss, torch.zeros(())
     sources = batch.sources.unbind(dim=1)
     disparities = depth_net(batch.target * 2 - 1)
@@ -107,7 +107,7 @@ def rough(disparity: Tensor, image: Tensor, kind: str) -> Tensor:
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_training_step_beside_a_straight_line(name: str, cpu_ms: Callable[..., list[float]]) -> None:
+def test_training_step_beside_a_plain_loss(name: str, cpu_ms: Callable[..., list[float]]) -> None:
     """Forward, loss, backward and Adam; batch 4 at 416x128 with four sources, the plain pair at full width."""
     smooth = F.interpolate(torch.rand(20, 3, 16, 52), (128, 416), mode="bicubic").clamp(0, 1).view(4, 5, 3, 128, 416)
     K = torch.tensor([[240.0, 0, 207.5], [0, 240.0, 63.5], [0, 0, 1]]).expand(4, 3, 3)
@@ -120,8 +120,8 @@ def test_training_step_beside_a_straight_line(name: str, cpu_ms: Callable[..., l
     def ours() -> Tensor:
         return evaluate_objective(depth_net, pose_net, batch, config).total
 
-    def straight() -> Tensor:
-        return straight_line(depth_net, pose_net, batch, config)
+    def plain() -> Tensor:
+        return plain_loss(depth_net, pose_net, batch, config)
 
     def step(objective: Callable[[], Tensor]) -> Callable[[], None]:
         def work() -> None:
@@ -131,9 +131,9 @@ def test_training_step_beside_a_straight_line(name: str, cpu_ms: Callable[..., l
 
         return work
 
-    torch.testing.assert_close(ours(), straight(), rtol=1e-4, atol=0)
-    for mine, other in zip(torch.autograd.grad(ours(), weights), torch.autograd.grad(straight(), weights)):
+    torch.testing.assert_close(ours(), plain(), rtol=1e-4, atol=0)
+    for mine, other in zip(torch.autograd.grad(ours(), weights), torch.autograd.grad(plain(), weights)):
         assert (mine - other).norm() <= 0.01 * other.norm()
-    mine_ms, other_ms = cpu_ms(step(ours), step(straight), runs=5)
+    mine_ms, other_ms = cpu_ms(step(ours), step(plain), runs=5)
     print(f"\n\n| training step ({name}) | CPU ms | ratio |\n|---|---:|---:|")
-    print(f"| straight line | {other_ms:.0f} | 1.00 |\n| ours | {mine_ms:.0f} | {mine_ms / other_ms:.2f} |")
+    print(f"| plain implementation | {other_ms:.0f} | 1.00 |\n| ours | {mine_ms:.0f} | {mine_ms / other_ms:.2f} |")

@@ -28,7 +28,7 @@ class Plane:
     distance: float = 4.0
 
     def points(self, t_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where each pixel's ray meets the plane ``(H, W, 2)``; the camera never turns."""
+        """Where each pixel's ray meets the plane ``(H, W, 2)``; the camera never rotates."""
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float64)
         depth = self.distance - t_world_camera[2]
         x = (u - self.camera.cx) / self.camera.fx * depth + t_world_camera[0]
@@ -47,7 +47,7 @@ class Plane:
 
 
 @pytest.fixture(autouse=True)
-def _same_chance() -> None:
+def _seeded_torch() -> None:
     torch.manual_seed(0)
     cv2.setNumThreads(1)  # forked workers do not inherit OpenCV's threads
 

@@ -1,4 +1,4 @@
-"""What users get wrong, through the command line: one line that says what was wanted, what came, and what to do."""
+"""User errors through the command line: one line with what was wanted, what came, and what to do."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         lines = [line for line in err.splitlines() if line.startswith("erfsfm: ")]
         assert (stopped.value.code, out, len(lines)) == (1, "", 1), err
         assert "Traceback" not in err
-        assert err.rstrip().endswith(lines[0]), "the error is the last word"
+        assert err.rstrip().endswith(lines[0]), "the error is the last line"
         return lines[0]
 
     return call
@@ -68,7 +68,7 @@ def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: Writ
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_half_an_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, suffix: str) -> None:
+def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, suffix: str) -> None:
     root = write_root(tmp_path / "root", frames=5, suffix=suffix)
     image = root / f"sequences/00/image_2/000002{suffix}"
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
@@ -88,7 +88,9 @@ def test_twelve_bits_in_sixteen(refusal: Refusal, tmp_path: Path, weights: Path)
     ("line", "words"),
     [("fx: 100", "key 'fx' stands twice"), ("camera_height: 1", "key camera_height is unknown")],
 )
-def test_a_camera_file_that_says_too_much(refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str) -> None:
+def test_a_camera_file_with_unknown_or_duplicate_keys(
+    refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str
+) -> None:
     camera = trip / "camera.yaml"
     camera.write_text(f"{camera.read_text()}{line}\n")
     assert words in refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
@@ -100,7 +102,7 @@ def test_brackets_in_a_name(
     tmp_path: Path,
     write_root: WriteRoot,
 ) -> None:
-    """A folder is trained on and predicted from, and its leak is known by name."""
+    """A folder is trained on and predicted from, and its leak is detected by name."""
     root = write_root(tmp_path / "r[o]ot", frames=6)
     (root / "sequences/00").rename(root / "sequences/s[0]")
     (root / "poses/00.txt").rename(root / "poses/s[0].txt")
@@ -129,7 +131,7 @@ def test_intrinsics_of_another_resolution(refusal: Refusal, tmp_path: Path) -> N
 
 
 def test_calibration_of_another_resolution(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
-    """Raw images may be shrunk, never cropped: their camera knows its own shape."""
+    """Raw images may be shrunk, never cropped: their calibration has an image size."""
     write_raw(tmp_path, stored=(48, 48), speeds=[9] * 6)
     error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
     assert "the images are 48x48, but camera 02 in" in error
@@ -142,7 +144,7 @@ def test_a_raw_drive_shorter_than_a_snippet(refusal: Refusal, tmp_path: Path, wr
     assert "a snippet needs 5 consecutive frames; found kitti_raw/2011_09_26_drive_0001 (3 frames)" in error
 
 
-def test_a_raw_drive_for_tests(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
+def test_a_raw_drive_held_out_for_tests(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
     write_raw(tmp_path, drive="2011_09_26_drive_0013")
     error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
     assert "nothing left to train on: every recording found (kitti_raw/2011_09_26_drive_0013) is excluded" in error
@@ -190,7 +192,7 @@ def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: 
     config = load_experiment("tiny", [text for text in SMALL if "=" in text])
     (run / "config.yaml").write_text(dump_yaml(config))
     error = refusal(*TRAIN, *SMALL, "--dataset", root, "--output", run, "--resume")
-    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start anew" in error
+    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start again" in error
 
 
 def test_initial_weights_of_another_architecture(
@@ -217,7 +219,7 @@ def test_weights_cut_in_half(refusal: Refusal, tmp_path: Path, weights: Path, ve
     output = {"predict": "depth", "export": "net.onnx", "receptive-field": "field.png"}[verb]
     error = refusal(verb, *given, "--weights", weights, "--output", tmp_path / output)
     assert "depth.safetensors is damaged" in error
-    assert "copy it again or train anew" in error
+    assert "copy it again or train again" in error
     assert not (tmp_path / output).exists()
 
 
@@ -252,8 +254,8 @@ def test_a_misspelt_key(refusal: Refusal, tmp_path: Path) -> None:
     assert f"unknown key 'network.hieght' in {tmp_path}/mine.yaml; did you mean 'network.height'?" in error
 
 
-def spoil(path: Path, value: float) -> None:
-    """Put a number that is none into the first tensor of a weights file."""
+def insert_non_finite(path: Path, value: float) -> None:
+    """Put a non-finite number into the first tensor of a weights file."""
     tensors = load_file(path)
     next(iter(tensors.values())).view(-1)[0] = value
     save_file(tensors, path)
@@ -264,7 +266,7 @@ def spoil(path: Path, value: float) -> None:
 def test_weights_that_are_not_finite(
     refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path, kind: str, value: float
 ) -> None:
-    spoil(weights / f"{kind}.safetensors", value)
+    insert_non_finite(weights / f"{kind}.safetensors", value)
     root = write_root(tmp_path / "root", frames=6, depth=True)
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
     for arguments in (

@@ -180,7 +180,7 @@ def test_every_shipped_model_loads() -> None:
         assert model.record.licence
 
 
-def test_fingerprint_sees_both_files(folder: Path, tmp_path: Path) -> None:
+def test_fingerprint_depends_on_both_files(folder: Path, tmp_path: Path) -> None:
     before = weights_sha256(folder)
     assert len(before) == 64
     assert weights_sha256(shutil.copytree(folder, tmp_path / "copy")) == before

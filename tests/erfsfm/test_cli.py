@@ -1,4 +1,4 @@
-"""The command line: help without weight, errors in one line, results on stdout."""
+"""The command line: help without heavy imports, errors in one line, results on stdout."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ assert not heavy, heavy
 """
 
 
-def test_help_of_every_verb_is_light() -> None:
+def test_help_of_every_command_loads_no_heavy_library() -> None:
     finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
     assert {
@@ -327,7 +327,7 @@ def test_version(run: Run) -> None:
     ("words", "offered"),
     [("erfsfm ev", {"evaluate"}), ("erfsfm evaluate ", {"depth", "pose"}), ("erfsfm tr", {"train"})],
 )
-def test_shells_complete(words: str, offered: set[str]) -> None:
+def test_shell_completion(words: str, offered: set[str]) -> None:
     program = "import sys; sys.argv = ['erfsfm']; from erfsfm.cli import main; main()"
     asked = {"_ERFSFM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
     finished = subprocess.run(
@@ -348,12 +348,12 @@ def test_shells_complete(words: str, offered: set[str]) -> None:
         ("evaluate pose", False),
     ],
 )
-def test_a_seed_is_offered_where_numbers_are_random(run: Run, verb: str, seeded: bool) -> None:
+def test_seed_is_listed_where_numbers_are_random(run: Run, verb: str, seeded: bool) -> None:
     _, out, _ = run(*verb.split(), "--help")
     assert ("--seed" in out) == seeded
 
 
-def test_a_seed_is_still_accepted_where_nothing_is_random(run: Run, weights: Path, tmp_path: Path) -> None:
+def test_seed_is_still_accepted_where_nothing_is_random(run: Run, weights: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
     given = ["predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth", "--seed", 3]
     assert run(*given)[0] == 0

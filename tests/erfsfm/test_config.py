@@ -1,4 +1,4 @@
-"""Configurations: what is read, what is refused, and in which words."""
+"""Configurations: reading, overrides and error messages."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_small_numbers_in_any_spelling(tmp_path: Path, text: str) -> None:
     assert load_experiment(None, [f"training.learning_rate={text}"]).training.learning_rate == 1e-4
 
 
-def test_values_never_change() -> None:
+def test_configurations_are_frozen() -> None:
     config = ExperimentConfig()
     with pytest.raises(ValidationError):
         config.training.steps = 3  # type: ignore[misc]

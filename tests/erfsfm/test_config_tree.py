@@ -1,4 +1,4 @@
-"""What both packages' configurations have in common: overrides, old names, where an error comes from."""
+"""Configurations of both packages: overrides, old names, the origin of an error."""
 
 from __future__ import annotations
 

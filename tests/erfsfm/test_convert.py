@@ -1,4 +1,4 @@
-"""Checkpoints synthesised with the names of the published code, and what may be wrong with them."""
+"""Checkpoints synthesised with the names of the published code, and the errors of malformed ones."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ def test_one_network_alone(tmp_path: Path, depth_file: Path) -> None:
         predictor.poses([image] * 5)
 
 
-class Malice:
+class Malicious:
     """Would leave a file behind when unpickled."""
 
     def __init__(self, trace: Path) -> None:
@@ -253,15 +253,17 @@ def test_nothing_is_executed(tmp_path: Path, form: str) -> None:
     path, trace = tmp_path / "evil.pth.tar", tmp_path / "trace"
     state: dict[str, object] = dict(OldDisp().state_dict())
     if form == "pickle":
-        path.write_bytes(pickle.dumps(Malice(trace)))
+        path.write_bytes(pickle.dumps(Malicious(trace)))
     else:
-        payload = {"state_dict": state, "epoch": Malice(trace)} if form != "hidden" else state | {"x": Malice(trace)}
+        payload = (
+            {"state_dict": state, "epoch": Malicious(trace)} if form != "hidden" else state | {"x": Malicious(trace)}
+        )
         torch.save(payload, path, _use_new_zipfile_serialization=form != "legacy")
     message = refusal(path)
     assert "would execute code" in message
     assert not trace.exists()
     torch.load(path, weights_only=False) if form != "pickle" else pickle.loads(path.read_bytes())
-    assert trace.exists(), "the trap works where it is let"
+    assert trace.exists(), "the payload runs where code is allowed"
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -274,7 +276,7 @@ def test_half_copied(tmp_path: Path, keep: float, legacy: bool) -> None:
 
 
 @pytest.mark.parametrize("content", [{"state_dict": 3}, {"state_dict": {"a": 1}}, [1, 2], {}])
-def test_other_contents(tmp_path: Path, content: object) -> None:
+def test_files_without_a_checkpoint(tmp_path: Path, content: object) -> None:
     torch.save(content, tmp_path / "x.pth.tar")
     message = refusal(tmp_path / "x.pth.tar")
     assert "no state_dict of tensors" in message or "neither DispNetS nor PoseExpNet" in message

@@ -1,4 +1,4 @@
-"""Every network says the same in onnxruntime as in PyTorch, and a wrong graph is never written."""
+"""Every network has the same outputs in onnxruntime as in PyTorch, and a wrong graph is never written."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def fresh(**settings: Any) -> Model:
     return Model(ModelRecord(network=config, trained_on=["simulated/0-9"]), *nets)
 
 
-def answer(path: Path, **inputs: torch.Tensor) -> np.ndarray:
+def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     assert {entry.name for entry in session.get_inputs()} == set(inputs)
     return session.run(None, {name: value.numpy() for name, value in inputs.items()})[0]
@@ -58,8 +58,8 @@ def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, 
     images = torch.rand(1 + config.sources, 1, 3, config.height, config.width) * 2 - 1
     with torch.no_grad():
         disparity, vectors = model.depth_net(images[0]), model.pose_net(images[0], list(images[1:]))
-    np.testing.assert_allclose(answer(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
-    found = answer(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
+    np.testing.assert_allclose(onnx_output(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
+    found = onnx_output(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
     np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
 
 
@@ -107,7 +107,7 @@ def test_a_graph_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_onnx(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_onnxruntime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def without(name: str, *rest: Any) -> Any:

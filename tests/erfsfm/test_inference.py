@@ -1,4 +1,4 @@
-"""The door to the networks: what goes in, what comes out."""
+"""Inference: inputs and outputs of the networks."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def echo(sources: int = 4) -> tuple[DepthPosePredictor, Echo]:
     return DepthPosePredictor(Model(model(sources).record, net, net)), net
 
 
-def test_a_buffer_that_is_filled_anew_is_a_new_image(predictor: DepthPosePredictor) -> None:
+def test_a_reused_buffer_is_a_new_image(predictor: DepthPosePredictor) -> None:
     buffer, second = image(), image()
     first_depth = predictor.depth(buffer)
     buffer[:] = second
@@ -126,7 +126,7 @@ def test_swapping_frames_swaps_rows() -> None:
     np.testing.assert_array_equal(predictor.poses(frames[::-1]), forwards[::-1])
 
 
-def test_real_networks_tell_sources_apart(predictor: DepthPosePredictor) -> None:
+def test_poses_of_real_networks_depend_on_the_source(predictor: DepthPosePredictor) -> None:
     frames = [image() for _ in range(5)]
     swapped = [frames[k] for k in (1, 0, 2, 3, 4)]
     assert not np.allclose(predictor.poses(frames), predictor.poses(swapped))
@@ -171,7 +171,7 @@ def test_a_prepared_image_does_not_change_with_the_buffer_it_came_from(predictor
     assert np.abs(predictor.disparity(buffer) - expected).max() > 0
 
 
-def test_a_frozen_predictor_answers_the_same_up_to_rounding() -> None:
+def test_a_frozen_predictor_has_the_same_outputs_up_to_rounding() -> None:
     frames = [image() for _ in range(5)]
     plain, frozen = DepthPosePredictor(model()), DepthPosePredictor(model()).freeze()
     for _ in range(2):
@@ -179,13 +179,13 @@ def test_a_frozen_predictor_answers_the_same_up_to_rounding() -> None:
         np.testing.assert_allclose(frozen.poses(frames), plain.poses(frames), atol=1e-6)
 
 
-def test_views_are_as_good_as_copies(predictor: DepthPosePredictor) -> None:
+def test_array_views_are_accepted(predictor: DepthPosePredictor) -> None:
     big = image(64, 128)
     view = big[::2, ::-2]
     np.testing.assert_array_equal(predictor.depth(view), predictor.depth(view.copy()))
 
 
-def test_answers_repeat_and_inputs_stay(predictor: DepthPosePredictor) -> None:
+def test_outputs_are_deterministic_and_inputs_unchanged(predictor: DepthPosePredictor) -> None:
     frame = image()
     before = frame.copy()
     np.testing.assert_array_equal(predictor.depth(frame), predictor.depth(frame))
@@ -203,7 +203,7 @@ def test_from_weights(tmp_path: Path) -> None:
     assert DepthPosePredictor.from_weights(str(tmp_path)).record == loaded.record
 
 
-def test_from_nothing(tmp_path: Path) -> None:
+def test_from_unknown_weights(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError):
         DepthPosePredictor.from_weights(tmp_path / "nowhere")
 

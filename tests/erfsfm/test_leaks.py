@@ -1,4 +1,4 @@
-"""What a training saw, followed to the evaluations that must refuse it."""
+"""The leak record from training to the evaluations that must refuse it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The record of a pose network's noise: what it says, and files that are not one."""
+"""The noise record of a pose network, its sigmas, and malformed files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def moved(z: float) -> np.ndarray:
     return T
 
 
-def test_a_pair_seen_by_two_snippets_is_one_measurement_of_both_directions() -> None:
+def test_a_pair_measured_by_two_snippets_is_one_measurement_of_both_directions() -> None:
     snippets = [
         (1, (0, 2), np.stack([moved(2.0), moved(-2.0)]), np.array([0.3, 0.5])),
         (2, (1, 3), np.stack([moved(2.2), moved(-2.0)]), np.array([0.7, 0.4])),
@@ -54,11 +54,11 @@ def test_correlated_measurements_do_not_count_as_independent() -> None:
     np.testing.assert_allclose(both / single, np.sqrt([1, 0.75, 0.5, 1, 0.75, 0.5]))
 
 
-def test_what_the_images_leave_unexplained_widens() -> None:
+def test_the_photometric_residual_widens_sigmas() -> None:
     noise = NOISE.model_copy(update={"residual": (0.0, 0.01, 0.0, 0.0, 0.0, 0.1)})
 
-    def sigmas(share: float) -> np.ndarray:
-        residuals = np.array([share, share])
+    def sigmas(ratio: float) -> np.ndarray:
+        residuals = np.array([ratio, ratio])
         return noise.sigmas(pair_poses([(1, (0, 2), np.stack([moved(2.0), moved(-2.0)]), residuals)])[0])
 
     np.testing.assert_allclose(sigmas(0.0)[:3], [0.001, 0.002, 0.003])
@@ -66,7 +66,7 @@ def test_what_the_images_leave_unexplained_widens() -> None:
     np.testing.assert_allclose(sigmas(0.5)[5] ** 2 - sigmas(0.0)[5] ** 2, (0.1 * 0.5 * 2.0) ** 2)
 
 
-def test_noise_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_noise_file_round_trip(tmp_path: Path) -> None:
     assert read_pose_noise(tmp_path) is None
     write_pose_noise(tmp_path, NOISE)
     assert read_pose_noise(tmp_path) == NOISE

@@ -36,14 +36,14 @@ def test_the_guide_names_them_all() -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_file_is_what_its_name_says(path: Path) -> None:
+def test_a_file_has_the_experiment_of_its_name(path: Path) -> None:
     experiment = load_experiment(path)
     network = experiment.network
     networks, size = re.fullmatch(r"table[123]-(.*?)-(\d+x\d+)", path.stem).groups()  # type: ignore[union-attr]
     assert f"{network.width}x{network.height}" == size
-    said = networks if "depthnet" in networks else f"depthnet-{networks}"
-    said = said if "posenet" in said else f"{said}-posenet"
-    assert f"{network.depth}-{network.pose}" == said
+    presets = networks if "depthnet" in networks else f"depthnet-{networks}"
+    presets = presets if "posenet" in presets else f"{presets}-posenet"
+    assert f"{network.depth}-{network.pose}" == presets
     assert (network.fidelity, network.sources, network.normalisation, network.masks) == ("paper", 4, "none", False)
     assert (network.depth_width, network.pose_width) == (1.0, 1.0)
     loss, training, data = experiment.loss, experiment.training, experiment.data

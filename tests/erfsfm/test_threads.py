@@ -1,4 +1,4 @@
-"""Libraries compute in the thread that asks, and get their threads back."""
+"""Libraries compute in the calling thread, and their thread counts are restored."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info
 from erfsfm.threads import limit_library_threads
 
 
-def test_threads_are_taken_and_given_back_also_after_an_error() -> None:
+def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
     blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     before = cv2.getNumThreads()
     cv2.setNumThreads(3)

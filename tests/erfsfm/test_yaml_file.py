@@ -1,4 +1,4 @@
-"""YAML: what is read, and that nothing hangs, repeats or overflows."""
+"""YAML: values that are read, and the limits on size, depth, duplicates and aliases."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def refusal(text: str) -> str:
         ("\x00", "special characters"),
     ],
 )
-def test_what_is_not_read_is_refused_in_one_line_and_soon(text: str, words: str) -> None:
+def test_refused_yaml_is_one_line_in_bounded_time(text: str, words: str) -> None:
     assert words in refusal(text)
 
 

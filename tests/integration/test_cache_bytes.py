@@ -14,7 +14,7 @@ import pytest
 from slam import run_slam
 from slam.results.folder import RunFolder
 
-# they say when the run was and how long it took
+# hold the time and duration of the run
 DIFFERENT = {"metrics.json", "run.log", "report.html"}
 NETWORKS = ("disparity", "poses")
 OPENCV = ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat")
@@ -22,7 +22,7 @@ OPENCV = ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat")
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """How often networks and image measurements were computed; they compute what they always do."""
+    """Number of calls of networks and image measurements, which are otherwise unchanged."""
     from erfsfm.inference import DepthPosePredictor
 
     counts: Counter[str] = Counter()

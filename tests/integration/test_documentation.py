@@ -298,15 +298,15 @@ def test_what_is_not_run_exists() -> None:
             assert extra and extra[1] in project["optional-dependencies"], f"{block}: no extra {arguments[1]}"
 
 
-def test_documents_have_the_commands_that_matter() -> None:
-    """A reading that finds nothing would pass everything above."""
+def test_the_main_commands_are_found_in_the_documents() -> None:
+    """A parser that finds no command would pass all tests above."""
     found = {" ".join(shlex.split(bare(block.text))[:2]) for block in commands()}
     assert {"erfsfm-slam run", "erfsfm-slam evaluate", "erfsfm train", "erfsfm predict", "make test"} <= found
     assert len(RUNNABLE) > 25
 
 
 def stand_ins(world: Path) -> dict[str, Any]:
-    """What the reader of a Python block is to have: a calibrated camera and some images."""
+    """Variables that the Python blocks expect: a calibrated camera and some images."""
     camera = yaml.safe_load((world / "camera.yaml").read_text())
     files = sorted((world / "sequences/sim/image_2").glob("*.png"))
     images = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files]
@@ -338,7 +338,7 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
 @pytest.mark.parametrize("block", blocks("yaml", "yml"))
 def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
-    assert "fx" in camera, f"{block}: this test knows camera.yaml only; teach it this kind of YAML"
+    assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))
     (tmp_path / "camera.yaml").write_text(block.text)

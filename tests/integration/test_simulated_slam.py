@@ -1,4 +1,4 @@
-"""The whole system on the simulated street with its exact ground truth: first an oracle, then the shipped networks.
+"""The whole system on the simulated street with its exact ground truth: with an oracle, then with the shipped networks.
 
 Errors may be twice what was measured; the measured figure is the other factor of each limit.
 """
@@ -72,7 +72,7 @@ def round_trip(street: Rendered) -> SlamResult:
     return drive(street, 0)
 
 
-def test_images_and_graph_cut_the_noise_of_the_network(round_trip: SlamResult) -> None:
+def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: SlamResult) -> None:
     assert len(round_trip.optimised) == 250
     sources = [motion.relative_pose.source for motion in round_trip.observations.steps]
     assert sources.count(ESSENTIAL_SOURCE) > 200
@@ -109,7 +109,7 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
     assert np.median(street.street.distance_to_surface(points)) < 0.03
 
 
-def test_the_graph_alone_cuts_the_noise(street: Rendered) -> None:
+def test_the_graph_alone_reduces_the_error(street: Rendered) -> None:
     part = Excerpt(street, 0, 100)
     options = ("geometry.enabled=false", "mapping.enabled=false")
     runs = [drive(part, seed, *options) for seed in range(4)]
@@ -131,7 +131,9 @@ def steps(path: Path) -> FloatArray:
     return se3.invert(T_world_camera[:-1]) @ T_world_camera[1:]
 
 
-def test_shipped_networks_turn_where_the_road_turns(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
+def test_rotations_of_the_shipped_networks_follow_the_road(
+    learned: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
     metrics = check_run(learned)
     assert metrics["provenance"]["leak"] is False
     network, truth = steps(learned / "trajectory_network.kitti.txt"), steps(learned / "reference.kitti.txt")

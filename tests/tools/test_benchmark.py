@@ -70,7 +70,7 @@ def summary(tools: Callable[[str], ModuleType]) -> ModuleType:
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[str, Any]:
-    """What a run leaves, as far as the tables look."""
+    """The metrics of a run that the tables read."""
     alignments = {how: {"ate_rmse_m": ate, "scale": 1.1, "r_rel_deg_per_100m": 0.5} for how in ("6dof", "7dof")}
     return {
         "status": "ok",
@@ -97,7 +97,7 @@ def job(plan: ModuleType, tmp_path: Path) -> Any:
 
 
 def results_of(plan: ModuleType, work: ModuleType, job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
-    """Outcomes of configurations, one a seed."""
+    """Results of configurations, one per seed."""
     return [
         work.JobResult(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
         for name, values in ates.items()
@@ -111,7 +111,9 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_plan_has_every_combination_and_first_what_fills_the_cache(plan: ModuleType, tmp_path: Path) -> None:
+def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache(
+    plan: ModuleType, tmp_path: Path
+) -> None:
     drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
     jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.words=20"])
     assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
@@ -136,7 +138,7 @@ def test_excerpts_share_one_world(plan: ModuleType, tmp_path: Path) -> None:
     assert grid.simulate == ("--route", "grid", "--seed", "610", "--frames", "50")
 
 
-def test_hazards_are_all_at_once_and_know_their_clean_twin(plan: ModuleType, tmp_path: Path) -> None:
+def test_hazards_are_all_at_once_and_name_their_clean_drive(plan: ModuleType, tmp_path: Path) -> None:
     clean, hard = plan.worlds(tmp_path, ["loop"], [620], 800, ["clean", "hazards"])
     assert clean.root.name == "loop-620-800-v1"
     assert hard.root.name == "loop-620-800-hazards-v1"
@@ -174,7 +176,7 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_shares_of_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
+def test_errors_relative_to_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     run = metrics(ate=0.9)
     run["trajectories"]["network"] = {"align": {"7dof": {"ate_rmse_m": 3.6}}}
@@ -190,7 +192,7 @@ def test_shares_of_path_and_network(derived_metrics: ModuleType, tmp_path: Path)
 @pytest.mark.parametrize(
     ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
 )
-def test_loops_are_sorted_by_the_truth(
+def test_true_and_false_loops(
     derived_metrics: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
 ) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
@@ -207,7 +209,7 @@ def test_loops_are_sorted_by_the_truth(
     assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
 
 
-def test_marks_count_drives_and_pair_hazards_with_their_clean_twins(
+def test_summary_counts_drives_and_pairs_hazards_with_clean_drives(
     summary: ModuleType, plan: ModuleType, work: ModuleType, job: Any, tmp_path: Path
 ) -> None:
     drives = plan.worlds(tmp_path, ["loop"], [620, 621], 800, ["clean", "hazards"])
@@ -230,7 +232,7 @@ def test_marks_count_drives_and_pair_hazards_with_their_clean_twins(
         assert row[head.index("false loops")] == false
 
 
-def test_a_leak_is_told(page: ModuleType, work: ModuleType, job: Any) -> None:
+def test_a_leak_is_reported(page: ModuleType, work: ModuleType, job: Any) -> None:
     assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
     leaky = metrics() | {"provenance": {"leak": True}}
     assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.JobResult(job, leaky, "abc")])
@@ -245,14 +247,14 @@ def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType
     assert "– map triangles, loop 610: no map." in text
 
 
-def test_ablation_without_the_whole_has_no_ratio(
+def test_ablation_without_everything_on_has_no_ratio(
     page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
 ) -> None:
     table = cells(page.ablation_tables(results_of(plan, work, job, {"no loops": [4.0]})))
     assert table[1][:2] == ["no loops", "–"]
 
 
-def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
+def test_speed_ratios_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
     asked = replace(job, configuration=plan.SPEED[0])
     grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
     results = [
@@ -261,13 +263,13 @@ def test_speed_shares_and_growth(page: ModuleType, plan: ModuleType, work: Modul
     ]
     table = cells(page.speed_tables(results))
     assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
-    assert ["loop 610", "sim", "networks asked", "25.0", "50.0", "25.0"] in table
+    assert ["loop 610", "sim", "networks computed", "25.0", "50.0", "25.0"] in table
     assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
     assert (table[-2][-2:], table[-1][-2:]) == (["loops", "read"], ["10.00", "40.00"])
     assert table[-1][table[-2].index("loops closed")] == "3"
 
 
-def test_a_section_takes_the_place_of_its_older_self(page: ModuleType) -> None:
+def test_a_section_replaces_its_older_version(page: ModuleType) -> None:
     text = page.with_section("", "## Speed\n\nsuperseded\n")
     text = page.with_section(text, "## Accuracy\n\nnumbers\n")
     text = page.with_section(text, "## Speed\n\nnew\n")
@@ -285,7 +287,7 @@ def test_a_section_names_commit_and_seeds(page: ModuleType, plan: ModuleType, wo
     assert "    the command\n" in text
 
 
-def test_no_cache_no_measurement_from_it(
+def test_a_missing_cache_is_refused(
     plan: ModuleType, work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(work, "fingerprint", lambda weights: "same")
@@ -296,7 +298,7 @@ def test_no_cache_no_measurement_from_it(
     assert work.job_result(from_cache).reason.startswith("there is no cache in ")
 
 
-def test_only_what_ended_well_with_the_same_sources_is_kept(
+def test_only_successful_runs_of_the_same_sources_are_kept(
     work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     codes = iter([-9, 0, 0, 0])
@@ -325,7 +327,7 @@ def test_only_what_ended_well_with_the_same_sources_is_kept(
     assert len(runs) == 4
 
 
-def test_the_fingerprint_sees_sources_and_weights(
+def test_the_fingerprint_depends_on_sources_and_weights(
     work: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(work, "ROOT", tmp_path)
@@ -342,13 +344,13 @@ def test_the_fingerprint_sees_sources_and_weights(
     assert len(seen) == 3
 
 
-def test_parallel_runs_want_dask(work: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parallel_runs_need_dask(work: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
     with pytest.raises(SystemExit, match=r"erfsfm-slam\[benchmark\]"), work.workers(2, None):
         pass
 
 
-def test_dask_does_everything_once(work: ModuleType, tmp_path: Path) -> None:
+def test_dask_runs_every_job_once(work: ModuleType, tmp_path: Path) -> None:
     pytest.importorskip("dask.distributed")
     places = [tmp_path / str(n) for n in range(4)]
     with work.workers(2, None) as spread:
@@ -356,12 +358,12 @@ def test_dask_does_everything_once(work: ModuleType, tmp_path: Path) -> None:
     assert all(place.is_dir() for place in places)
 
 
-def test_nothing_to_measure_is_said(benchmark: ModuleType, tmp_path: Path) -> None:
+def test_nothing_to_measure_is_an_error(benchmark: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="nothing to measure"):
         benchmark.main(["accuracy", "--routes", "--output", str(tmp_path)])
 
 
-def test_the_command_is_told_whole_but_without_paths_and_hosts(benchmark: ModuleType) -> None:
+def test_the_command_has_all_options_but_no_paths_and_hosts(benchmark: ModuleType) -> None:
     words = ["accuracy", "--routes", "--kitti", "/data/k", "--excerpt", "0:9", "--scheduler", "tcp://host:1"]
     command = benchmark._command(benchmark._parser().parse_args(words))
     assert command.startswith(

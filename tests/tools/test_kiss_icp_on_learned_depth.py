@@ -1,4 +1,4 @@
-"""Clouds of depth, and their registration where depth is true."""
+"""Point clouds of depth, and their registration with true depth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def tool() -> ModuleType:
     return module
 
 
-def test_a_cloud_is_what_is_near_and_smooth(tool: ModuleType) -> None:
+def test_a_cloud_has_near_points_away_from_depth_edges(tool: ModuleType) -> None:
     depth = np.full((20, 30), 8.0, dtype=np.float32)
     depth[:, 10:20] = 16.0
     depth[:, 20:] = 90.0
@@ -39,17 +39,17 @@ def test_a_cloud_is_what_is_near_and_smooth(tool: ModuleType) -> None:
     assert len(tool.cloud(depth, camera, 40.0, 0.5, np.random.default_rng(0))) == 119
 
 
-def test_true_depth_gives_the_true_path(tool: ModuleType) -> None:
+def test_true_depth_gives_the_true_trajectory(tool: ModuleType) -> None:
     street = SimulatedStreet(SimulationOptions("straight", frames=12, seed=620))
     frames = [street.render(k) for k in range(12)]
     K = street.K
     camera = Intrinsics(416, 128, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    T_first_camera = tool.registered([frame.depth for frame in frames], camera, far_m=40.0, voxel_m=1.0, share=0.3)
+    T_first_camera = tool.registered([frame.depth for frame in frames], camera, far_m=40.0, voxel_m=1.0, ratio=0.3)
     error = np.linalg.norm(T_first_camera[:, :3, 3] - street.T_world_camera[:, :3, 3], axis=1)
     assert error.max() < 0.1 * np.linalg.norm(street.T_world_camera[-1, :3, 3])
 
 
-def test_a_second_run_reads_the_answers_of_the_first(
+def test_a_second_run_reads_the_cache_of_the_first(
     tool: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--frames", "0:8", "--weights", "sim", "--cache", str(tmp_path / "cache"), "--columns", "120"]
@@ -60,7 +60,7 @@ def test_a_second_run_reads_the_answers_of_the_first(
         tables.append(re.sub(r"\d\.\de-\d\d", "", capsys.readouterr().out))
         entries.append({path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*") if path.is_file()})
     assert "kiss-icp, one unit" in tables[0] and tables[0] == tables[1]
-    assert len(entries[0]) == 8 + 4 and entries[0] == entries[1], "one disparity a frame and one answer a snippet"
+    assert len(entries[0]) == 8 + 4 and entries[0] == entries[1], "one disparity a frame and one pose entry a snippet"
 
 
 def test_a_cache_that_cannot_be_made_is_one_line(tool: ModuleType, tmp_path: Path) -> None:
@@ -69,6 +69,6 @@ def test_a_cache_that_cannot_be_made_is_one_line(tool: ModuleType, tmp_path: Pat
         tool.main(["--frames", "0:8", "--weights", "sim", "--cache", str(tmp_path / "file" / "cache")])
 
 
-def test_missing_true_depth_is_said(tool: ModuleType, tmp_path: Path) -> None:
+def test_missing_true_depth_is_an_error(tool: ModuleType, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=r"no depth map 000003\.png"):
         tool.true_depth(tmp_path, 3)

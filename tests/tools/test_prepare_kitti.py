@@ -1,4 +1,4 @@
-"""A small copy of KITTI: same layout, moved intrinsics, whole files, and a run that goes on."""
+"""A small copy of KITTI: same layout, scaled intrinsics, whole files, and resuming."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_scans_and_jpg(tool: ModuleType, root: Path, tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "small/sequences/00/image_3/000002.jpg")).shape == (32, 48, 3)
 
 
-def test_it_goes_on_where_it_was(tool: ModuleType, root: Path, tmp_path: Path) -> None:
+def test_an_interrupted_copy_is_resumed(tool: ModuleType, root: Path, tmp_path: Path) -> None:
     small = tmp_path / "small"
     broken = root / "dataset/sequences/04/image_3/000002.png"
     content = broken.read_bytes()

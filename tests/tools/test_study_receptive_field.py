@@ -1,4 +1,4 @@
-"""What the study of receptive fields concludes from its trainings."""
+"""Tables and conclusions of the receptive-field study."""
 
 import importlib
 import sys
@@ -12,7 +12,7 @@ study = importlib.import_module("study_receptive_field")
 
 
 def study_rows(better: float) -> list:
-    """Three seeds of every variant, alike but for a pose network whose rotation is better by a share."""
+    """Three seeds of every variant, equal but for a pose network whose rotation error is smaller by a ratio."""
     rng = np.random.default_rng(0)
     found = []
     for seed in range(3):
@@ -23,11 +23,11 @@ def study_rows(better: float) -> list:
 
 
 def test_a_large_gain_is_named_and_noise_is_not():
-    said = study.verdict(study_rows(better=0.3)).splitlines()
-    (gain,) = [line for line in said if "dfcv2` against `posenet`: snippet RE" in line]
+    lines = study.conclusions(study_rows(better=0.3)).splitlines()
+    (gain,) = [line for line in lines if "dfcv2` against `posenet`: snippet RE" in line]
     assert gain.endswith("better.")
     assert not [
-        line for line in study.verdict(study_rows(better=0.0)).splitlines() if line.endswith(("better.", "worse."))
+        line for line in study.conclusions(study_rows(better=0.0)).splitlines() if line.endswith(("better.", "worse."))
     ]
 
 

@@ -1,4 +1,4 @@
-"""Every tool says what it does, and shipping weights writes a card."""
+"""Every tool has a help text with an example, and shipping weights writes a model card."""
 
 import subprocess
 import sys

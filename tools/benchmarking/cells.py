@@ -23,7 +23,7 @@ def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Seque
 
 
 def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:
-    """Outcomes by what they share, in order of appearance."""
+    """Results grouped by their labels, in order of appearance."""
     groups: dict[tuple[str, ...], list[JobResult]] = {}
     for o in results:
         groups.setdefault(tuple(label(o) for label in labels), []).append(o)

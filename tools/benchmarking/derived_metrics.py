@@ -14,20 +14,20 @@ from slam.results.folder import RunFolder
 from slam.results.summary import null
 from slam.se3 import FloatArray, invert, rotation_angle
 
-FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop that is farther off the truth is false
+FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
 
 
 def derive_metrics(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Errors as shares, and the accepted loops sorted by the truth.
+    """Relative errors, and the number of true and of false accepted loops.
 
     ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's.
     """
     length = lookup(metrics, "sequence", "length_m")
     network, optimised = (_ate(metrics, name) for name in ("network", "optimised"))
     return {
-        **_share("network_percent", network, length, 100.0),
-        **_share("optimised_percent", optimised, length, 100.0),
-        **_share("of_network", optimised, network, 1.0),
+        **_ratio("network_percent", network, length, 100.0),
+        **_ratio("optimised_percent", optimised, length, 100.0),
+        **_ratio("of_network", optimised, network, 1.0),
         **_loops(folder, metrics),
     }
 
@@ -36,7 +36,7 @@ def _ate(metrics: Mapping[str, Any], trajectory: str) -> tuple[float | None, str
     return lookup(metrics, "trajectories", trajectory, "align", "7dof", "ate_rmse_m")
 
 
-def _share(name: str, part: tuple[float | None, str], whole: tuple[float | None, str], unit: float) -> dict[str, Any]:
+def _ratio(name: str, part: tuple[float | None, str], whole: tuple[float | None, str], unit: float) -> dict[str, Any]:
     if part[0] is None or not whole[0]:
         return null(name, part[1] or whole[1] or "nothing to compare with")
     return {name: unit * part[0] / whole[0]}

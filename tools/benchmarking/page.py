@@ -62,7 +62,7 @@ are the same for every seed, and a standard deviation over seeds is that of the 
 data. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale* is the
 factor that the optimised trajectory still needs.
 
-An experiment beside these runs, kiss-icp on the point clouds of learned depth, is told in
+An experiment beside these runs, kiss-icp on the point clouds of learned depth, is described in
 [design/tried-without-success](design/tried-without-success.md).
 """
 

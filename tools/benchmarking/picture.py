@@ -19,7 +19,7 @@ from slam.storage.files import write_atomically
 
 SIDE_IN = 1.9
 DPI = 90
-COLOURS = 48  # a third of the bytes of a full palette, and no eye sees it
+COLOURS = 48  # a third of the bytes of a full palette, without a visible difference
 
 
 def drawable(results: Sequence[JobResult]) -> list[JobResult]:

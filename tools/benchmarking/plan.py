@@ -15,7 +15,7 @@ Condition = Literal["clean", "hazards"]
 class BenchmarkSequence:
     """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options.
 
-    Drives of one ``kind`` are counted together; ``clean`` names the same drive without hazards.
+    Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Configuration:
 
 
 _UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
-_NEVER = 1e9  # a limit that nothing reaches
+_NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
 EVERYTHING = Configuration("everything on", QUIET, "keep")
@@ -68,7 +68,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
 }
 ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _PARTS.items()))
 SPEED = (
-    Configuration("networks asked"),
+    Configuration("networks computed"),
     Configuration("cache filled", cache="fill"),
     Configuration("from the cache", cache="full"),
     Configuration("from the cache, no fusion", ("mapping.enabled=false",), cache="full"),
@@ -89,22 +89,22 @@ class Job:
 
     @property
     def title(self) -> str:
-        """For a reader."""
+        """Title in tables and logs."""
         return f"{self.drive.name}, {self.weights}, {self.configuration.name}, seed {self.seed}"
 
     @property
     def place(self) -> Path:
-        """Of this run alone."""
+        """Folder of this run alone."""
         return self.folder / slug(self.title)
 
     @property
     def cache(self) -> Path:
-        """Shared by the configurations of one drive."""
+        """Cache folder that the configurations of one drive share."""
         return self.folder / "cache" / slug(f"{self.drive.name}_{self.weights}")
 
     @property
     def arguments(self) -> list[str]:
-        """Of ``erfsfm-slam``."""
+        """Arguments of ``erfsfm-slam``."""
         drive, configuration = self.drive, self.configuration
         words = ["run", "--dataset", str(drive.root), "--sequence", drive.sequence, "--weights", self.weights]
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
@@ -130,7 +130,7 @@ def plan(
 def worlds(
     folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int, conditions: Sequence[Condition] = ("clean",)
 ) -> list[BenchmarkSequence]:
-    """Simulated drives, in folders that name everything that decides them; ``hazards`` are all of them at once."""
+    """Simulated drives, in folders named by all parameters of the simulation; ``hazards`` are all of them at once."""
     from slam.sequences.simulation.hazards import Hazard
     from slam.sequences.simulation.street import VERSION
 

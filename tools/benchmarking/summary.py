@@ -43,7 +43,7 @@ def kind(o: JobResult) -> str:
 
 
 def found(group: Sequence[JobResult]) -> str:
-    """In how many runs at least one accepted loop is true."""
+    """Number of runs with at least one true accepted loop."""
     return f"{sum(count > 0 for count in values(group, TRUE_LOOPS))} of {len(group)}"
 
 

@@ -25,8 +25,8 @@ from slam.results.comparison import failure
 from slam.storage.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("erfsfm", "slam", "configs")  # what decides the numbers
-BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # of hundreds of runs, and no table reads them
+SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
+BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # removed after a run: no table reads them
 
 Spread = Callable[[Callable[[Any], None], Sequence[Any]], Iterable[None]]
 
@@ -42,13 +42,13 @@ class JobResult:
 
 
 def simulate(drive: BenchmarkSequence) -> None:
-    """Simulate a world where it is missing; whoever needs it checks that it is there."""
+    """Simulate a world where it is missing; `measured` checks that it was made."""
     if not drive.root.exists():
         subprocess.run(_slam("simulate", str(drive.root), *drive.simulate), stdout=subprocess.DEVNULL, check=False)
 
 
 def perform(job: Job) -> None:
-    """Run a job and leave ``record.json`` in its place, unless the same job ended well before."""
+    """Run a job and write ``record.json`` to its folder, unless the same job was successful before."""
     identity = {"arguments": job.arguments, "sources": fingerprint(job.weights)}
     kept = _read(job.place / "record.json")
     if kept.get("identity") == identity and not _read_result(job, kept).reason:
@@ -76,7 +76,7 @@ def job_result(job: Job) -> JobResult:
 
 def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
     metrics = _read(job.place / "run" / "metrics.json")
-    reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was broken off")
+    reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was interrupted")
     commit = record.get("commit", "")
     if reason:
         return JobResult(job, {}, commit, reason)
@@ -91,7 +91,7 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
 
 
 def _slam(*arguments: str) -> list[str]:
-    """``erfsfm-slam`` of this interpreter, whatever lies in the working directory."""
+    """``erfsfm-slam`` of this interpreter, whatever the working directory holds."""
     return [sys.executable, "-P", "-m", "slam", *arguments]
 
 
@@ -105,7 +105,7 @@ def _reason(finished: subprocess.CompletedProcess[str]) -> str:
 
 
 def fingerprint(weights: str) -> str:
-    """Of sources and weights: what has another one is measured again."""
+    """Hash of sources and weights; jobs with another hash are run again."""
     digest = hashlib.sha256()
     for root in (*(ROOT / name for name in SOURCES), Path(weights)):
         for path in sorted(root.rglob("*")):
@@ -136,7 +136,7 @@ def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
         import cloudpickle
         from dask.distributed import Client, as_completed
     except ImportError as error:
-        raise SystemExit("--jobs and --scheduler want Dask: pip install 'erfsfm-slam[benchmark]'") from error
+        raise SystemExit("--jobs and --scheduler need Dask: pip install 'erfsfm-slam[benchmark]'") from error
     for module in (plan, sys.modules[__name__]):  # workers elsewhere do not have them
         cloudpickle.register_pickle_by_value(module)
     local: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Variations of a snippet: the camera follows the images."""
+"""Augmentation of a snippet: the camera is changed with the images."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def centre_of(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("flip", [0.0, 1.0])
 @pytest.mark.parametrize("zoom", [1.0, 1.15, 1.3])
-def test_points_are_where_the_camera_says(seed: int, flip: float, zoom: float) -> None:
+def test_points_project_to_where_the_augmented_image_has_them(seed: int, flip: float, zoom: float) -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(flip=flip, zoom=zoom)
     varied, _, camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(seed))
@@ -65,7 +65,7 @@ def test_the_papers_flip_is_one_pixel_off() -> None:
     assert project(camera, POINTS[0] * [-1, 1, 1])[0] - centre_of(varied[0])[0] == pytest.approx(1, abs=0.05)
 
 
-def test_nothing_to_vary_leaves_all_as_it_was() -> None:
+def test_zero_augmentation_changes_nothing() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     varied, _, camera, _ = augment(images, [], CAMERA, DataConfig(flip=0, zoom=1), "default", np.random.default_rng(0))
     assert camera == CAMERA
@@ -73,7 +73,7 @@ def test_nothing_to_vary_leaves_all_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_colour_is_one_change_for_all_frames(seed: int) -> None:
+def test_all_frames_get_the_same_colour_change(seed: int) -> None:
     rng = np.random.default_rng(9)
     image = rng.integers(0, 256, (96, 160, 3), dtype=np.uint8)
     config = DataConfig(flip=0, zoom=1, colour_jitter=0.3)
@@ -96,7 +96,7 @@ def test_weak_colour_changes_are_weak() -> None:
         assert (varied == image).all()
 
 
-def test_the_generator_is_the_only_chance() -> None:
+def test_the_generator_is_the_only_source_of_randomness() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(colour_jitter=0.2)
     first, _, camera, _ = augment(images, [], CAMERA, config, "default", np.random.default_rng(4))
@@ -107,7 +107,7 @@ def test_the_generator_is_the_only_chance() -> None:
     assert any((a != b).any() for a, b in zip(first, other))
 
 
-def test_inputs_are_left_alone() -> None:
+def test_inputs_are_not_modified() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     before = [image.copy() for image in images]
     augment(images, [], CAMERA, DataConfig(flip=1, colour_jitter=0.5), "default", np.random.default_rng(1))

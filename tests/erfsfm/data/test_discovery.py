@@ -1,4 +1,4 @@
-"""What is found under a root, and what is said where nothing is."""
+"""Discovery of recordings under a root, and the errors."""
 
 from __future__ import annotations
 
@@ -115,8 +115,8 @@ def test_poses_and_parts(tmp_path: Path, write_root: Callable[..., Path]) -> Non
     assert len(whole.part(4, 10**9)) == 2
 
 
-def test_poses_are_those_of_the_camera_that_looked(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    """P2 with 60 px * 0.5 m in its last column: camera 2 is half a metre left of camera 0, which turns left."""
+def test_poses_are_those_of_the_camera_that_took_the_images(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    """P2 with 60 px * 0.5 m in its last column: camera 2 is half a metre left of camera 0, which rotates left."""
     write_root(tmp_path, frames=2)
     (tmp_path / "sequences/00/calib.txt").write_text("P2: 60 0 47.5 30 0 62 31.5 0 0 0 1 0\n")
     (tmp_path / "poses/00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n0 0 -1 3 0 1 0 0 1 0 0 0\n")
@@ -212,18 +212,18 @@ def test_missing_root(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [[], ["readme.txt"], ["sequences/"], ["sequences/00/"]])
-def test_nothing_to_learn_from(tmp_path: Path, content: list[str]) -> None:
+def test_a_root_without_recordings(tmp_path: Path, content: list[str]) -> None:
     for name in content:
         if name.endswith("/"):
             (tmp_path / name).mkdir(parents=True)
         else:
             (tmp_path / name).write_text("")
-    assert "nothing to learn from" in refusal(tmp_path)
+    assert "no recording" in refusal(tmp_path)
 
 
 def test_a_file_is_no_root(tmp_path: Path) -> None:
     (tmp_path / "x.zip").write_bytes(b"PK")
-    assert "nothing to learn from" in refusal(tmp_path / "x.zip")
+    assert "no recording" in refusal(tmp_path / "x.zip")
 
 
 def test_empty_image_folder(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_a_folder_is_split_at_its_gaps(tmp_path: Path) -> None:
     assert [r.frames_name for r in discover(tmp_path / "drive")] == ["folder/drive[0:4]", "folder/drive[5:7]"]
 
 
-def test_an_image_that_is_no_frame(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_an_image_without_a_frame_number(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path)
     frame = tmp_path / "sequences/00/image_2/000003.png"
     frame.rename(frame.with_name("left.png"))
@@ -301,7 +301,7 @@ def test_an_image_that_is_no_frame(tmp_path: Path, write_root: Callable[..., Pat
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_half_an_image(tmp_path: Path, write_root: Callable[..., Path], suffix: str) -> None:
+def test_truncated_image(tmp_path: Path, write_root: Callable[..., Path], suffix: str) -> None:
     write_root(tmp_path, suffix=suffix)
     image = tmp_path / f"sequences/00/image_2/000002{suffix}"
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
@@ -391,7 +391,7 @@ def test_broken_video(tmp_path: Path) -> None:
     assert "x.mp4" in refusal(tmp_path)
 
 
-def test_simulation_file_with_more_in_it(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_simulation_file_with_other_keys(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=1)
     (tmp_path / "simulation.json").write_text(json.dumps({"seed": 3, "route": "loop"}))
     assert one(tmp_path).name == "simulated/3"

@@ -25,7 +25,7 @@ class Painted:
         return np.full((height, width, 3), index % 256, np.uint8)
 
 
-def look(cache: ImageCache, recording: Painted, *indices: int) -> None:
+def read(cache: ImageCache, recording: Painted, *indices: int) -> None:
     for index in indices:
         image = cache.image(recording, index)  # type: ignore[arg-type]
         assert image.shape == (HEIGHT, WIDTH, 3)
@@ -35,33 +35,33 @@ def look(cache: ImageCache, recording: Painted, *indices: int) -> None:
 @pytest.mark.parametrize("limit_mb, decoded", [(10, [0, 1]), (0, [0, 1, 0, 1])])
 def test_decodes_once_while_there_is_room(limit_mb: int, decoded: list[int]) -> None:
     recording = Painted()
-    look(ImageCache(limit_mb, HEIGHT, WIDTH), recording, 0, 1, 0, 1)
+    read(ImageCache(limit_mb, HEIGHT, WIDTH), recording, 0, 1, 0, 1)
     assert recording.decoded == decoded
 
 
-def test_forgets_what_was_not_looked_at_for_longest() -> None:
+def test_drops_the_least_recently_used_frame() -> None:
     recording = Painted()
-    look(ImageCache(1, HEIGHT, WIDTH), recording, 0, 1, 0, 2, 0, 1)  # two images fit
+    read(ImageCache(1, HEIGHT, WIDTH), recording, 0, 1, 0, 2, 0, 1)  # two images fit
     assert recording.decoded == [0, 1, 2, 1]
 
 
 def test_recordings_are_kept_apart() -> None:
     first, second = Painted(), Painted()
     cache = ImageCache(10, HEIGHT, WIDTH)
-    look(cache, first, 3)
-    look(cache, second, 3)
+    read(cache, first, 3)
+    read(cache, second, 3)
     assert first.decoded == second.decoded == [3]
 
 
-def test_an_image_handed_out_stays_when_its_place_is_taken() -> None:
+def test_a_returned_image_is_unchanged_when_its_block_is_reused() -> None:
     recording = Painted()
     cache = ImageCache(1, HEIGHT, WIDTH)
-    look(cache, recording, 0)
+    read(cache, recording, 0)
     held = cache.image(recording, 0)  # type: ignore[arg-type]
-    look(cache, recording, 1, 2, 3)
+    read(cache, recording, 1, 2, 3)
     assert (held == 0).all()
     held[:] = 99
-    look(cache, recording, 3, 2)
+    read(cache, recording, 3, 2)
 
 
 def test_many_blocks() -> None:
@@ -74,7 +74,7 @@ def test_many_blocks() -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory is read from /proc, which Linux has")
-def test_memory_is_what_was_asked_for() -> None:
+def test_memory_stays_within_the_limit() -> None:
     """Between short-lived arrays, as a sample makes them."""
 
     def resident_mb() -> float:

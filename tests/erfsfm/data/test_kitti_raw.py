@@ -1,4 +1,4 @@
-"""Raw drives as recordings: which cameras, which intrinsics, and what is said of incomplete ones."""
+"""Raw drives as recordings: cameras, intrinsics, and the errors of incomplete drives."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_parts_keep_the_numbers_of_the_drive(tmp_path: Path, write_raw: WriteDri
     assert [r.frames_name for r in open_drive(drive)] == 2 * [f"{NAME}[1:3]", f"{NAME}[4:6]"]
 
 
-def test_what_is_missing(tmp_path: Path, write_raw: WriteDrive) -> None:
+def test_missing_files(tmp_path: Path, write_raw: WriteDrive) -> None:
     write_raw(tmp_path)
     calibration = tmp_path / "2011_09_26/calib_cam_to_cam.txt"
     calibration.write_text("S_rect_02: 96 64\n")

@@ -1,4 +1,4 @@
-"""Draws, windows, validation and who trains on what."""
+"""Draws, windows, validation, and the split of recordings."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def experiment(batch: int = 2, sources: int = 2, devices: int = 1, **data: Any) 
 
 @pytest.fixture
 def coded(tmp_path: Path) -> Path:
-    """Folders ``a`` and ``b`` whose frame k is painted 20 k, and the second colour says which folder."""
+    """Folders ``a`` and ``b`` whose frame k is painted 20 k, and the second channel encodes the folder."""
     for code, name in enumerate("ab"):
         folder = tmp_path / name
         folder.mkdir()
@@ -56,21 +56,21 @@ def coded(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "messages"),
     [
         (["folder/b"], []),
         (["folder/b", "folder/c"], ["data.validation names folder/c, which is not among the data"]),
     ],
 )
-def test_a_validation_that_is_partly_absent_is_said(
-    coded: Path, names: list[str], said: list[str], caplog: pytest.LogCaptureFixture
+def test_a_partly_absent_validation_is_logged(
+    coded: Path, names: list[str], messages: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     _, validation = split_recordings(DataConfig(roots=[coded / "a", coded / "b"], validation=names))
     assert [recording.name for recording in validation] == ["folder/b"]
-    assert [record.message for record in caplog.records] == said
+    assert [record.message for record in caplog.records] == messages
 
 
-def test_only_the_default_may_name_nothing_to_validate_on(coded: Path) -> None:
+def test_only_the_default_validation_may_match_no_recording(coded: Path) -> None:
     assert split_recordings(DataConfig(roots=[coded / "a"]))[1] == []
     assert split_recordings(DataConfig(roots=[coded / "a"], validation=[]))[1] == []
     with pytest.raises(DataError, match=r"nothing to validate on: .* name folder/c; found folder/a; name one"):
@@ -132,7 +132,7 @@ def test_workers_change_nothing(coded: Path, workers: int) -> None:
     assert all(equal(a, b) for a, b in zip(alone, shared))
 
 
-def test_weather_is_shown_to_the_networks_and_changes_nothing_else(coded: Path) -> None:
+def test_weather_changes_only_the_network_input(coded: Path) -> None:
     clear = SnippetDraws(discover(coded), experiment(), 20)
     wet = SnippetDraws(discover(coded), experiment(weather=0.5), 20)
     changed = 0
@@ -146,7 +146,7 @@ def test_weather_is_shown_to_the_networks_and_changes_nothing_else(coded: Path) 
     assert 3 <= changed <= 16
 
 
-def test_resuming_sees_what_it_would_have_seen(coded: Path) -> None:
+def test_resuming_draws_the_same_samples(coded: Path) -> None:
     whole = batches(coded, 0)
     for workers in (0, 2):
         tail = batches(coded, workers, first=6)
@@ -162,8 +162,8 @@ def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers
         list(DataLoader(SnippetDraws(discover(coded), config, 16, 4, rank), 2, num_workers=workers)) for rank in (0, 1)
     ]
     assert len(whole) == len(parts[0]) == len(parts[1]) == 3
-    for batch, *shares in zip(whole, *parts):
-        assert equal(batch, {key: torch.cat([share[key] for share in shares]) for key in batch})
+    for batch, *batches in zip(whole, *parts):
+        assert equal(batch, {key: torch.cat([part[key] for part in batches]) for key in batch})
 
 
 def test_a_last_batch_may_be_smaller(coded: Path) -> None:
@@ -187,7 +187,7 @@ def test_by_default_recordings_count_by_their_windows(coded: Path) -> None:
     assert counts["b"] / 400 == pytest.approx(2 / 9, abs=0.06)
 
 
-def test_weights_set_the_shares(coded: Path) -> None:
+def test_weights_set_the_probabilities(coded: Path) -> None:
     long, short = discover(coded)
     config = experiment(weights={"folder/a": 1, "folder/b": 3})
     draws = SnippetDraws([long, short.part(0, 4)], config, 400)
@@ -213,12 +213,12 @@ def test_weights_mix_kinds_of_data(
     assert chances == {name: pytest.approx(weight / 4) for name, weight in weights.items()}
 
 
-def test_recordings_without_a_share_are_refused(coded: Path) -> None:
-    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no share: name it there"):
+def test_recordings_without_a_weight_are_refused(coded: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no weight: name it there"):
         SnippetDraws(discover(coded), experiment(weights={"folder/a": 1}), 1)
 
 
-def test_weights_of_nothing_are_refused(coded: Path) -> None:
+def test_weights_that_match_no_recording_are_refused(coded: Path) -> None:
     with pytest.raises(DataError, match="kitti"):
         SnippetDraws(discover(coded), experiment(weights={"kitti": 1}), 1)
 
@@ -240,7 +240,7 @@ def test_errors_name_a_few_of_many(coded: Path) -> None:
         usable([replace(first.part(0, 2), name=f"f/{k}") for k in range(20)], 5)
 
 
-def test_as_tensors_puts_the_target_apart() -> None:
+def test_as_tensors_separates_the_target() -> None:
     images = [np.full((2, 2, 3), 51 * k, np.uint8) for k in range(5)]
     sample = as_tensors(images, np.eye(3, dtype=np.float32))
     assert float(sample["target"].mean()) == pytest.approx(0.4)
@@ -282,7 +282,7 @@ def test_validation_truth_of_a_part(tmp_path: Path, write_root: Callable[..., Pa
     assert float(sample["depth"][3, 3]) == pytest.approx(6 - 0.4, abs=1 / 256)
 
 
-# who trains on what
+# the split of recordings
 
 
 def names(config: DataConfig) -> tuple[list[str], list[str]]:
@@ -332,7 +332,7 @@ def test_exclude_by_raw_drive(kitti: Path) -> None:
 
 
 def test_exclude_a_part(kitti: Path) -> None:
-    """Frames kept back do not forbid the frames before them, once those are named."""
+    """Excluded frames do not exclude the frames before them where ranges name these."""
     held_back = ["kitti_odometry/00[4:]", "kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"]
     with pytest.raises(DataError, match="nothing left to train on"):
         split_recordings(DataConfig(roots=[kitti], exclude=held_back))
@@ -390,7 +390,7 @@ def test_a_car_that_never_moves(tmp_path: Path, write_raw: Callable[..., Path]) 
         split_recordings(DataConfig(roots=[tmp_path]))
 
 
-def test_a_split_says_who_trains_validates_and_tests(raw: Path) -> None:
+def test_a_split_lists_training_validation_and_test_recordings(raw: Path) -> None:
     assert drives(DataConfig(roots=[raw], split="eigen", exclude=[])) == ({"drive_0001", "drive_0033"}, {"drive_0005"})
 
 
@@ -401,16 +401,16 @@ def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> 
     assert validation == ["kitti_odometry/06[0:3]"]
 
 
-def test_a_split_of_ones_own(tmp_path: Path, kitti: Path) -> None:
+def test_a_split_file_of_the_user(tmp_path: Path, kitti: Path) -> None:
     (tmp_path / "mine.yaml").write_text(
         "train: ['kitti_odometry/00[1:4]', kitti_odometry/09]\ntest: [kitti_odometry/09]\n"
     )
     config = DataConfig(roots=[kitti], split=str(tmp_path / "mine.yaml"), exclude=[])
-    assert names(config)[0] == ["kitti_odometry/00[1:4]"], "what tests never trains"
+    assert names(config)[0] == ["kitti_odometry/00[1:4]"], "a test recording is never trained on"
 
 
 def test_eigens_scenes_exclude_their_odometry_sequences_by_split_alone(tmp_path: Path, kitti: Path) -> None:
-    """Training on 00 is what the paper does; who asks for the split does not want it."""
+    """The paper trains on 00; the split excludes it."""
     assert names(DataConfig(roots=[kitti]))[0] == ["kitti_odometry/00[0:6]"]
     (tmp_path / "test.yaml").write_text("test: ['kitti_raw/2011_10_03_drive_0027[0:3]']\n")
     with pytest.raises(DataError, match="nothing left to train on"):
@@ -466,5 +466,5 @@ def test_ranges_and_gaps(tmp_path: Path, write_root: Callable[..., Path]) -> Non
 
     assert names() == ["simulated/3[0:4]", "simulated/3[5:8]", "simulated/3[9:12]"]
     assert names(ranges={"simulated/3": "2:7"}) == ["simulated/3[2:4]", "simulated/3[5:7]"]
-    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that there are"):
+    with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that the recording has"):
         names(ranges={"simulated/3": "12:"})

@@ -1,4 +1,4 @@
-"""Splits as files: what is shipped, how frames are written, and what is refused."""
+"""Split files: those shipped, the notation of frames, and the errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_runs(runs: str, frames: list[int]) -> None:
 @pytest.mark.parametrize(
     "name", ["kitti_raw/a", "kitti_raw/a[]", "kitti_raw/a[:]", "a[1:]", "a[0:9:0]", "a[1,,2]", "a[x]"]
 )
-def test_runs_that_are_none(name: str) -> None:
+def test_malformed_runs(name: str) -> None:
     with pytest.raises(DataError, match="names no single frames"):
         Split(test=[name]).test_frames()
 
@@ -55,7 +55,7 @@ def test_runs_that_are_none(name: str) -> None:
         ("test: [a]\ntest: [b]", "key 'test' stands twice"),
     ],
 )
-def test_files_that_are_no_splits(tmp_path: Path, text: str, words: str) -> None:
+def test_malformed_split_files(tmp_path: Path, text: str, words: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(DataError, match=words) as caught:

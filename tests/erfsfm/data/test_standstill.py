@@ -80,8 +80,8 @@ def test_one_frame_alone(tmp_path: Path, write_raw: WriteDrive) -> None:
 
 
 @pytest.mark.data
-def test_real_recordings_never_stand(data_root: Path) -> None:
-    """A drive at 38 km/h and more: both ways of knowing say so."""
+def test_real_recordings_never_stand_still(data_root: Path) -> None:
+    """A drive at 38 km/h and more: by speed and by images."""
     (drive,) = (data_root / "kitti_raw/2011_09_26").glob("*_0013_sync")
     (recording,) = open_drive(drive)
     assert spans(recording) == [(0, 144)]

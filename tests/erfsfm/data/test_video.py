@@ -1,4 +1,4 @@
-"""Videos: every frame in its place, at any order of asking, and what is said of damaged ones."""
+"""Videos: frames read in any order, and the errors of damaged files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def number(image: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize(("suffix", "codec"), [(".mp4", "mp4v"), (".avi", "MJPG"), (".mkv", "mp4v")])
-def test_any_frame_at_any_time(tmp_path: Path, suffix: str, codec: str) -> None:
+def test_frames_in_any_order(tmp_path: Path, suffix: str, codec: str) -> None:
     video = Video(write(tmp_path / f"a{suffix}", codec=codec))
     assert (len(video), video.width, video.height) == (FRAMES, *SIZE)
     order = [0, 39, 7, 8, 30, 2, 39, 7]
@@ -58,7 +58,7 @@ def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_video_that_was_cut_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """An avi keeps its count of frames in front: half the file has half of them, and that is said."""
+    """An avi keeps its count of frames in front: half the file has half of them, and a warning is logged."""
     path = write(tmp_path / "a.avi", codec="MJPG")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with caplog.at_level(logging.WARNING):

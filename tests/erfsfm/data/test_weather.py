@@ -1,4 +1,4 @@
-"""Bad weather over a snippet: seen worse, in the same place."""
+"""Simulated weather over a snippet: degraded images, unchanged geometry."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_only_the_seed_decides(images: list[NDArray[np.uint8]]) -> None:
     assert any(not np.array_equal(a, b) for a, b in zip(first, other))
 
 
-def test_what_was_given_stays(images: list[NDArray[np.uint8]]) -> None:
+def test_inputs_are_not_modified(images: list[NDArray[np.uint8]]) -> None:
     before = images[0].copy()
     for seed in range(5):
         weathered(images, np.random.default_rng(seed))
@@ -40,7 +40,7 @@ def test_images_stay_images_and_many_get_worse(images: list[NDArray[np.uint8]]) 
     assert max(changes) < 100
 
 
-def test_things_stay_where_they_are(images: list[NDArray[np.uint8]]) -> None:
+def test_positions_do_not_change(images: list[NDArray[np.uint8]]) -> None:
     """The mean over much weather has its brightest place where the clear image has it."""
     seen = [image.astype(float)[..., 0] for s in range(60) for image in weathered(images, np.random.default_rng(s))]
     bright = np.maximum(np.mean(seen, axis=0) - 90, 0)

@@ -1,4 +1,4 @@
-"""A KITTI raw drive small enough to think about: level LiDAR, camera without tilt, a wall of known depth."""
+"""A minimal KITTI raw drive: level LiDAR, camera without tilt, a wall of known depth."""
 
 from __future__ import annotations
 

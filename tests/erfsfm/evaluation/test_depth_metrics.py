@@ -42,7 +42,7 @@ def test_scaled_predictions_are_clipped_afterwards() -> None:
     assert errors.rmse == pytest.approx(math.sqrt(1 / 3)), "80 against 79, not 10000"
 
 
-def test_what_counts() -> None:
+def test_valid_pixels() -> None:
     truth = np.full((100, 200), 5.0, np.float32)
     truth[50, 50:53] = [0, 80, 90]
     assert (~valid_pixels(truth, 80, "none")).sum() == 3

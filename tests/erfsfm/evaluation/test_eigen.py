@@ -1,4 +1,4 @@
-"""The Eigen protocol with networks that know the answer, its two scales and its fidelities."""
+"""The Eigen protocol with oracle networks, its two scales and its fidelities."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_both_scales(tmp_path: Path, write_drive: Write, split: str, fidelity: s
     assert set(oracle.asked) == {(32, 64, 3) if fidelity == "paper" else (64, 96, 3)}
 
 
-def test_a_wrong_unit_of_motion_is_seen_in_one_row_alone(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_a_wrong_unit_of_motion_affects_the_pose_row_alone(tmp_path: Path, write_drive: Write, split: str) -> None:
     root = write_drive(tmp_path / "raw", speed=12.0)
     median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert median["abs_rel"] == pytest.approx(0, abs=1e-5)
@@ -84,7 +84,7 @@ def test_clipping_is_what_fidelity_changes(tmp_path: Path, write_drive: Write, s
     assert eigen_protocol(far, root, split, "paper", False)[1]["abs_rel"] == pytest.approx(1 - 80 * 0.1 / 20, abs=1e-5)
 
 
-def test_a_car_that_stands(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_a_car_that_stands_still(tmp_path: Path, write_drive: Write, split: str) -> None:
     root = write_drive(tmp_path / "raw", speed=0.0)
     median, pose, _ = eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
     assert (median["images"], pose["images"], pose["abs_rel"]) == (3, 0, None)
@@ -137,7 +137,7 @@ def test_frames_of_the_eigen_list(tmp_path: Path, drive: str, wanted: list[int])
     assert [frame.index for frame in read_split("eigen", tmp_path) if frame.drive == drive] == wanted
 
 
-def test_a_split_of_ones_own_in_yaml(tmp_path: Path, write_drive: Write) -> None:
+def test_a_yaml_split_of_the_user(tmp_path: Path, write_drive: Write) -> None:
     root = write_drive(tmp_path / "raw")
     path = tmp_path / "mine.yaml"
     path.write_text(f"test:\n  - kitti_raw/{DRIVE}[0:5:2, 8]\n")
@@ -150,12 +150,12 @@ def test_a_split_of_ones_own_in_yaml(tmp_path: Path, write_drive: Write) -> None
         read_split("odometry", root)
 
 
-def test_raw_drives_want_a_split(tmp_path: Path, write_drive: Write) -> None:
+def test_raw_drives_need_a_split(tmp_path: Path, write_drive: Write) -> None:
     with pytest.raises(DataError, match="name their frames with --split"):
         depth_protocol(Oracle(), write_drive(tmp_path / "raw"), allow_leak=False)
 
 
-def test_splits_that_are_none(tmp_path: Path, write_drive: Write) -> None:
+def test_malformed_splits(tmp_path: Path, write_drive: Write) -> None:
     root = write_drive(tmp_path / "raw")
     (tmp_path / "empty.txt").write_text("\n")
     (tmp_path / "words.txt").write_text("one two\n")
@@ -170,7 +170,7 @@ def test_splits_that_are_none(tmp_path: Path, write_drive: Write) -> None:
         read_split("eigen", tmp_path / "nowhere")
 
 
-def test_a_scan_that_hits_nothing(tmp_path: Path, write_drive: Write, split: str) -> None:
+def test_a_scan_without_points_in_the_crop(tmp_path: Path, write_drive: Write, split: str) -> None:
     root = write_drive(tmp_path / "raw", points=np.zeros((0, 4), np.float32))
     with pytest.raises(DataError, match="frame 0 hits nothing under 80 m"):
         eigen_protocol(Oracle(), root, split, "default", allow_leak=False)
@@ -188,7 +188,7 @@ def test_a_given_scale_and_clipping_by_hand() -> None:
 
 @pytest.mark.data
 def test_shipped_weights_on_a_real_drive(data_root: Path, tmp_path: Path) -> None:
-    """Never seen in training: better than a guess, and both fidelities agree where clipping does not matter."""
+    """Never seen in training: better than the baseline, and both fidelities agree where clipping does not matter."""
     (tmp_path / "split.txt").write_text("".join(f"2011_09_26_drive_0013 {i}\n" for i in (5, 25, 45)))
     predictor = DepthPosePredictor.from_weights("default")
     root, split = data_root / "kitti_raw", str(tmp_path / "split.txt")

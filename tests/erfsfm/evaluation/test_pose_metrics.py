@@ -26,7 +26,7 @@ def straight(steps: list[float]) -> Poses:
     return T
 
 
-def wander(rng: np.random.Generator, count: int) -> Poses:
+def random_poses(rng: np.random.Generator, count: int) -> Poses:
     """Random poses."""
     T = np.tile(np.eye(4), (count, 1, 1))
     T[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
@@ -39,7 +39,7 @@ def about_y(angle: float) -> Poses:
 
 
 def test_a_scaled_copy_is_perfect() -> None:
-    true = snippets_from_trajectory(wander(np.random.default_rng(1), 12))
+    true = snippets_from_trajectory(random_poses(np.random.default_rng(1), 12))
     predicted = true.copy()
     predicted[..., :3, 3] *= np.linspace(0.1, 7.0, len(true))[:, None, None]
     errors = snippet_errors(predicted, true)
@@ -67,7 +67,7 @@ def test_hand_value_of_re_counts_the_first_frame() -> None:
 
 def test_paper_fidelity_averages_over_four_zero_rows() -> None:
     rng = np.random.default_rng(2)
-    true, predicted = snippets_from_trajectory(wander(rng, 30)), snippets_from_trajectory(wander(rng, 30))
+    true, predicted = snippets_from_trajectory(random_poses(rng, 30)), snippets_from_trajectory(random_poses(rng, 30))
     plain, paper = snippet_errors(predicted, true), snippet_errors(predicted, true, fidelity="paper")
     assert paper.ate_mean == pytest.approx(plain.ate_mean * 26 / 30, rel=1e-12)
     assert paper.re_mean == pytest.approx(plain.re_mean * 26 / 30, rel=1e-12)
@@ -84,13 +84,13 @@ def test_no_predicted_motion_is_scored_as_standing_still() -> None:
 
 
 @pytest.mark.parametrize("shapes", [((0, 5, 4, 4), (0, 5, 4, 4)), ((2, 5, 4, 4), (3, 5, 4, 4)), ((5, 4, 4),) * 2])
-def test_shapes_that_make_no_sense_are_refused(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+def test_wrong_shapes_are_refused(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     with pytest.raises(ValueError, match="snippet"):
         snippet_errors(np.zeros(shapes[0]), np.zeros(shapes[1]))
 
 
 def test_snippets_start_at_the_identity_and_hold_relative_poses() -> None:
-    T_world_camera = wander(np.random.default_rng(3), 9)
+    T_world_camera = random_poses(np.random.default_rng(3), 9)
     snippets = snippets_from_trajectory(T_world_camera)
     assert snippets.shape == (5, 5, 4, 4)
     np.testing.assert_allclose(snippets[:, 0], np.tile(np.eye(4), (5, 1, 1)), atol=1e-14)
@@ -98,8 +98,8 @@ def test_snippets_start_at_the_identity_and_hold_relative_poses() -> None:
     assert snippets_from_trajectory(T_world_camera[:4]).shape == (0, 5, 4, 4)
 
 
-def test_the_networks_answer_becomes_the_snippet_of_the_trajectory() -> None:
-    T_world_camera = wander(np.random.default_rng(4), 5)
+def test_network_output_becomes_the_snippet_of_the_trajectory() -> None:
+    T_world_camera = random_poses(np.random.default_rng(4), 5)
     T_camera_world = np.linalg.inv(T_world_camera)
     T_source_target = (T_camera_world @ T_world_camera[2])[[0, 1, 3, 4]]
     T_first_k = snippet_from_network(T_source_target)

@@ -1,4 +1,4 @@
-"""Whole evaluations with networks that know the answer."""
+"""The evaluation protocols with oracle networks."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_pose(tmp_path: Path, write_root: Callable[..., Path], name: str) -> Non
     assert networks["leak"] is False
 
 
-def test_frames_of_a_sequence_are_held_against_what_was_seen(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+def test_frames_of_a_sequence_are_checked_for_leaks(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=20, step=STEP)
     seen = Oracle(STEP, seen=["kitti_odometry/00[0:12]"])
     networks, _ = pose_protocol(seen, tmp_path, ["00[12:]"], "default", allow_leak=False)

@@ -41,7 +41,7 @@ def test_right_camera() -> None:
 
 
 @pytest.mark.parametrize("line", ["", "5", DRIVE, f"{DRIVE} five", f"2011_09_26/{DRIVE}_sync/image_00/data/5.png"])
-def test_other_lines(line: str) -> None:
+def test_malformed_lines(line: str) -> None:
     with pytest.raises(DataError, match="names no frame: wanted"):
         RawFrame.parse(line, Path())
 
@@ -95,7 +95,7 @@ def test_images_of_another_shape(tmp_path: Path, write_drive: Write) -> None:
         lidar_depth(frame, (64, 64))
 
 
-def test_displacements_of_a_steady_drive(tmp_path: Path, write_drive: Write) -> None:
+def test_displacements_at_constant_speed(tmp_path: Path, write_drive: Write) -> None:
     frame = RawFrame(write_drive(tmp_path, speed=10.0), DRIVE, 4)
     np.testing.assert_allclose(displacements(frame, [2, 3, 4, 5, 6]), [2, 1, 1, 2], rtol=1e-5)
 

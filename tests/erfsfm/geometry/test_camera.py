@@ -1,4 +1,4 @@
-"""The camera matrix follows what is done to the image."""
+"""The camera matrix under resize, crop and flip of the image."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_project_then_flip() -> None:
     )
 
 
-def test_flip_twice_is_nothing() -> None:
+def test_flip_twice_is_the_identity() -> None:
     assert CAMERA.flipped().flipped() == CAMERA
     assert CAMERA.flipped("paper").flipped("paper") == CAMERA
     assert CAMERA.flipped("paper").cx == CAMERA.flipped().cx + 1

@@ -1,4 +1,4 @@
-"""Six-vectors, rotations and what they do to points."""
+"""Six-vectors, rotations and the transform of points."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_float64_stays() -> None:
     assert pose_vector_to_matrix(torch.zeros(6, dtype=torch.float64)).dtype == torch.float64
 
 
-def test_transform_points_rotates_then_moves() -> None:
+def test_transform_points_rotates_then_translates() -> None:
     T_a_b = pose_vector_to_matrix(torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2]]).double())
     points_b = torch.tensor([[[1.0], [0.0], [5.0]]]).double()
     torch.testing.assert_close(transform_points(T_a_b, points_b), torch.tensor([[[1.0], [1.0], [5.0]]]).double())
@@ -75,7 +75,7 @@ def test_gradients(angle: float) -> None:
     assert torch.autograd.gradcheck(lambda v, p: transform_points(pose_vector_to_matrix(v), p), (vector, points))
 
 
-def test_with_rotation_replaces_what_is_known_and_keeps_the_rest() -> None:
+def test_with_rotation_replaces_measured_rotations_only() -> None:
     T = pose_vector_to_matrix(torch.tensor([[1.0, 2.0, 3.0, 0.1, 0.2, 0.3], [4.0, 5.0, 6.0, 0.3, 0.2, 0.1]]))
     R = torch.stack([torch.eye(3), torch.full((3, 3), torch.nan)])
     replaced = with_rotation(T, R)

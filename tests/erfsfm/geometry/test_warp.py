@@ -1,4 +1,4 @@
-"""The inverse warp: where pixels land, and which of them count."""
+"""The inverse warp: projected positions and the valid mask."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_points_behind_the_camera_are_invalid() -> None:
     assert not project_into_source(depth, moved(0, 0, -3), camera(11, 11)).valid.any(), "nor those in its plane"
 
 
-def test_every_part_of_a_batch_has_its_own_camera_and_motion() -> None:
+def test_every_sample_of_a_batch_has_its_own_camera_and_motion() -> None:
     depth = torch.rand(2, 1, 9, 12) + 4
     T = torch.cat([moved(0.3, 0, 0), moved(0, 0.2, -1)])
     K = torch.cat([camera(12, 9), camera(12, 9, 20.0)])
@@ -71,7 +71,7 @@ def test_every_part_of_a_batch_has_its_own_camera_and_motion() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("inf"), float("nan"), 1e30])
-def test_wild_depth_gives_numbers(bad: float) -> None:
+def test_extreme_depth_gives_finite_values(bad: float) -> None:
     image = torch.rand(1, 3, 8, 8)
     depth = torch.full((1, 1, 8, 8), bad)
     projection = project_into_source(depth, moved(1e5, 0, 0), camera(8, 8))

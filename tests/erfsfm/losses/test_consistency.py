@@ -30,7 +30,7 @@ def test_worse_agreement_is_a_larger_value(ratio: float) -> None:
     assert (depth_inconsistency(depth, depth * ratio * 1.1) > depth_inconsistency(depth, depth * ratio)).all()
 
 
-def test_rotation_disagreement_is_the_chordal_distance_of_what_was_measured():
+def test_rotation_disagreement_is_the_chordal_distance_to_measured_rotations():
     angle = 0.3
     turned = torch.eye(3).repeat(1, 2, 1, 1)
     turned[0, 0, :2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])

@@ -32,7 +32,7 @@ def test_box_mean_gradcheck() -> None:
     assert torch.autograd.gradgradcheck(box_mean, (x,))
 
 
-def test_box_mean_leaves_its_argument_alone() -> None:
+def test_box_mean_does_not_modify_its_argument() -> None:
     x = torch.randn(4, 5)
     before = x.clone()
     box_mean(x)
@@ -63,7 +63,7 @@ def test_dissimilarity_matches_a_naive_reference() -> None:
             np.testing.assert_allclose(result[batch, channel].numpy(), expected, atol=1e-12)
 
 
-def test_equal_images_do_not_differ() -> None:
+def test_equal_images_have_no_dissimilarity() -> None:
     image = torch.rand(2, 3, 9, 9)
     assert float(dissimilarity(image, image).max()) < 1e-5
     assert float(photometric_error(image, image, 0.85).max()) < 1e-5
@@ -108,7 +108,7 @@ def test_gradient() -> None:
     assert torch.autograd.gradcheck(error, (warped,))
 
 
-def test_gradient_at_equal_images_is_a_number() -> None:
+def test_gradient_at_equal_images_is_finite() -> None:
     image = torch.rand(1, 3, 5, 5)
     warped = image.clone().requires_grad_()
     photometric_error(image, warped, 0.85).sum().backward()

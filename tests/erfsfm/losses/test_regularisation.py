@@ -49,7 +49,7 @@ def test_edge_aware_by_hand() -> None:
     assert float(edge_aware_smoothness(values, edge)) == pytest.approx((0.5 + 0.5 * math.exp(-1)) / 2, abs=1e-6)
 
 
-def test_edge_aware_does_not_see_scale() -> None:
+def test_edge_aware_is_scale_invariant() -> None:
     values, image = torch.rand(2, 1, 6, 7) + 0.5, torch.rand(2, 3, 6, 7)
     torch.testing.assert_close(edge_aware_smoothness(values, image), edge_aware_smoothness(values * 30, image))
 

@@ -21,7 +21,7 @@ def test_distance_from_an_interval_is_a_log_ratio(disparity, expected):
     assert distance.item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_the_unit_is_taken_out_first():
+def test_the_scale_is_removed_first():
     disparity = torch.full((1, 1, 4, 4), 0.25 * 3)
     interval = bounds(0.24, 0.26)
     log_scale = interval.log_scale(disparity)
@@ -29,7 +29,7 @@ def test_the_unit_is_taken_out_first():
     assert outside(disparity, interval, log_scale).item() == 0
 
 
-def test_unknown_pixels_neither_count_nor_spoil_gradients():
+def test_unbounded_pixels_affect_neither_loss_nor_gradients():
     disparity = torch.full((1, 1, 4, 4), 0.5, requires_grad=True)
     least, most = torch.zeros(1, 1, 4, 4), torch.full((1, 1, 4, 4), torch.inf)
     most[..., 0, 0] = 0.25  # something far: only bounded from above
@@ -41,7 +41,7 @@ def test_unknown_pixels_neither_count_nor_spoil_gradients():
     assert disparity.grad.count_nonzero() == 1
 
 
-def test_what_is_only_bounded_from_below_costs_where_it_is_farther():
+def test_a_lower_bound_alone_penalises_farther_depth():
     disparity = torch.tensor([[[[0.05, 0.2]]]], requires_grad=True)
     interval = Bounds(torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
     distance = outside(disparity, interval, ZERO)
@@ -50,7 +50,7 @@ def test_what_is_only_bounded_from_below_costs_where_it_is_farther():
     assert disparity.grad is not None and disparity.grad[0, 0, 0, 0] < 0 and disparity.grad[0, 0, 0, 1] == 0
 
 
-def test_nothing_known_is_no_loss():
+def test_no_bounds_no_loss():
     assert (
         outside(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0
     )

@@ -87,7 +87,7 @@ ONE_GROUP = [case for case in CASES if case[5] == case[6] == 1]
 
 @pytest.fixture
 def compiled(monkeypatch):
-    """Sends every case to the compiled path that it knows, and counts how often it went there."""
+    """Uses the compiled path for every case that it supports, and counts its calls."""
     kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
     monkeypatch.setattr(deformable, "_KERNEL_CHANNELS", 0)
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 0)
@@ -171,7 +171,7 @@ def test_compiled_neutral_start_is_plain_convolution(stride, padding, compiled):
     assert compiled
 
 
-def test_a_whole_layer_learns_the_same_on_both_paths(compiled, monkeypatch):
+def test_gradients_of_a_whole_layer_agree_on_both_paths(compiled, monkeypatch):
     torch.manual_seed(0)
     layer = DeformableConv2d(8, 6, kernel=3, stride=2, padding=1).double()
     initialise(layer, "paper")
@@ -187,7 +187,7 @@ def test_a_whole_layer_learns_the_same_on_both_paths(compiled, monkeypatch):
 
 
 @pytest.mark.parametrize("poisoned", ["input", "offset", "mask"])
-def test_no_number_stays_visible_when_compiled(poisoned, compiled):
+def test_nan_is_propagated_when_compiled(poisoned, compiled):
     tensors = {name: tensor.detach() for name, tensor in make_case(*CASES[0]).items()}
     tensors[poisoned][0, 0, 2, 2] = math.nan
     if poisoned == "mask":
@@ -201,7 +201,7 @@ def test_no_number_stays_visible_when_compiled(poisoned, compiled):
     "why",
     ["groups", "half precision", "autocast", "mixed precisions", "tracing", "meta", "few channels", "few samples"],
 )
-def test_what_the_compiled_path_leaves_to_pytorch(why, compiled, monkeypatch):
+def test_cases_that_the_compiled_path_does_not_take(why, compiled, monkeypatch):
     tensors = {name: tensor.detach() for name, tensor in make_case(*CASES[1 if why == "groups" else 0]).items()}
     options = {"stride": 2 if why == "groups" else 1, "padding": 1}
     if why == "half precision":
@@ -246,7 +246,7 @@ def test_small_layers_do_not_load_numba():
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_a_folder_that_cannot_be_written_does_not_matter(monkeypatch):
+def test_an_unwritable_cache_folder_is_ignored(monkeypatch):
     kernel = pytest.importorskip("erfsfm.networks.deformable_kernel")
     njit = kernel.njit
 
@@ -276,7 +276,7 @@ def test_samples_fade_to_zero_within_one_pixel_outside():
         assert value.item() == pytest.approx(wanted, abs=1e-6)
 
 
-def test_half_precision_places_keep_their_pixels():
+def test_half_precision_keeps_exact_pixel_positions():
     features = torch.randn(1, 1, 1, 600).bfloat16()
     offset = torch.zeros(1, 2, 1, 600).bfloat16()
     moved = deform_conv2d(features, offset, torch.ones(1, 1, 1, 1).bfloat16())

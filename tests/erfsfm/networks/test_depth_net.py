@@ -79,7 +79,7 @@ def test_zero_offsets_start_as_the_plain_network():
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("normalisation", ["none", "batch"])
-def test_every_weight_learns(variant, normalisation):
+def test_every_weight_has_a_gradient(variant, normalisation):
     torch.manual_seed(0)
     network = DepthNet(variant, width=0.25, normalisation=normalisation)
     image = torch.rand(2, 3, 129, 131) * 2 - 1

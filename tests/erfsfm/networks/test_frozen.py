@@ -1,4 +1,4 @@
-"""Graphs answer what their networks answer."""
+"""Frozen graphs have the outputs of their networks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from erfsfm.networks.presets import build
 SIZE = (1, 3, 64, 128)
 
 
-def awake(network: nn.Module) -> nn.Module:
+def with_moving_taps(network: nn.Module) -> nn.Module:
     """With deformable layers that move their taps, as trained ones do."""
     for layer in network.modules():
         if isinstance(layer, DeformableConv2d):
@@ -39,10 +39,10 @@ def inputs(kind: str, seed: int) -> tuple[Any, ...]:
     + ["erf-depthnet-dilated", "erf-posenet-dilated", "erf-posenet-dfc"],
 )
 @torch.inference_mode()
-def test_a_graph_answers_as_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
-    network = awake(build(name, width=0.125, sources=4))
+    network = with_moving_taps(build(name, width=0.125, sources=4))
     graph = Frozen(network)
     for seed in range(3):
         given = inputs(kind, seed)
@@ -52,24 +52,24 @@ def test_a_graph_answers_as_its_network_on_other_images_too(name: str, monkeypat
 
 
 @torch.inference_mode()
-def test_answers_repeat_from_the_first_on() -> None:
-    graph = Frozen(awake(build("erf-depthnet-dfcv2", width=0.125)))
+def test_outputs_are_deterministic_from_the_first_call_on() -> None:
+    graph = Frozen(with_moving_taps(build("erf-depthnet-dfcv2", width=0.125)))
     given = inputs("depth", 0)
     answers = [graph(*given) for _ in range(4)]
     assert all(torch.equal(answer, answers[0]) for answer in answers)
 
 
 @torch.inference_mode()
-def test_what_numba_serves_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_networks_with_compiled_layers_are_not_traced(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("numba")
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
-    network = awake(build("erf-depthnet-dfc", width=0.25))
+    network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
     graph = Frozen(network)
     graph(*inputs("depth", 0))
     assert graph.network is network
 
 
-def test_a_network_that_refuses_goes_on_refusing() -> None:
+def test_a_network_that_raises_keeps_raising() -> None:
     class Refusing(nn.Module):
         def forward(self, image: Tensor) -> Tensor:
             raise ValueError("no network here")
@@ -80,7 +80,7 @@ def test_a_network_that_refuses_goes_on_refusing() -> None:
             graph(torch.zeros(SIZE))
 
 
-def test_tracing_in_a_thread_warns_of_nothing_and_exchanges_no_filters() -> None:
+def test_tracing_in_a_thread_warns_of_nothing_and_keeps_the_warning_filters() -> None:
     """`warnings.catch_warnings` would replace the filters of every thread while the graph is traced."""
     seen: list[object] = []
 

@@ -152,15 +152,15 @@ def test_learned_offsets_are_kept():
 
 
 @pytest.mark.parametrize(
-    "name, fidelity, share", [("erf-posenet-dilated", "paper", 0.25), ("erf-posenet-dilated", "default", 1.0)]
+    "name, fidelity, fraction", [("erf-posenet-dilated", "paper", 0.25), ("erf-posenet-dilated", "default", 1.0)]
 )
-def test_share_of_the_image_that_the_pose_can_see(name, fidelity, share):
+def test_fraction_of_the_image_that_the_pose_depends_on(name, fidelity, fraction):
     network = small(name, fidelity)
     height, width = measured(network).map_size
     seen = torch.zeros(128, 416, dtype=torch.bool)
     for pixel in itertools.product(range(height), range(width)):
         seen |= measured(network, pixel=pixel).gradient > 0
-    assert seen.double().mean() == pytest.approx(share, abs=1e-6)
+    assert seen.double().mean() == pytest.approx(fraction, abs=1e-6)
 
 
 def test_on_a_large_image_gradients_reach_exactly_the_theoretical_side():
@@ -170,7 +170,7 @@ def test_on_a_large_image_gradients_reach_exactly_the_theoretical_side():
         assert field.rows == field.columns == theoretical(network)
 
 
-def test_measuring_leaves_the_network_alone():
+def test_measuring_does_not_modify_the_network():
     network = build("erf-posenet-dfc", width=0.1, normalisation="batch")
     before = {name: value.clone() for name, value in network.state_dict().items()}
     field = measured(network)
@@ -188,7 +188,7 @@ def test_effective_field_lies_inside_the_measured_one():
     assert network.encoder.training
 
 
-def test_share_that_holds_the_weight():
+def test_fraction_of_pixels_that_holds_the_gradient():
     field = measured(small("posenet"))
     assert field.share_holding(1.0) <= field.coverage
     assert 0 < field.share_holding(0.5) < field.share_holding(0.95) < field.coverage
@@ -196,7 +196,7 @@ def test_share_that_holds_the_weight():
     assert field.share_holding(0.95) == pytest.approx(10 / (128 * 416))
 
 
-def test_a_dead_first_channel_hides_nothing():
+def test_a_dead_first_channel_does_not_matter():
     network = small("posenet")
     torch.nn.init.zeros_(network.encoder.stages[6][0][0].weight[0])
     assert effective(network, torch.rand(1, 15, 128, 416)).coverage > 0.5

@@ -1,4 +1,4 @@
-"""Weights handed from one variant of a network to another."""
+"""Weights transferred from one variant of a network to another."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def made(name: str, width: float = 0.25, seed: int = 0) -> torch.nn.Module:
         ("erf-posenet-dfc", "posenet"),
     ],
 )
-def test_a_network_at_rest_says_the_same_in_another_variant(first: str, second: str):
+def test_a_network_with_zero_offsets_has_the_same_output_in_another_variant(first: str, second: str):
     trained, fresh = made(first), made(second, seed=1)
     for key, value in trained.named_parameters():
         if key.endswith(".bias"):
@@ -34,13 +34,13 @@ def test_a_network_at_rest_says_the_same_in_another_variant(first: str, second: 
 
 
 @pytest.mark.parametrize("name", ["erf-depthnet-dfcv2", "erf-posenet-dfc"])
-def test_twice_the_width_says_nearly_the_same_and_learns_apart(name: str):
+def test_twice_the_width_has_nearly_the_same_output_and_different_gradients(name: str):
     trained, wide = made(name), made(name, width=0.5, seed=1)
     take_over(wide, trained.state_dict())
     image = torch.rand(1, 3, 64, 96)
     seen = (image,) if "depth" in name else (image, [image.flip(3), image.flip(2), image, image * 0.5])
-    said, wanted = wide(*seen), trained(*seen)
-    assert (said - wanted).norm() < 0.1 * wanted.norm()
+    widened, wanted = wide(*seen), trained(*seen)
+    assert (widened - wanted).norm() < 0.1 * wanted.norm()
     weights = wide.state_dict().items()
     kernels = [value for key, value in weights if "encoder" in key and value.dim() == 4 and value.any()]
     assert kernels and all((kernel[0] != kernel[1]).any() for kernel in kernels)

@@ -1,4 +1,4 @@
-"""``camera.yaml``: what it says, and what is said of one that cannot be right."""
+"""``camera.yaml``: its keys, and the errors of implausible values."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_impossible_cameras_are_refused_in_one_line(
         ("fx: 30", "fx: 32", ""),
     ],
 )
-def test_unlikely_cameras_are_warned_of_once(
+def test_unlikely_cameras_are_logged_once(
     tmp_path: Path, camera_yaml: str, caplog: pytest.LogCaptureFixture, old: str, new: str, warning: str
 ) -> None:
     with caplog.at_level(logging.WARNING):

@@ -24,7 +24,7 @@ def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
-def test_grey_and_deep_images_become_three_channels(tmp_path: Path, dtype: type, value: int) -> None:
+def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: type, value: int) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 6), value, dtype))
     assert (read_image(tmp_path / "a.png") == 77).all()
     assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
@@ -42,7 +42,7 @@ def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> No
     cv2.imwrite(str(path), values * 16)
     assert read_image(path).mean() > 100
     cv2.imwrite(str(path), np.zeros_like(values))
-    assert read_image(path).max() == 0, "a black image is what it says"
+    assert read_image(path).max() == 0, "a black image is accepted"
 
 
 def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float, read
         read(path)
 
 
-def test_a_preallocated_copy_that_broke_off(tmp_path: Path) -> None:
+def test_an_interrupted_preallocated_copy(tmp_path: Path) -> None:
     """A copy that fills the file's length first leaves zeros where the rest should be."""
     path = tmp_path / "a.jpg"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))

@@ -29,7 +29,7 @@ def test_lever_arm_by_hand(calibration) -> None:
     )
     T_cam0_camera = moved_to_camera(np.eye(4)[None], T_camera_cam0)[0]
     assert T_cam0_camera[0, 3] == pytest.approx(-0.0599, abs=1e-4)
-    # P itself is the judge: a point of camera 0 lands where K projects the moved point
+    # reference is P itself: it projects a point of camera 0 to where K projects the translated point
     point_cam0 = np.array([1.0, -0.5, 8.0])
     P = file.matrix("P2", (3, 4))
     by_P = P @ [*point_cam0, 1.0]
@@ -37,7 +37,7 @@ def test_lever_arm_by_hand(calibration) -> None:
     assert by_K == pytest.approx(by_P)
 
 
-def test_rig_turning_on_the_spot_moves_the_side_camera() -> None:
+def test_rotation_of_the_rig_translates_the_side_camera() -> None:
     T_camera_cam0 = se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))  # the camera is 0.5 m left of camera 0
     turn_right = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3))
     T_world_camera = moved_to_camera(np.stack([np.eye(4), turn_right]), T_camera_cam0)

@@ -33,7 +33,7 @@ def test_no_gap() -> None:
     [(5, [0, 1, 2, 3, 4], 0), (22, [0, 1, 2, 3, 4], 17), (4, [0, 1, 3, 4], 0), (6, None, None), (3, None, None)],
     ids=["one a row", "one a number from 0", "one a file", "too many", "too few"],
 )
-def test_what_lies_beside(values: int, rows: list[int] | None, skipped: int | None) -> None:
+def test_rows_of_accompanying_files(values: int, rows: list[int] | None, skipped: int | None) -> None:
     assigned = by_number(named("17", "18", "20", "21")).rows_of(values)
     assert (None if assigned is None else (assigned[0].tolist(), assigned[1])) == (
         None if rows is None else (rows, skipped)
@@ -47,7 +47,7 @@ def test_what_lies_beside(values: int, rows: list[int] | None, skipped: int | No
         (("0001", "001"), "0001.png and 001.png have the same number"),
     ],
 )
-def test_names_that_are_no_numbers(stems: tuple[str, ...], message: str) -> None:
+def test_names_without_numbers(stems: tuple[str, ...], message: str) -> None:
     with pytest.raises(DataError, match=message):
         by_number(named(*stems))
 
@@ -74,7 +74,7 @@ def test_a_gap_in_a_folder() -> None:
     assert files.file_name(3) == "frame_10.png"
 
 
-def test_a_huge_gap_costs_nothing() -> None:
+def test_a_huge_gap_takes_no_memory() -> None:
     files = by_name(named("0", "1", "2", "999999999999"))
     assert len(files) == 10**12 and files.parts() == [(0, 3), (3, 4)]
     assert isinstance(files, NumberedFiles)

@@ -1,4 +1,4 @@
-"""A pinhole's numbers under a resize, and which are no camera's."""
+"""Pinhole intrinsics under a resize, and impossible ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KITTI = Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
 
 
 @pytest.mark.parametrize("kind", [Camera, Intrinsics])
-def test_both_packages_resize_alike(kind: type[Pinhole]) -> None:
+def test_both_packages_resize_in_the_same_way(kind: type[Pinhole]) -> None:
     half = kind.of(Pinhole(100, 60, 80.0, 82.0, 49.5, 29.5)).resized(50, 30)
     assert type(half) is kind
     assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (50, 30, 40, 41, 24.5, 14.5)
@@ -33,7 +33,7 @@ def test_both_packages_resize_alike(kind: type[Pinhole]) -> None:
     ],
     ids=["KITTI", "telephoto", "fisheye", "upright"],
 )
-def test_real_cameras_pass_without_a_word(camera: Pinhole, caplog: pytest.LogCaptureFixture) -> None:
+def test_real_cameras_pass_without_a_warning(camera: Pinhole, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         require_plausible(camera, "here")
     assert impossible(camera) is None and not caplog.records

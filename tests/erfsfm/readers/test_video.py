@@ -54,7 +54,7 @@ def test_uncounted_video(tmp_path: Path) -> None:
         assert decoded(frames.read(index)) == index
 
 
-def test_a_seek_that_lands_elsewhere_is_noticed(tmp_path: Path) -> None:
+def test_a_seek_to_another_frame_is_detected(tmp_path: Path) -> None:
     frames = VideoFrames(write_video(tmp_path / "a.avi"))
     frames._times_ms = [time + 1 for time in frames._times_ms]
     assert decoded(frames.read(50)) == 50

@@ -29,7 +29,7 @@ def test_formats(tmp_path, rows, kind, start):
     assert (tmp_path / f"field.{kind}").read_bytes().startswith(start)
 
 
-def test_a_network_that_reads_nothing(tmp_path, rows):
+def test_a_network_with_an_empty_field(tmp_path, rows):
     rows[0].weighed.gradient.zero_()
     draw_fields(rows[:1], np.zeros_like(SNIPPET[2]), tmp_path / "field.png")
     assert (tmp_path / "field.png").stat().st_size > 0

@@ -17,7 +17,7 @@ def by_name(names, **options):
     }
 
 
-def test_the_papers_dilated_network_stands_beside_ours():
+def test_the_papers_dilated_network_follows_ours():
     rows = by_name(["posenet", "erf-posenet-dilated"])
     assert list(rows) == [("posenet", "default"), ("erf-posenet-dilated", "default"), ("erf-posenet-dilated", "paper")]
     paper, ours = rows["erf-posenet-dilated", "paper"].summary(), rows["erf-posenet-dilated", "default"].summary()
@@ -28,7 +28,7 @@ def test_the_papers_dilated_network_stands_beside_ours():
     assert paper["effective_share_95"] <= paper["share"]
 
 
-def test_the_comb_is_every_second_row_and_column():
+def test_the_papers_dilated_network_reads_every_second_row_and_column():
     (row,) = measure_fields(["erf-posenet-dilated"], "paper", SNIPPET)
     read = row.seen.gradient > 0
     rows, columns = read.nonzero(as_tuple=True)
@@ -36,14 +36,14 @@ def test_the_comb_is_every_second_row_and_column():
 
 
 @pytest.mark.parametrize(
-    "name, side, columns, share", [("erf-posenet-dfc", 511, 415, 0.998), ("posenet", 263, 263, 0.632)]
+    "name, side, columns, fraction", [("erf-posenet-dfc", 511, 415, 0.998), ("posenet", 263, 263, 0.632)]
 )
-def test_pushed_taps(name, side, columns, share):
+def test_pushed_taps(name, side, columns, fraction):
     summary = by_name([name])[name, "default"].summary()
     assert (summary["theoretical_px"], summary["theoretical_at_rest_px"]) == (side, 263)
     assert summary["offsets_px"] == (1.0 if "dfc" in name else 0.0)
     assert summary["columns"] == columns
-    assert summary["share"] == pytest.approx(share, abs=6e-4)
+    assert summary["share"] == pytest.approx(fraction, abs=6e-4)
 
 
 @pytest.mark.parametrize("sources", [2, 4])

@@ -36,7 +36,7 @@ def test_depth_of_a_street_is_within_a_tenth_up_to_scale(street, measured):
     assert np.median(scales) == pytest.approx(street.camera_height_m, rel=0.12)
 
 
-def test_motion_is_right_in_turn_direction_and_relative_length(street, measured):
+def test_motion_is_right_in_rotation_direction_and_relative_length(street, measured):
     for index, seen in measured.items():
         sources = [index + k for k in (-2, -1, 1, 2)]
         true = np.linalg.inv(street.T_world_camera[sources]) @ street.T_world_camera[index]
@@ -46,14 +46,14 @@ def test_motion_is_right_in_turn_direction_and_relative_length(street, measured)
         assert np.ptp(lengths) / lengths.mean() < 0.1
 
 
-def test_a_camera_at_rest_has_not_moved_and_bounds_nothing(street):
+def test_a_camera_at_rest_has_no_motion_and_no_depth_bounds(street):
     image = street.render(0).image
     seen = measure_structure([image] * 5, street.K.astype(np.float32))
     np.testing.assert_array_equal(seen.T_source_target, np.tile(np.eye(4), (4, 1, 1)))
     assert not seen.least.any() and np.isinf(seen.most).all()
 
 
-def test_a_blank_wall_says_nothing(street):
+def test_a_blank_wall_gives_no_measurement(street):
     blank = np.full((128, 416, 3), 127, np.uint8)
     noise = np.random.default_rng(0).integers(0, 255, (128, 416, 3), dtype=np.uint8)
     assert two_view(blank[..., 0], noise[..., 0], street.K.astype(np.float32), fine=False) is None
@@ -72,7 +72,7 @@ def test_height_over_a_known_plane_with_a_car_on_it():
     assert plane is not None and 1 / np.linalg.norm(plane) == pytest.approx(1.6, rel=0.01)
 
 
-def test_the_road_is_known_where_nothing_was_measured_but_not_under_a_car():
+def test_the_road_is_filled_where_nothing_was_measured_but_not_under_a_car():
     K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
     p = rays(128, 416, K)
     road = (p @ np.array([0, 1, 0]) / 1.6).astype(np.float32)
@@ -92,7 +92,7 @@ def test_no_road_in_a_wall():
     assert road_plane(wall, wall > 0, rays(128, 416, K), np.array([0.0, 0, 1])) is None
 
 
-def test_the_cache_measures_once_and_mends_a_broken_entry(street, tmp_path, monkeypatch):
+def test_the_cache_measures_once_and_replaces_a_damaged_entry(street, tmp_path, monkeypatch):
     images = [street.render(k).image for k in (10, 11, 12)]
     K = street.K.astype(np.float32)
     fresh = StructureCache(tmp_path).structure(images, K)
@@ -107,7 +107,7 @@ def test_the_cache_measures_once_and_mends_a_broken_entry(street, tmp_path, monk
     assert len(entry.read_bytes()) > 1000
 
 
-def test_a_car_that_drives_along_is_no_hole_in_the_road():
+def test_a_car_at_the_cameras_speed_gets_no_far_depth():
     """Ahead at our own speed it does not move in the image, as if it were infinitely far."""
     K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1]], np.float32)
     road = (rays(128, 416, K) @ np.array([0, 1, 0]) / 1.6).astype(np.float32)

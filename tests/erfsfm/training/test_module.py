@@ -6,7 +6,7 @@ from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.training.module import SelfSupervision
 
 
-def test_what_predicts_offsets_learns_at_its_own_rate():
+def test_offset_predictors_have_their_own_learning_rate():
     network = NetworkConfig(depth="erf-depthnet-dfcv2", pose="erf-posenet-dfc", depth_width=0.25, pose_width=0.25)
     module = SelfSupervision(
         ExperimentConfig(network=network, training=TrainingConfig(learning_rate=1e-3, offset_rate=0.1))
@@ -36,7 +36,7 @@ def test_muon_takes_every_parameter_once_and_kernels_at_their_own_rate():
     assert id(layer.offset.weight) not in kernels and id(layer.kernel.weight) in kernels
 
 
-def test_a_pose_network_that_does_not_learn_stays_as_it_is_also_its_norms():
+def test_an_untrained_pose_network_keeps_its_weights_and_norm_statistics():
     network = NetworkConfig(
         depth="depthnet", pose="posenet", depth_width=0.0625, pose_width=0.125, normalisation="batch", sources=2
     )

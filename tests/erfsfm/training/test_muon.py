@@ -33,7 +33,7 @@ def test_other_parameters_follow_adam() -> None:
     assert torch.allclose(ours, theirs, atol=1e-6)
 
 
-def test_a_kernels_step_has_the_size_asked_for_whatever_the_gradients() -> None:
+def test_the_step_size_of_a_kernel_does_not_depend_on_the_gradients() -> None:
     torch.manual_seed(2)
     for scale in (1e-6, 1.0, 1e6):
         kernel = nn.Parameter(torch.zeros(8, 4, 3, 3))
@@ -42,7 +42,7 @@ def test_a_kernels_step_has_the_size_asked_for_whatever_the_gradients() -> None:
         assert 0.5 * 0.02 < float(kernel.detach().square().mean().sqrt()) < 1.3 * 0.02
 
 
-def test_a_saved_state_goes_on_bit_for_bit() -> None:
+def test_a_restored_state_continues_bit_for_bit() -> None:
     def steps(parameters: list[nn.Parameter], optimiser: Muon, first: int, last: int) -> None:
         for seed in range(first, last):
             torch.manual_seed(seed)

@@ -59,7 +59,7 @@ class FixedPose(nn.Module):
 
 
 def true_poses() -> Tensor:
-    """``T_source_target`` of cameras that do not turn: minus their places."""
+    """``T_source_target`` of cameras that do not rotate: minus their positions."""
     return torch.tensor([[*(-np.array(place)), 0, 0, 0] for place in PLACES], dtype=torch.float64)
 
 
@@ -79,32 +79,34 @@ def batch(plane) -> SnippetBatch:
     return SnippetBatch(target, sources, torch.from_numpy(plane.camera.K)[None].double().expand(2, 3, 3))
 
 
-def judge(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> ObjectiveResult:
+def evaluate(batch: SnippetBatch, config: ExperimentConfig, disparity: float, vectors: Tensor) -> ObjectiveResult:
     depth_net, pose_net = FixedDepth(disparity).requires_grad_(False), FixedPose(vectors).requires_grad_(False)
     return evaluate_objective(depth_net, pose_net, batch, config)
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.85])
-def test_truth_is_best(batch: SnippetBatch, plane, reduction: str, ssim_weight: float) -> None:
+def test_the_true_depth_and_motion_have_the_least_loss(
+    batch: SnippetBatch, plane, reduction: str, ssim_weight: float
+) -> None:
     config = experiment(reduction=reduction, ssim_weight=ssim_weight, scales=2)
-    truth = float(judge(batch, config, 1 / plane.distance, true_poses()).total)
+    truth = float(evaluate(batch, config, 1 / plane.distance, true_poses()).total)
     assert 0 <= truth < 0.02
     turned = true_poses()
     turned[:, 4] = 0.05
     wrong = {
-        "too near": judge(batch, config, 1.4 / plane.distance, true_poses()),
-        "too far": judge(batch, config, 0.6 / plane.distance, true_poses()),
-        "backwards": judge(batch, config, 1 / plane.distance, -true_poses()),
-        "turned": judge(batch, config, 1 / plane.distance, turned),
-        "swapped": judge(batch, config, 1 / plane.distance, true_poses().flip(0)),
+        "too near": evaluate(batch, config, 1.4 / plane.distance, true_poses()),
+        "too far": evaluate(batch, config, 0.6 / plane.distance, true_poses()),
+        "backwards": evaluate(batch, config, 1 / plane.distance, -true_poses()),
+        "turned": evaluate(batch, config, 1 / plane.distance, turned),
+        "swapped": evaluate(batch, config, 1 / plane.distance, true_poses().flip(0)),
     }
     for name, outcome in wrong.items():
         assert float(outcome.total) > 2 * truth, name
 
 
-def test_what_it_returns(batch: SnippetBatch, plane) -> None:
-    outcome = judge(batch, experiment(), 1 / plane.distance, true_poses())
+def test_shapes_of_the_result(batch: SnippetBatch, plane) -> None:
+    outcome = evaluate(batch, experiment(), 1 / plane.distance, true_poses())
     assert outcome.total.shape == ()
     assert set(outcome.terms) == {"photometric", "smoothness"}
     assert outcome.T_source_target.shape == (2, 2, 4, 4)
@@ -114,7 +116,7 @@ def test_what_it_returns(batch: SnippetBatch, plane) -> None:
     assert float(inner.max()) < 0.03, "warped[:, k] is source k seen from the target"
 
 
-def test_networks_see_what_is_shown_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane) -> None:
+def test_networks_get_the_weather_and_the_error_is_of_the_clear_images(batch: SnippetBatch, plane) -> None:
     seen: list[Tensor] = []
 
     class Watching(FixedDepth):
@@ -128,7 +130,7 @@ def test_networks_see_what_is_shown_and_the_error_is_of_the_clear_images(batch: 
             return super().forward(target, sources)
 
     shown = torch.rand(2, 3, 3, 64, 96, dtype=torch.float64)
-    clear = judge(batch, experiment(), 1 / plane.distance, true_poses())
+    clear = evaluate(batch, experiment(), 1 / plane.distance, true_poses())
     nets = Watching(1 / plane.distance), WatchingPose(true_poses())
     wet = evaluate_objective(*nets, replace(batch, shown=shown), experiment())
     assert float(wet.total.detach()) == float(clear.total)
@@ -150,7 +152,7 @@ def test_gradient_points_towards_truth(batch: SnippetBatch, plane, reduction: st
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_every_weight_of_both_networks_learns(masks: bool) -> None:
+def test_every_weight_of_both_networks_has_a_gradient(masks: bool) -> None:
     config = ExperimentConfig.model_validate(
         {
             "network": {"sources": 2, "masks": masks, "depth_width": 0.0625, "pose_width": 0.125},
@@ -244,30 +246,30 @@ def test_smoothness_halves_from_scale_to_scale() -> None:
 
 @pytest.mark.parametrize("smoothness", ["depth-second-order", "disparity-second-order", "disparity-edge-aware"])
 def test_a_flat_depth_is_smooth(batch: SnippetBatch, plane, smoothness: str) -> None:
-    outcome = judge(batch, experiment(smoothness=smoothness, smoothness_weight=1.0), 0.25, true_poses())
+    outcome = evaluate(batch, experiment(smoothness=smoothness, smoothness_weight=1.0), 0.25, true_poses())
     assert float(outcome.terms["smoothness"]) == pytest.approx(0, abs=1e-12)
 
 
 def test_minimum_is_at_most_the_mean_of_the_sources(batch: SnippetBatch) -> None:
     """Where everything is visible: no motion, so that the sources themselves are compared."""
     vectors = torch.zeros(2, 6).double()
-    minimum = judge(batch, experiment(reduction="minimum"), 0.25, vectors)
-    mean = judge(batch, experiment(reduction="mean"), 0.25, vectors)
+    minimum = evaluate(batch, experiment(reduction="minimum"), 0.25, vectors)
+    mean = evaluate(batch, experiment(reduction="mean"), 0.25, vectors)
     assert 0 < float(minimum.total) <= float(mean.total) / 2
 
 
-def test_minimum_forgives_an_occluded_source(batch: SnippetBatch, plane) -> None:
+def test_minimum_tolerates_an_occluded_source(batch: SnippetBatch, plane) -> None:
     sources = batch.sources.clone()
     sources[:, 0, :, 20:40, 30:60] = 0
     hidden = SnippetBatch(batch.target, sources, batch.K)
     for reduction, forgives in (("minimum", True), ("mean", False)):
         config = experiment(reduction=reduction, scales=1)
-        clear = float(judge(batch, config, 1 / plane.distance, true_poses()).total)
-        covered = float(judge(hidden, config, 1 / plane.distance, true_poses()).total)
+        clear = float(evaluate(batch, config, 1 / plane.distance, true_poses()).total)
+        covered = float(evaluate(hidden, config, 1 / plane.distance, true_poses()).total)
         assert (covered < 1.5 * clear) is forgives
 
 
-def test_nothing_visible_costs_nothing(batch: SnippetBatch) -> None:
+def test_no_visible_points_no_loss(batch: SnippetBatch) -> None:
     """All points behind both sources: no error, and gradients that are numbers."""
     vectors = torch.tensor([[0, 0, -100.0, 0, 0, 0]] * 2).double()
     for reduction in ("minimum", "mean"):
@@ -283,9 +285,9 @@ def test_nothing_visible_costs_nothing(batch: SnippetBatch) -> None:
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
 def test_auto_mask_ignores_a_still_world(batch: SnippetBatch, reduction: str) -> None:
     still = SnippetBatch(batch.target, batch.target[:, None].expand_as(batch.sources), batch.K)
-    masked = judge(still, experiment(reduction=reduction, auto_mask=True), 0.25, true_poses())
+    masked = evaluate(still, experiment(reduction=reduction, auto_mask=True), 0.25, true_poses())
     assert float(masked.total) == 0
-    assert float(judge(still, experiment(reduction=reduction), 0.25, true_poses()).total) > 0.01
+    assert float(evaluate(still, experiment(reduction=reduction), 0.25, true_poses()).total) > 0.01
 
 
 @pytest.mark.parametrize("reduction", ["mean", "minimum"])
@@ -298,14 +300,14 @@ def test_auto_mask_keeps_what_moves(batch: SnippetBatch, plane, reduction: str) 
     depth_net = FixedDepth(1.1 / plane.distance)
     evaluate_objective(depth_net, FixedPose(true_poses()), half_still, config).total.backward()
     assert depth_net.disparity.grad is not None
-    assert float(depth_net.disparity.grad) > 0, "the moving half still says: further away"
-    plain = judge(half_still, experiment(reduction=reduction, scales=1), 1 / plane.distance, true_poses())
-    masked = judge(half_still, config, 1 / plane.distance, true_poses())
-    assert float(masked.total) < 0.3 * float(plain.total), "the still half no longer disturbs the truth"
+    assert float(depth_net.disparity.grad) > 0, "the moving half still gives a gradient towards larger depth"
+    plain = evaluate(half_still, experiment(reduction=reduction, scales=1), 1 / plane.distance, true_poses())
+    masked = evaluate(half_still, config, 1 / plane.distance, true_poses())
+    assert float(masked.total) < 0.3 * float(plain.total), "the still half adds no error at the true depth"
 
 
-def test_masks_weigh_the_error_and_are_held_up(batch: SnippetBatch) -> None:
-    plain = float(judge(batch, experiment(), 0.3, true_poses()).total)
+def test_masks_weigh_the_error_and_are_regularised_towards_one(batch: SnippetBatch) -> None:
+    plain = float(evaluate(batch, experiment(), 0.3, true_poses()).total)
     config = experiment(masks=True, mask_weight=0.1)
     depth_net, pose_net = FixedDepth(0.3), FixedPose(true_poses(), mask=0.5)
     with torch.no_grad():
@@ -324,17 +326,17 @@ def test_consistency_by_hand(batch: SnippetBatch, plane) -> None:
     """One depth d for all frames contradicts a motion of z along the axis by |z| / (2 d - z)."""
     d = plane.distance
     config = experiment(consistency_weight=2.0)
-    outcome = judge(batch, config, 1 / d, true_poses())
+    outcome = evaluate(batch, config, 1 / d, true_poses())
     before, after = (-place[2] for place in PLACES)  # t_z of T_source_target
     expected = (abs(before) / (2 * d + before) + abs(after) / (2 * d + after)) / 2
     assert float(outcome.terms["consistency"]) == pytest.approx(expected, rel=1e-6)
     assert float(outcome.total) == pytest.approx(float(outcome.terms["photometric"]) + 2 * expected, rel=1e-6)
     sideways = true_poses() * torch.tensor([1, 1, 0, 0, 0, 0])
-    assert float(judge(batch, config, 1 / d, sideways).terms["consistency"]) == pytest.approx(0, abs=1e-9)
+    assert float(evaluate(batch, config, 1 / d, sideways).terms["consistency"]) == pytest.approx(0, abs=1e-9)
 
 
 def test_consistency_pairs_each_source_with_its_own_depth() -> None:
-    """Disparities that encode which image was asked: target, before, after of each sample."""
+    """Disparities that encode the input image: target, before, after of each sample."""
 
     class Labelled(nn.Module):
         def forward(self, image: Tensor) -> list[Tensor]:
@@ -367,7 +369,7 @@ def test_evaluation_mode_is_refused(batch: SnippetBatch) -> None:
         evaluate_objective(FixedDepth(0.3).eval(), FixedPose(true_poses()), batch, experiment())
 
 
-def test_a_teacher_that_tells_the_truth_costs_nothing_and_a_wrong_one_does(batch: SnippetBatch, plane) -> None:
+def test_the_teacher_loss_is_zero_for_true_outputs_and_positive_for_wrong_ones(batch: SnippetBatch, plane) -> None:
     config = ExperimentConfig(
         loss=LossConfig(photometric_weight=0, smoothness_weight=0),
         teacher=TeacherConfig(rotation_weight=1, translation_weight=1, structure_weight=1, unit_weight=1),
@@ -375,15 +377,16 @@ def test_a_teacher_that_tells_the_truth_costs_nothing_and_a_wrong_one_does(batch
     vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
     height, width = batch.target.shape[-2:]
     half = torch.full((2, 1, height, width), 0.5).double()
-    in_heights = vectors * torch.tensor([10.0] * 3 + [1] * 3)  # the networks' unit is ten of them
+    in_heights = vectors * torch.tensor([10.0] * 3 + [1] * 3)  # the networks' unit is ten camera heights
     T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
     right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
-    outcome = judge(right, config, 0.5, vectors)
+    outcome = evaluate(right, config, 0.5, vectors)
     assert outcome.warped is None
     assert outcome.total.item() == pytest.approx(0, abs=1e-3)
     for term, vector in {"translation": vectors * 2, "rotation": -vectors}.items():
-        assert judge(right, config, 0.5, vector).terms[term].item() > 0.1
-    twice = judge(right, config, 1.0, vectors)  # all twice as near: only the unit is wrong, and translations by it
+        assert evaluate(right, config, 0.5, vector).terms[term].item() > 0.1
+    # all twice as near: a wrong unit, which translations share
+    twice = evaluate(right, config, 1.0, vectors)
     assert twice.terms["structure"].item() == pytest.approx(0, abs=1e-3)
     assert twice.terms["unit"].item() == pytest.approx(math.log(2), rel=1e-3)
-    assert judge(right, config, 1.0, vectors * torch.tensor([0.5] * 3 + [1] * 3)).terms["translation"].item() < 1e-3
+    assert evaluate(right, config, 1.0, vectors * torch.tensor([0.5] * 3 + [1] * 3)).terms["translation"].item() < 1e-3

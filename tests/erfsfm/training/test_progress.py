@@ -1,4 +1,4 @@
-"""The line on the terminal."""
+"""The progress bar."""
 
 import io
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ from rich.console import Console
 from erfsfm.training.progress import ProgressLine
 
 
-def test_the_line_counts_from_where_the_run_begins() -> None:
+def test_the_progress_bar_counts_from_the_first_step_of_the_run() -> None:
     written = io.StringIO()
     line = ProgressLine(8, Console(file=written, force_terminal=True, width=120))
     trainer: Any = SimpleNamespace(max_steps=12, global_step=5)
@@ -25,7 +25,7 @@ def test_the_line_counts_from_where_the_run_begins() -> None:
     assert "snippets/s" in text and "loss 0.1200" in text and "0:00:00" in text
 
 
-def test_an_error_leaves_the_terminal_free() -> None:
+def test_an_error_ends_the_progress_bar() -> None:
     written = io.StringIO()
     line = ProgressLine(8, Console(file=written, force_terminal=True, width=120))
     trainer: Any = SimpleNamespace(max_steps=12, global_step=0)

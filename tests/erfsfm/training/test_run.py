@@ -1,4 +1,4 @@
-"""A whole training on a toy drive: its folder, its resume, its refusals."""
+"""A whole training on a toy drive: output folder, resume, errors."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_five_frames_are_validated_by_the_snippet_protocol(small: Small, held_ou
     assert {"snippet_ate", "snippet_re"} <= metrics.keys()
 
 
-def test_a_pose_network_that_does_not_learn_is_written_as_it_came(
+def test_an_untrained_pose_network_is_written_unchanged(
     small: Small, world: Path, held_out: Path, tmp_path: Path
 ) -> None:
     small["network"]["normalisation"] = "batch"
@@ -162,7 +162,7 @@ def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
     "schedule, normalisation, optimiser",
     [("constant", "none", "adam"), ("cosine", "batch", "adam"), ("cosine", "batch", "muon")],
 )
-def test_resume_ends_with_the_very_same_weights(
+def test_resume_ends_with_identical_weights(
     small: Small,
     world: Path,
     held_out: Path,
@@ -198,10 +198,10 @@ def test_resume_ends_with_the_very_same_weights(
 
 
 @pytest.mark.parametrize("moment", ["in a step", "in the second checkpoint"])
-def test_killed_and_resumed_ends_with_the_very_same_weights(
+def test_killed_and_resumed_ends_with_identical_weights(
     small: Small, world: Path, held_out: Path, tmp_path: Path, moment: str
 ) -> None:
-    """``kill -9``: nothing is tidied up, and half a checkpoint may lie on the disk."""
+    """``kill -9``: no clean-up, and half a checkpoint may be on the disk."""
     config = configure(small, [world, held_out], training={"steps": 6, "learning_rate": 1e-3})
     train(config, tmp_path / "whole", device="cpu")
     victim = multiprocessing.get_context("fork").Process(target=die, args=(config, tmp_path / "cut", moment))
@@ -234,7 +234,7 @@ def die(config: ExperimentConfig, output: Path, moment: str) -> None:
     train(config, output, device="cpu")
 
 
-def test_a_finished_run_can_be_prolonged(small: Small, world: Path, tmp_path: Path) -> None:
+def test_a_finished_run_can_be_extended(small: Small, world: Path, tmp_path: Path) -> None:
     config = configure(small, [world])
     longer = configure(small, [world], training={"steps": 6})
     train(longer, tmp_path / "whole", device="cpu")
@@ -245,7 +245,7 @@ def test_a_finished_run_can_be_prolonged(small: Small, world: Path, tmp_path: Pa
 
 
 def test_resuming_a_finished_run_changes_nothing(small: Small, world: Path, held_out: Path, tmp_path: Path) -> None:
-    """In particular the best weights are not replaced by the last, nor their metrics forgotten."""
+    """In particular the best weights and their metrics are not replaced by the last."""
     config = configure(small, [world, held_out], training={"learning_rate": 3.0, "gradient_clip": 1.0})
     output = train(config, tmp_path / "run", device="cpu")
     shutil.copytree(output, tmp_path / "before")
@@ -254,17 +254,17 @@ def test_resuming_a_finished_run_changes_nothing(small: Small, world: Path, held
     assert load_model(output).record.metrics == load_model(tmp_path / "before").record.metrics != {}
 
 
-def test_the_best_stays_on_top(
+def test_the_best_weights_stay_in_the_output_folder(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quality = iter([0.3, 0.2, 0.5, float("nan")])
     original = SelfSupervision.on_validation_epoch_end
 
-    def pretend(self: SelfSupervision) -> None:
+    def scripted_validation(self: SelfSupervision) -> None:
         original(self)
         self.validation_metrics["abs_rel"] = next(quality)
 
-    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", pretend)
+    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", scripted_validation)
     config = configure(small, [world, held_out], training={"steps": 4, "validate_every": 1})
     output = train(config, tmp_path / "run", device="cpu")
     assert load_model(output).record.step == 2
@@ -272,7 +272,7 @@ def test_the_best_stays_on_top(
     assert load_model(output / "last").record.step == 4
 
 
-def pretend(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> None:
+def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> None:
     """Let the k-th validation of the run, counted by its steps, measure the k-th value."""
     original = SelfSupervision.on_validation_epoch_end
 
@@ -286,8 +286,8 @@ def pretend(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> 
 def test_best_depth_and_best_pose_are_kept_apart(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pretend(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4])
-    pretend(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
+    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4])
+    scripted_validation(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
     config = configure(small, [world, held_out], training={"validate_every": 1})
     output = train(config, tmp_path / "run", device="cpu")
     steps = {name: load_model(output / name).record.step for name in (".", "best_pose", "last")}
@@ -304,7 +304,7 @@ def test_patience_ends_a_run_also_after_a_resume(
     patience: int,
     end: int,
 ) -> None:
-    pretend(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.1, 0.4, 0.1, math.nan, 0.2])
+    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.1, 0.4, 0.1, math.nan, 0.2])
     training = {"steps": 8, "validate_every": 1, "checkpoint_every": 1, "patience": patience}
     config = configure(small, [world, held_out], training=training)
     assert load_model(train(config, tmp_path / "whole", device="cpu") / "last").record.step == end
@@ -344,7 +344,7 @@ def test_decisive(metrics: dict[str, float], measure: float) -> None:
     assert decisive(metrics) == measure
 
 
-def test_initial_weights_hand_on_their_leak_record(
+def test_initial_weights_pass_on_their_leak_record(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = train(configure(small, [world], training={"steps": 1}), tmp_path / "first", device="cpu")
@@ -376,7 +376,7 @@ def test_resume_with_other_data_keeps_the_leak_record(
     assert load_model(tmp_path / "run").record.trained_on == ["simulated/500", "kitti_odometry/00[0:10]"]
 
 
-def test_a_loss_that_is_no_number_stops_the_run(
+def test_a_non_finite_loss_stops_the_run(
     small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = SelfSupervision.training_step
@@ -397,24 +397,29 @@ def test_a_loss_that_is_no_number_stops_the_run(
     train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
 
 
-def test_weights_that_are_no_numbers_are_not_written(
+def test_non_finite_weights_are_not_written(
     small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The very last step spoils them, after which no loss is looked at."""
+    """The last step writes NaN, after which no loss is checked."""
 
-    def spoil(self: SelfSupervision, *_: object) -> None:
+    def insert_nan(self: SelfSupervision, *_: object) -> None:
         if self.global_step == 3:
             next(self.pose_net.parameters()).data.view(-1)[0] = float("nan")
 
-    monkeypatch.setattr(SelfSupervision, "on_before_optimizer_step", spoil)
+    monkeypatch.setattr(SelfSupervision, "on_before_optimizer_step", insert_nan)
     with pytest.raises(TrainingError, match=r"weights are NaN or infinite at step 4: lower training\.learning_rate"):
         train(configure(small, [world]), tmp_path / "run", device="cpu")
     assert not (tmp_path / "run" / "model.yaml").exists()
 
 
-@pytest.mark.parametrize(("spoilt", "stops"), [((1, 2, 3), True), ((0, 1, 3), False)])
+@pytest.mark.parametrize(("constant", "stops"), [((1, 2, 3), True), ((0, 1, 3), False)])
 def test_a_depth_that_stays_constant_stops_the_run(
-    small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoilt: tuple[int, ...], stops: bool
+    small: Small,
+    world: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    constant: tuple[int, ...],
+    stops: bool,
 ) -> None:
     original = SelfSupervision.training_step
 
@@ -422,7 +427,7 @@ def test_a_depth_that_stays_constant_stops_the_run(
         weights = [head.weight for head in self.depth_net.heads]
         before = [weight.detach().clone() for weight in weights]
         for weight in weights:
-            weight.data *= self.global_step not in spoilt
+            weight.data *= self.global_step not in constant
         try:
             return original(self, batch, index)
         finally:
@@ -484,12 +489,12 @@ def test_a_start_that_failed_may_be_repeated(small: Small, world: Path, tmp_path
     assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
 
 
-def test_no_validation_is_said_once(
+def test_missing_validation_is_logged_once(
     small: Small, world: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     train(configure(small, [world], training={"steps": 1}), tmp_path / "run", device="cpu")
-    said = [record.message for record in caplog.records if "validation" in record.message]
-    assert said == ["training runs without validation: no recording of data.validation is among the data"]
+    messages = [record.message for record in caplog.records if "validation" in record.message]
+    assert messages == ["training runs without validation: no recording of data.validation is among the data"]
 
 
 def test_a_failed_start_leaves_nothing(small: Small, world: Path, tmp_path: Path) -> None:
@@ -518,7 +523,7 @@ def test_resume_with_another_optimiser(cut: tuple[ExperimentConfig, Path]) -> No
         train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
 
 
-class Malice:
+class Malicious:
     """An object that runs a command when it is unpickled."""
 
     def __init__(self, mark: Path) -> None:
@@ -538,7 +543,7 @@ def refused_checkpoint(cut: tuple[ExperimentConfig, Path]) -> None:
 @pytest.mark.parametrize("kind", ["torch", "pickle"])
 def test_code_in_a_checkpoint_never_runs(cut: tuple[ExperimentConfig, Path], tmp_path: Path, kind: str) -> None:
     path = cut[1] / "checkpoints" / "last.ckpt"
-    state = torch.load(path, weights_only=True) | {"extra": Malice(tmp_path / "executed")}
+    state = torch.load(path, weights_only=True) | {"extra": Malicious(tmp_path / "executed")}
     if kind == "torch":
         torch.save(state, path)
     else:
@@ -607,7 +612,7 @@ def test_workers_start_where_opencv_has_threads(small: Small, world: Path, tmp_p
         cv2.setNumThreads(threads)
 
 
-def test_lightning_keeps_quiet(
+def test_lightning_prints_nothing(
     small: Small,
     world: Path,
     held_out: Path,

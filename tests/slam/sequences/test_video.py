@@ -7,29 +7,12 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 
-FRAMES = 90
-FORMATS = {".mp4": "mp4v", ".avi": "MJPG", ".mov": "mp4v", ".mkv": "MJPG"}
-
-
-def coded(number: int) -> np.ndarray:
-    """An image whose eight upright stripes are the bits of a number."""
-    bits = np.array([255 * (number >> bit & 1) for bit in range(8)], np.uint8)
-    return np.repeat(np.tile(np.repeat(bits, 8), (48, 1))[..., None], 3, axis=2)
-
-
-def decoded(image: np.ndarray) -> int:
-    bright = image[:, 4::8].mean(axis=(0, 2)) > 127
-    return int(sum(1 << bit for bit in range(8) if bright[bit]))
-
-
-def write_video(path: Path, frames: int = FRAMES) -> Path:
+def write_video(path: Path) -> Path:
+    """Ninety frames, each twice as bright as its number."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    fourcc = cv2.VideoWriter.fourcc(*FORMATS[path.suffix])
-    writer = cv2.VideoWriter(str(path), fourcc, 10, (64, 48))
-    if not writer.isOpened():
-        pytest.skip(f"this OpenCV cannot write {path.suffix}")
-    for k in range(frames):
-        writer.write(coded(k))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for k in range(90):
+        writer.write(np.full((48, 64, 3), 2 * k, np.uint8))
     writer.release()
     return path
 
@@ -45,7 +28,7 @@ def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
     (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
     sequence = open_sequence(tmp_path / "trip" if by_folder else path, None, None, "10:20")
     assert (sequence.name, len(sequence)) == ("drive", 10)
-    assert decoded(sequence.frame(2).image) == 12
+    assert sequence.frame(2).image.mean() == pytest.approx(24, abs=1)
     assert sequence.stamps[0] == pytest.approx(2.0)
     assert sequence.provenance() == ("folder/trip[10:20]",)
 

@@ -1,4 +1,4 @@
-"""The result of a measurement that could not be made."""
+"""The result of a measurement that failed."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def test_another_length_keeps_rotation_and_direction() -> None:
 
 
 def test_a_motion_without_separate_direction_noise_accepts_no_other_length() -> None:
-    with pytest.raises(ValueError, match="by pnp has no direction"):
+    with pytest.raises(ValueError, match="by pnp has no separate noise"):
         motion_by_points().with_length(1.0, 0.03, 0.09, NO_NOISE)
 
 

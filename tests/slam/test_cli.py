@@ -239,7 +239,7 @@ def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
     code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
-    assert code == 0 and re.search(r"^BRIDGED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
+    assert code == 0 and re.search(r"^INTERPOLATED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
 
 
 def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:

@@ -238,7 +238,7 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
     first = live(kitti_root)
     feed(first, kitti_root, range(6))
     first.save(tmp_path / "drive.zip")
-    with pytest.raises(SlamError, match="before the first frame; 6 came already"):
+    with pytest.raises(SlamError, match="before the first frame; there are 6 already"):
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")

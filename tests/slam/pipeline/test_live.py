@@ -102,11 +102,11 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
             slam.add_frame(image, stamp)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
-    with pytest.raises(SlamError, match="reference wants a whole sequence"):
+    with pytest.raises(SlamError, match="reference needs a whole sequence"):
         started(load_config(None, ["scale.mode=reference"]))
-    with pytest.raises(SlamError, match=r"lidar\.factors=true wants a whole sequence"):
+    with pytest.raises(SlamError, match=r"lidar\.factors=true needs a whole sequence"):
         started(load_config(None, ["lidar.factors=true"]))
-    with pytest.raises(SlamError, match="wants camera_height_m"):
+    with pytest.raises(SlamError, match="needs camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
 
 

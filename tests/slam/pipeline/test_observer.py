@@ -150,7 +150,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
     seen = result.observations
     assert set(seen.interpolated) == set(BAD)
-    assert warnings.count("bridged by interpolation") == warnings.count("frames 25 to 34 bridged by interpolation") == 1
+    assert warnings.count("are interpolated") == warnings.count("frames 25 to 34 are interpolated") == 1
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
     assert [factor.from_index for factor in interpolated] == list(range(24, 35))
     assert min(factor.sigmas[0] for factor in interpolated) > 5 * np.deg2rad(0.3)

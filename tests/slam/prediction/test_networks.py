@@ -204,5 +204,5 @@ def test_a_full_disk_ends_the_caching_and_not_the_run(
     monkeypatch.setattr(Path, "write_bytes", full)
     for frame in frames(0):
         predictor.depth(frame)
-    assert networks.asked == 5 and caplog.text.count("keeps nothing more") == 1
+    assert networks.asked == 5 and caplog.text.count("is not written any more") == 1
     assert entries(tmp_path) == []

@@ -36,7 +36,7 @@ def export(folder: RunFolder, what: str, output: Path, up: str) -> Path:
             ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o) or ``colmap`` (a model in text form).
         output: the file; for ``colmap`` the folder.
         up: ``y-down`` as the run has it, or ``z``: x right, y ahead, z up. A trajectory's cameras keep
-            their own axes, only the world is turned.
+            their own axes, only the world is rotated.
 
     Returns:
         What was written.

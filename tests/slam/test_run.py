@@ -180,8 +180,8 @@ def test_however_a_run_ends_its_folder_has_the_reason(
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
     metrics = RunFolder.open(tmp_path / "ended").metrics()
-    told = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
-    wanted = told.get(type(error).__name__, type(error).__name__)
+    known = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
+    wanted = known.get(type(error).__name__, type(error).__name__)
     assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
 
 
@@ -200,9 +200,9 @@ def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -
 
 
 def test_progress_is_reported(quick: dict[str, Any]) -> None:
-    told: list[tuple[str, int, int]] = []
-    run_slam(**quick, progress=lambda *words: told.append(words))
-    assert told == [("frames", k, 6) for k in range(1, 7)]
+    calls: list[tuple[str, int, int]] = []
+    run_slam(**quick, progress=lambda *words: calls.append(words))
+    assert calls == [("frames", k, 6) for k in range(1, 7)]
 
 
 def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:

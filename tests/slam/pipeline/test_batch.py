@@ -248,8 +248,8 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
     result = run(still, *options, noise=noise)
     assert {factor.source for factor in result.observations.steps.relative_poses} == {STILL_SOURCE}
-    turned = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
-    assert turned[1] < 0.3 * turned[0]
+    rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
+    assert rotation[1] < 0.3 * rotation[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
@@ -300,9 +300,9 @@ def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
 
 
 def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
-    told: list[tuple[str, int, int]] = []
-    result = drive_street(street, lambda *words: told.append(words))
-    assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
+    calls: list[tuple[str, int, int]] = []
+    result = drive_street(street, lambda *words: calls.append(words))
+    assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
     seen = result.observations
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     measured = {first for first, _ in seen.steps.motions}

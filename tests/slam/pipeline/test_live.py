@@ -52,7 +52,7 @@ def feed(slam: Slam, first: int, stop: int) -> None:
 
 
 def test_incremental_and_batch_agree_after_the_same_loops() -> None:
-    """To 0.1 % of the path, whatever the graph held on the way."""
+    """To 0.1 % of the path, whatever the graph held in between."""
     config = load_config(None, SETTINGS)
     slam = started(config, update_frames=25, sweep_frames=125)
     feed(slam, 0, FRAMES)
@@ -76,8 +76,8 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         feed(slam, len(slam), count)
         T_world_camera = slam.trajectory().T_world_camera
         assert T_world_camera.shape == (count, 4, 4)
-        way = np.linalg.norm(T_world_camera[-1, :3, 3])
-        assert way == 0.0 if count < 5 else 0.5 * count < way < 1.5 * count
+        distance = np.linalg.norm(T_world_camera[-1, :3, 3])
+        assert distance == 0.0 if count < 5 else 0.5 * count < distance < 1.5 * count
 
 
 def test_blank_frames_are_interpolated() -> None:

@@ -76,7 +76,7 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
     assert poses.residuals is not None and poses.residuals.shape == (4,) and (poses.residuals > 0).all()
 
 
-def test_two_predictors_do_not_share_what_a_frame_keeps_for_each() -> None:
+def test_two_predictors_have_separate_outputs_cached_in_a_frame() -> None:
     one, other = (NetworkPredictor(Counting(gain), CAMERA) for gain in (1, 2))
     (frame,) = frames(0, 1)
     np.testing.assert_allclose(one.depth(frame), 2 * other.depth(frame), rtol=1e-6)
@@ -96,7 +96,7 @@ class Answered(NamedTuple):
 
 
 class Counting:
-    """Networks whose answers follow from the images by a formula; they count how often they are asked."""
+    """Networks whose outputs are a formula of the images; they count their calls."""
 
     sources = 4
 

@@ -52,7 +52,7 @@ class MapCloud:
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """Size of a map, and how many frames went into it or were left out because it was full."""
+    """Size of a map, and numbers of frames fused and left out of a full map."""
 
     triangles: int
     points: int

@@ -87,8 +87,8 @@ class PlaceIndex:
         if not len(self._words) or not len(view):
             return []
         word = nearest_words(view.descriptors, self._words)
-        asked = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
-        scores = (self._weights @ asked.T).toarray().ravel()
+        query = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
+        scores = (self._weights @ query.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
 

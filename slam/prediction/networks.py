@@ -76,10 +76,10 @@ class NetworkPredictor:
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
 
-        def ask() -> Answer:
+        def compute() -> Answer:
             return (self._networks.poses([self._prepared(frame) for frame in frames]),)
 
-        (T_source_target,) = self._answers("poses", frames, ask)
+        (T_source_target,) = self._answers("poses", frames, compute)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
@@ -99,10 +99,10 @@ class NetworkPredictor:
         return residuals
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
-        def ask() -> Answer:
+        def compute() -> Answer:
             return (self._networks.disparity(self._prepared(frame)),)
 
-        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], ask)[0])
+        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], compute)[0])
 
     def _prepared(self, frame: Frame) -> Any:
         return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))

@@ -96,7 +96,7 @@ def _export_colmap(folder: RunFolder, output: Path, up: str) -> None:
 
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
-    """The optimised trajectory in the axes asked for."""
+    """The optimised trajectory in the given axes."""
     folder.require("trajectory_optimised.tum.txt")
     trajectory = folder.trajectory("optimised")
     if trajectory is None:

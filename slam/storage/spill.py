@@ -13,7 +13,7 @@ from slam.errors import SlamError
 
 
 class SpillFile:
-    """An unnamed temporary file; the operating system removes it when the process ends, in any way."""
+    """An unnamed temporary file; the operating system removes it when the process ends."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object

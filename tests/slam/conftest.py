@@ -71,8 +71,8 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
     numbers = {"network": 6.21, "odometry": 2.43, "optimised": 0.87}
     trajectories: dict[str, Any] = {k: errors_of(v) if reference else unknown for k, v in numbers.items()}
     if reference:
-        for way in trajectories["odometry"]["align"].values():
-            way |= {"t_rel_percent": None, "t_rel_percent_reason": "no segment of 100 m was left"}
+        for alignment in trajectories["odometry"]["align"].values():
+            alignment |= {"t_rel_percent": None, "t_rel_percent_reason": "no segment of 100 m was left"}
     trajectories |= {"lidar": None, "lidar_reason": "the sequence has no LiDAR scans"}
     return {
         "schema": 1,

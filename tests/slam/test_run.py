@@ -225,8 +225,8 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
 def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
     kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def asked(*_: object, **__: object) -> None:
-        raise AssertionError("a network was asked, or an image measured")
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("a network was run, or an image measured")
 
     def run(name: str, *overrides: str, cache: Path | None = tmp_path / "cache") -> RunFolder:
         given = [NO_REPORT, *overrides]
@@ -234,9 +234,9 @@ def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
 
     plain, cold = run("plain", cache=None), run("cold")
     for name in ("disparity", "poses"):
-        monkeypatch.setattr(slam.run.DepthPosePredictor, name, asked)
+        monkeypatch.setattr(slam.run.DepthPosePredictor, name, forbidden)
     for name in ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat", "remap"):
-        monkeypatch.setattr(cv2, name, asked)
+        monkeypatch.setattr(cv2, name, forbidden)
     warm = run("warm")
     names = sorted(path.name for path in plain.path.iterdir())
     assert names == sorted(path.name for path in warm.path.iterdir())

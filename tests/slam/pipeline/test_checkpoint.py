@@ -122,7 +122,7 @@ def test_without_kept_keyframes_the_map_begins_at_the_checkpoint(
     assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
-def test_graph_mapping_and_output_may_be_configured_anew(go_on: Callable[..., RunFolder]) -> None:
+def test_graph_mapping_and_output_may_be_changed(go_on: Callable[..., RunFolder]) -> None:
     continued = go_on(overrides=["pose_graph.kernel=none", "mapping.enabled=false", "output.keep=nothing"])
     config = load_config(continued.path / "config.yaml")
     assert (config.pose_graph.kernel, config.output.keep) == ("none", "nothing")

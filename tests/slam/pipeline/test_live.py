@@ -181,7 +181,7 @@ def test_a_failure_at_the_last_frame_is_raised_once() -> None:
         assert len(slam.trajectory()) == len(slam) == 9
 
 
-def test_a_closed_session_has_no_threads_and_still_answers(tmp_path: Path) -> None:
+def test_a_closed_session_has_no_threads_and_keeps_its_results(tmp_path: Path) -> None:
     before = set(threading.enumerate())
     config = load_config(None, [*SETTINGS, "geometry.enabled=true"])
     with started(config) as slam, started(config) as other:

@@ -36,7 +36,7 @@ def again(asked: Sequence[Frame]) -> list[Frame]:
     return [Frame(frame.index, frame.stamp, frame.image.copy()) for frame in asked]
 
 
-def test_answers_by_frame_what_the_networks_answer_by_image(direct: DepthPosePredictor) -> None:
+def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
     predictor: Predictor = NetworkPredictor(direct, CAMERA)
     snippet = frames(10)
     depth = predictor.depth(snippet[0])
@@ -130,7 +130,7 @@ def entries(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def test_a_second_run_reads_every_answer_and_gets_the_same(tmp_path: Path) -> None:
+def test_a_second_run_reads_every_output_from_the_cache(tmp_path: Path) -> None:
     networks, snippet = Counting(), frames(0)
     first, namespace = cached(networks, tmp_path)
     depth, poses = first.depth(snippet[0]), first.snippet(snippet)  # the latter wants the target's disparity too
@@ -148,7 +148,7 @@ def test_a_second_run_reads_every_answer_and_gets_the_same(tmp_path: Path) -> No
     assert networks.prepared == 0, "images whose answers are known need not be prepared"
 
 
-def test_every_difference_is_another_entry(tmp_path: Path) -> None:
+def test_any_different_input_is_another_entry(tmp_path: Path) -> None:
     networks, snippet = Counting(), frames(0)
     predictor, _ = cached(networks, tmp_path)
     predictor.depth(snippet[2])

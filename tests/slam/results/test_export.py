@@ -1,4 +1,4 @@
-"""Exports are whole files in the axes asked for."""
+"""Exports are whole files in the given axes."""
 
 from __future__ import annotations
 

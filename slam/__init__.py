@@ -10,7 +10,7 @@ __all__ = ["Slam", "run_slam"]
 
 
 def __getattr__(name: str) -> Any:
-    """Load the system when it is asked for: ``import slam`` alone stays light."""
+    """Import the system on first use: ``import slam`` alone stays light."""
     if name == "Slam":
         from slam.pipeline.live import Slam
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    rich_markup_mode=None,  # a markup would swallow <...> or [...] of the help
+    rich_markup_mode=None,  # markup would remove <...> or [...] from the help
     pretty_exceptions_enable=False,
     help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
 )
@@ -36,7 +36,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-# Verbs that once offered these two without using them still accept them, unseen.
+# Hidden options of verbs that once offered them without effect.
 UnusedDevice = Annotated[DeviceName, typer.Option("--device", hidden=True)]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
@@ -79,7 +79,7 @@ def run(
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:
-    """Trajectory, map and report of a sequence. Without options: of the embedded simulated street.
+    """Trajectory, map and report of a sequence. Without options: the embedded simulated street.
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
@@ -251,7 +251,7 @@ def config() -> None:
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
 ) -> None:
-    """What is installed, found or missing. What is missing comes with what to do.
+    """Check the installation. Missing parts come with what to do.
 
     Example: erfsfm-slam doctor --dataset /data/kitti
     """
@@ -300,7 +300,7 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     for note in unit_notes(metrics):
         typer.echo(note)
     for gap in sequence["bridged"]:
-        typer.echo(f"BRIDGED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
+        typer.echo(f"INTERPOLATED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
     typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
@@ -323,7 +323,7 @@ def _print_localisations(run_folder: RunFolder, table: Table) -> None:
 
 
 def _print_table(table: Table) -> None:
-    """As wide as the terminal; in a pipe wide enough that no cell wraps."""
+    """As wide as the terminal; in a pipe without wrapping."""
     from rich.console import Console
 
     on_terminal = sys.stdout is not None and sys.stdout.isatty()

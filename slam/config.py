@@ -87,7 +87,7 @@ class LoopsConfig(Section):
         gt=0,
         description="largest difference of the translations measured in both directions, over the depth",
     )
-    corner_sigma_widening: float = Field(default=1.25, gt=0, description="factor on the corners' own sigmas")
+    corner_sigma_widening: float = Field(default=1.25, gt=0, description="factor on the sigmas by corners")
     rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma, degrees")
     translation_floor_ratio: float = Field(default=0.0003, gt=0, description="least translation sigma over the depth")
     length_relative_sigma: float = Field(default=0.04, gt=0, description="translation sigma over the translation")
@@ -98,7 +98,7 @@ class LoopsConfig(Section):
         default=20, ge=1, description="distance of both ends within which loops must agree, frames"
     )
     min_support: int = Field(default=2, ge=0, description="least number of images with loops that support a loop")
-    alone_inliers: int = Field(default=120, ge=6, description="inliers from which on a loop needs no support")
+    alone_inliers: int = Field(default=120, ge=6, description="number of inliers from which on a loop needs no support")
     support_sigmas: float = Field(default=3.0, gt=0, description="largest difference of supporting loops, sigmas")
     support_drift_ratio: float = Field(
         default=0.1, ge=0, description="drift of the odometry between supporting loops over the path between them"
@@ -175,7 +175,7 @@ class OutputConfig(Section):
 
 
 class SlamConfig(Section):
-    """Everything that a run can be told."""
+    """All settings of a run."""
 
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()

@@ -1,4 +1,4 @@
-"""Where the configurations of SLAM lie, and the keys that earlier releases had."""
+"""Shipped SLAM configurations, and the configuration keys of earlier releases."""
 
 from __future__ import annotations
 

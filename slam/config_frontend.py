@@ -33,7 +33,7 @@ class FrontendConfig(Section):
     noise_steps: int = Field(
         default=20,
         ge=1,
-        description="steps measured by image geometry too, from which on the noise is estimated on this sequence",
+        description="steps also measured by image geometry, from which on the noise is estimated on this sequence",
     )
     student_t_dof: float = Field(
         default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
@@ -158,7 +158,7 @@ class RoadConfig(Section):
         default=0.25,
         ge=0,
         le=1,
-        description="least part of the photometric error without motion that the alignment removes",
+        description="least fraction of the photometric error without motion that the alignment removes",
     )
     relative_sigma: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma of a length per radian of estimated tilt")
@@ -175,7 +175,7 @@ class LengthConfig(Section):
     unit_walk_sigma: float = Field(
         default=0.003, gt=0, description="sigma per step of the random walk of learned depth's scale"
     )
-    unit_sigma: float = Field(default=0.2, gt=0, description="sigma of that scale as the learned ground plane gives it")
+    unit_sigma: float = Field(default=0.2, gt=0, description="sigma of that scale by the learned ground plane")
     max_contradiction: float = Field(
         default=2.5, gt=1, description="largest factor between a measured length and that by learned depth"
     )
@@ -192,7 +192,7 @@ class GapsConfig(Section):
 
     enabled: bool = Field(
         default=True,
-        description="interpolate over unusable frames; false: they are measured like others and may end a run",
+        description="interpolate over unusable frames; false: they are measured as usable ones and may end a run",
     )
     blank_contrast: float = Field(
         default=3.0, ge=0, description="standard deviation of grey levels below which a frame is blank"
@@ -207,7 +207,7 @@ class GapsConfig(Section):
     repeat_difference: float = Field(
         default=0.1,
         ge=0,
-        description="largest difference of a copy encoded again from its image, over the mean image gradient",
+        description="largest difference of a re-encoded copy to its image, over the mean image gradient",
     )
     max_unread_frames: int = Field(
         default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
@@ -221,7 +221,7 @@ class GapsConfig(Section):
 
 
 class LidarConfig(Section):
-    """LiDAR odometry, see ``frontend/lidar_odometry.py``; without factors it is only compared with."""
+    """LiDAR odometry, see ``frontend/lidar_odometry.py``; without factors only for comparison."""
 
     factors: bool = Field(
         default=False, description="add kiss-icp's odometry to the pose graph; scale.mode lidar fits the scale to it"

@@ -1,7 +1,7 @@
-"""What travels between the parts of the system: small frozen records and two protocols.
+"""Data types shared by the parts of the system: small frozen records and two protocols.
 
-The front end, the graph, the map and the evaluation never import each other; they meet in
-``slam/pipeline/batch.py`` through these.
+The front end, the graph, the map and the evaluation never import each other; ``slam/pipeline/batch.py``
+passes these between them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
 Ends = tuple[int, int]  # the two frames of a step or a factor
-LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may give these up
+LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may drop these
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,7 @@ class Intrinsics(Pinhole):
 class Frame:
     """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
 
-    What is computed from the image alone (grey levels, pyramids, features) belongs to the frame: it is made once and
-    lives as long as the frame does.
+    What is computed from the image alone (grey levels, pyramids, features) is computed once and cached by the frame.
     """
 
     index: int
@@ -64,7 +63,7 @@ class Frame:
     _derived: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
 
     def derived(self, key: Hashable, make: Callable[[], T]) -> T:
-        """What ``make`` computes from the image, made when it is first asked for; any thread may ask."""
+        """The result of ``make``, computed at the first call with this key; thread-safe."""
         if key not in self._derived:
             self._derived.setdefault(key, make())
         known: T = self._derived[key]
@@ -77,7 +76,7 @@ class Frame:
 
     @property
     def digest(self) -> bytes:
-        """SHA-256 of shape and pixels: names the image in a cache."""
+        """SHA-256 of shape and pixels: the cache key of the image."""
 
         def digest() -> bytes:
             return hashlib.sha256(repr(self.image.shape).encode() + self.image.tobytes()).digest()
@@ -86,7 +85,7 @@ class Frame:
 
 
 class Sequence(Protocol):
-    """A recording: frames in time order, their camera, and whatever else is known about them.
+    """A recording: frames in time order, their camera, and optional calibration and ground truth.
 
     ``reference`` is the true ``T_world_camera`` ``(N, 4, 4)`` with the first pose the identity, or
     None; ``camera_height_m`` is the height of the camera above the road, ``T_camera_lidar`` takes LiDAR
@@ -113,17 +112,17 @@ class Sequence(Protocol):
         ...
 
     def provenance(self) -> tuple[str, ...]:
-        """Names of what this is, as the leak record of a checkpoint writes them."""
+        """Names of the recordings, as in the leak record of a checkpoint."""
         ...
 
 
 @dataclass(frozen=True)
 class SnippetPoses:
-    """A pose network's answer for one snippet.
+    """Output of the pose network for one snippet.
 
     ``T_source_target`` ``(N, 4, 4)``: target camera to source camera, unscaled, row k for
-    ``sources[k]`` in time order; ``target`` is the middle frame. ``residuals`` ``(N,)`` are the shares of the images'
-    differences that these poses leave unexplained, None where no one looked.
+    ``sources[k]`` in time order; ``target`` is the middle frame. ``residuals`` ``(N,)`` are the photometric
+    residuals over the images' differences, None where not computed.
     """
 
     target: int
@@ -152,7 +151,7 @@ class Predictor(Protocol):
         ...
 
     def executor(self) -> Executor:
-        """A new thread in which this predictor is asked, with as many cores as it may use; its user shuts it down."""
+        """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""
         ...
 
 
@@ -161,8 +160,8 @@ class RelativePose:
     """A measured ``T_from_to`` between two frames and its noise.
 
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
-    translation in the units of the measurement. ``source`` names who measured it. ``correlated_sigmas`` ``(6,)``, where
-    errors of neighbours are alike: independent errors of these sigmas would add up along a chain as those do.
+    translation in the units of the measurement. ``source`` names the method. ``correlated_sigmas`` ``(6,)``, where
+    errors of neighbours are correlated: independent errors of these sigmas would add up along a chain as those do.
     Errors follow Student's t with ``student_t_dof`` degrees of freedom; they are normal where that is infinite.
     """
 
@@ -189,7 +188,7 @@ class RelativePose:
 
     @property
     def graph_sigmas(self) -> FloatArray:
-        """Sigmas ``(6,)`` for a graph, which takes the errors of its factors to be independent."""
+        """Sigmas ``(6,)`` for a graph, which assumes independent errors of its factors."""
         return self.sigmas if self.correlated_sigmas is None else self.correlated_sigmas
 
 

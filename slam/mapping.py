@@ -25,7 +25,7 @@ from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray, invert, rotation_angle
 
 _BLOCK_SIDE = 16
-_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street; growing costs Open3D a second
+_FIRST_BLOCKS = 3000  # 240 MiB, enough for 300 m of street; growing takes Open3D a second
 _SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
 _ATTRIBUTES = ("tsdf", "weight", "color")
 
@@ -52,7 +52,7 @@ class MapCloud:
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """Size of a map, and how many frames went into it or were left out because it was full."""
+    """Size of a map, and numbers of frames fused and left out of a full map."""
 
     triangles: int
     points: int
@@ -78,7 +78,7 @@ class TsdfMap:
         self._cloud: MapCloud | None = None
 
     def integrate(self, depth: DepthMap, image: Image, T_world_camera: FloatArray) -> None:
-        """Filter a depth map by the previous keyframe and fuse it; skip it where the camera hardly moved.
+        """Filter a depth map by the previous keyframe and fuse it; skip it if the camera hardly moved.
 
         Args:
             depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
@@ -122,7 +122,7 @@ class TsdfMap:
         if self._cloud is None:
             self._fuse_single_keyframe()
             point = self._extract(self._grid.extract_point_cloud).point
-            # Open3D's threads finish in any order; sorted, two runs write the same file
+            # sorted, for the order of Open3D's threads is not reproducible
             order = np.lexsort(_array(point.positions).T)
             positions, normals, colours = (
                 _array(part)[order] for part in (point.positions, point.normals, point.colors)

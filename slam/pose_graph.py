@@ -2,7 +2,7 @@
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
 that order. A Huber kernel limits outliers. Redescending kernels do not recover from a drifted start, so Cauchy is only
-offered as a second stage after Huber.
+a second stage after Huber.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ANCHOR_SIGMA = 1e-6
 _OUTLYING = 3.0
 # iSAM2: threshold of relinearisation, and of convergence
 _RELINEARISE = 1e-3
-_SETTLED = 1e-4
+_CONVERGED = 1e-4
 _MOST_UPDATES = 20
 _SAME_RATIO = 0.01
 
@@ -171,20 +171,20 @@ class PoseGraph:
 class IncrementalPoseGraph:
     """The same factors solved incrementally by iSAM2 (Kaess et al. 2012).
 
-    iSAM2 updates the weight of a robust factor only where it relinearises, so it does that often. Measurements that
-    later frames changed are exchanged.
+    iSAM2 updates the weight of a robust factor only where it relinearises, so it does that often. Factors whose
+    measurement was changed by later frames are replaced.
     """
 
     def __init__(self, config: PoseGraphConfig) -> None:
         self._config = config
         self._kernel = "none" if config.kernel == "none" else "huber"
-        self._start()
+        self._restart()
 
     def update(self, relative_poses: Sequence[RelativePose], T_world_camera_initial: FloatArray) -> FloatArray:
-        """Exchange the graph's factors for these and solve.
+        """Replace the graph's factors by these and solve.
 
         Args:
-            relative_poses: all factors, at most one of a source between two frames in one direction.
+            relative_poses: all factors, at most one by each source between two frames in one direction.
             T_world_camera_initial: dead reckoning ``(N, 4, 4)``; only its steps to new frames are used.
 
         Returns:
@@ -196,21 +196,21 @@ class IncrementalPoseGraph:
         _check_connected(relative_poses, len(T_world_camera_initial))
         wanted = {(edge.from_index, edge.to_index, edge.source): edge for edge in relative_poses}
         try:
-            self._exchange(wanted, T_world_camera_initial)
+            self._replace(wanted, T_world_camera_initial)
         except RuntimeError as error:  # iSAM2 is not usable after an indeterminate system
-            logger.warning("iSAM2 starts again: %s", _first_line(error))
-            self._start()
+            logger.warning("iSAM2 is restarted: %s", _first_line(error))
+            self._restart()
             initial = PoseGraph(self._config)
             initial.add_relative(*relative_poses)
             T_solved = initial.optimise(T_world_camera_initial)
             try:
-                self._exchange(wanted, T_solved)
+                self._replace(wanted, T_solved)
             except RuntimeError as again:
-                self._start()
+                self._restart()
                 raise SlamError(f"the pose graph cannot be solved: {_first_line(again)}") from again
         return self._T_world_camera.copy()
 
-    def _start(self) -> None:
+    def _restart(self) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.relinearizeSkip = 1
         parameters.setRelinearizeThreshold(_RELINEARISE)
@@ -219,7 +219,7 @@ class IncrementalPoseGraph:
         self._held: dict[tuple[int, int, str], tuple[RelativePose, int]] = {}
         self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
 
-    def _exchange(self, wanted: dict[tuple[int, int, str], RelativePose], T_world_camera_initial: FloatArray) -> None:
+    def _replace(self, wanted: dict[tuple[int, int, str], RelativePose], T_world_camera_initial: FloatArray) -> None:
         gone = [key for key, (edge, _) in self._held.items() if key not in wanted or _differ(edge, wanted[key])]
         slots = [self._held.pop(key)[1] for key in gone]
         fresh = [key for key in wanted if key not in self._held]
@@ -242,7 +242,7 @@ class IncrementalPoseGraph:
             T = np.stack(
                 [p.matrix() for p in map(self._isam.calculateEstimatePose3, range(len(T_world_camera_initial)))]
             )
-            if T_before is not None and np.abs(T - T_before).max() < _SETTLED:
+            if T_before is not None and np.abs(T - T_before).max() < _CONVERGED:
                 break
             T_before = T
             self._isam.update()

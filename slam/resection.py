@@ -1,6 +1,6 @@
-"""Perspective-n-point: the camera that sees known points, by RANSAC and refinement, with its covariance.
+"""Perspective-n-point: camera pose from known points, by RANSAC and refinement, with its covariance.
 
-OpenCV's consensus methods seed themselves, so a seed varies the order in which they are given their points.
+OpenCV's RANSAC methods have a fixed seed, so ours permutes their points.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LEAST_PIXEL_SIGMA = 0.1
 class Resection:
     """``T_camera_points`` takes the points to the camera; ``inliers`` are rows of the points.
 
-    ``sigmas`` ``(6,)``: of rotation and translation in the camera, for corners that err independently.
+    ``sigmas`` ``(6,)``: of rotation and translation in the camera, for independent errors of corners.
     """
 
     T_camera_points: FloatArray
@@ -32,7 +32,7 @@ class Resection:
 
 
 def ransac_order(count: int, seed: int) -> NDArray[np.intp]:
-    """The order ``(count,)`` in which points are given to a consensus method; seed 0 leaves them as they are."""
+    """The order ``(count,)`` of the points for a RANSAC method; seed 0 is the given order."""
     order = np.arange(count, dtype=np.intp)
     return order if seed == 0 else np.random.default_rng(seed).permutation(order)
 
@@ -44,7 +44,7 @@ def consensus(
 
     Args:
         points: ``(M, 3)``.
-        pixels: where the camera sees them ``(M, 2)``, in the unit of K.
+        pixels: their projections ``(M, 2)``, in the unit of K.
         K: camera matrix ``(3, 3)``; the identity for rays.
         iterations: RANSAC samples.
         reprojection_px: largest reprojection error of an inlier.
@@ -68,7 +68,7 @@ def consensus(
 def refine(
     points: FloatArray, pixels: FloatArray, K: FloatArray, start: tuple[FloatArray, FloatArray, NDArray[np.intp]]
 ) -> Resection:
-    """Levenberg-Marquardt on the inliers of `consensus`, with sigmas from the Jacobian and the residuals' size."""
+    """Levenberg-Marquardt on the inliers of `consensus`, with sigmas from the Jacobian and the residuals."""
     rotation, translation, inliers = start
     points, pixels = points[inliers], pixels[inliers]
     rotation, translation = cv2.solvePnPRefineLM(

@@ -36,12 +36,12 @@ from slam.sequences.catalogue import open_sequence
 from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
 from slam.storage.fingerprint import code_fingerprint
 
-# what the pass over the frames depends on: `run --continue` cannot change it
-_SETTLED = ("geometry", "gaps", "road", "scale", "loops")
+# sections that the pass over the frames depends on: `run --continue` cannot change them
+_FIXED_SECTIONS = ("geometry", "gaps", "road", "scale", "loops")
 
 
 class RunOptions(TypedDict, total=False):
-    """What `run_slam` takes by name; defaults and meanings as in `RunRequest`."""
+    """Keyword arguments of `run_slam`; defaults and meanings as in `RunRequest`."""
 
     camera: Path | None
     weights: str | Path
@@ -60,7 +60,7 @@ class RunOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class RunRequest:
-    """Everything that a run is asked for.
+    """All inputs of a run.
 
     Attributes:
         dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
@@ -74,12 +74,12 @@ class RunRequest:
         output: the run folder itself; None makes ``results/<stamp>_<sequence>``.
         seed: of everything random.
         device: ``auto``, ``cpu`` or ``cuda``.
-        progress: told of (stage, done, total).
+        progress: called with (stage, done, total).
         command: recorded in the metrics.
-        cache: folder that keeps the networks' answers and what is measured in images; None computes all of it.
+        cache: folder of network outputs and image measurements; None computes all of them.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
-        continues: a run folder whose last frame comes right before the first of these, taken by the same camera; its
-            configuration holds, and the new folder has the whole drive.
+        continues: a run folder whose last frame comes right before the first of these, by the same camera; its
+            configuration is used, and the new folder has the whole drive.
     """
 
     dataset: str | Path | None = None
@@ -104,7 +104,7 @@ def run_slam(
 ) -> RunFolder:
     """Run the whole system on one sequence.
 
-    Everything that can be checked is checked before a folder is made. An earlier run in ``output`` stays until the
+    All checks come before a folder is made. An earlier run in ``output`` stays until the
     trajectories of this one are whole.
 
     Args:
@@ -116,7 +116,7 @@ def run_slam(
         The run folder.
 
     Raises:
-        SlamError, ErfsfmError: one line. Whatever ends a run, its folder holds what there is and says why.
+        SlamError, ErfsfmError: one line. However a run ends, its folder keeps its results and the reason.
     """
     request = RunRequest(dataset, sequence, **options)
     with run_log() as log, raising_on_termination() as ignore_signals:
@@ -139,7 +139,7 @@ def run_slam(
 
 @dataclass(frozen=True)
 class _Job:
-    """A run that was found possible."""
+    """A run that passed all checks."""
 
     request: RunRequest
     settings: SlamConfig
@@ -149,7 +149,7 @@ class _Job:
 
 
 def _prepare(request: RunRequest) -> _Job:
-    """Everything that a run needs, opened and checked; writes nothing but the cache's folder."""
+    """Open and check all inputs of a run; writes nothing but the cache's folder."""
     if request.output is not None:
         check_output(request.output)
     if request.rerun is not None:
@@ -171,12 +171,12 @@ def _prepare(request: RunRequest) -> _Job:
 
 
 def _settings(request: RunRequest) -> SlamConfig:
-    """The configuration; that of a run to continue, with changes to what the frames it has seen do not settle."""
+    """The configuration; of a run to continue, with changes that do not affect the pass over its frames."""
     continues = request.continues
     if continues is None:
         return load_config(request.config, request.overrides)
     if request.config is not None:
-        raise ConfigError(f"the configuration of {continues} holds for what continues it: leave out --config")
+        raise ConfigError(f"the configuration of {continues} is used to continue it: leave out --config")
     output = request.output
     if output is not None and continues.resolve() in (output.resolve(), (output / UNFINISHED).resolve()):
         raise RunError(
@@ -184,14 +184,16 @@ def _settings(request: RunRequest) -> SlamConfig:
         )
     own = load_config(RunFolder.open(continues).require("config.yaml"))
     settings = load_config(continues / "config.yaml", request.overrides)
-    for name in _SETTLED:
+    for name in _FIXED_SECTIONS:
         if getattr(settings, name) != getattr(own, name):
-            raise ConfigError(f"{name} is settled by the frames of {continues}: leave out --set {name}..., or run anew")
+            raise ConfigError(
+                f"{name} cannot be changed for {continues}: leave out --set {name}..., or run from the first frame"
+            )
     return settings
 
 
 def _checkpoint(continues: Path, weights_sha256: str, following: FrameSequence) -> SessionCheckpoint:
-    """What a run to continue kept, if these networks and frames can go on with it."""
+    """The checkpoint of a run to continue, if these networks and frames match it."""
     checkpoint = SessionCheckpoint.open(continues)
     if checkpoint.weights_sha256 != weights_sha256:
         raise RunError(f"{continues} was run with other weights: continue it with the same --weights")
@@ -205,11 +207,11 @@ def _checkpoint(continues: Path, weights_sha256: str, following: FrameSequence) 
 def _predictor(
     networks: DepthPosePredictor, intrinsics: Intrinsics, cache: Path | None
 ) -> tuple[NetworkPredictor, GetOrCompute]:
-    """The networks behind the cache, and the cache of what is measured in images."""
+    """The networks behind the cache, and the cache of image measurements."""
     if cache is None:
         return NetworkPredictor(networks, intrinsics), without_cache
     disk, code = DiskCache(cache), code_fingerprint()
-    # GPU and CPU answer a little differently and share no entries
+    # outputs of GPU and CPU differ a little and share no entries
     identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
     get_or_compute = CacheNamespace(disk, code).get_or_compute
     answers = CacheNamespace(disk, identity).get_or_compute
@@ -277,7 +279,7 @@ def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
 
 
 def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseException) -> None:
-    """Say in the folder why the run ended; where even that fails, the first error is the one to hear about."""
+    """Write the reason of the failure to the folder; errors of writing it are ignored, so the first one is raised."""
     known = isinstance(error, SlamError | ErfsfmError | Terminated)
     reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     log.failed(reason)

@@ -35,7 +35,7 @@ def coverage(relative_poses: Sequence[RelativePose], T_world_camera_true: FloatA
     Args:
         relative_poses: measurements with their noise, at least one.
         T_world_camera_true: truth ``(N, 4, 4)``, metres.
-        scale: units of the measurements per metre; brings the truth to their scale.
+        scale: units of the measurements per metre; scales the truth to them.
 
     Raises:
         SlamError: if there is no measurement or the scale is not positive.

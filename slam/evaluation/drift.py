@@ -67,9 +67,9 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
 def segment_errors(
     T_world_estimate: FloatArray, T_world_reference: FloatArray, lengths_m: Iterable[float]
 ) -> list[SegmentErrors]:
-    """Relative errors of all segments of each length that the true path holds, a start every ten frames.
+    """Relative errors of all segments of each length within the true path, starting every ten frames.
 
-    A segment ends at the first frame beyond its length. Lengths that no segment reaches are left out.
+    A segment ends at the first frame beyond its length. Lengths without a segment are left out.
 
     Args:
         T_world_estimate: poses ``(N, 4, 4)``, row k beside row k of the reference, in metres.

@@ -1,4 +1,4 @@
-"""How close a map is to the true surface, and how much of the surface it holds."""
+"""Accuracy and completeness of a map."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ COVERED_WITHIN_M = 0.3
 def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray) -> Similarity:
     """The similarity that takes a trajectory and its map to the truth, poses ``(N, 4, 4)`` both.
 
-    The rotation is the chordal mean over all orientations, scale and shift are the best for the positions
-    under it: positions alone leave the roll about a straight road open, and a map hangs on it.
+    The rotation is the chordal mean over all orientations, scale and translation are least
+    squares on positions: positions alone do not determine the roll about a straight road, which the map depends on.
     """
     R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
     R = nearest_rotation((R_true @ np.swapaxes(R_estimate, 1, 2)).sum(axis=0))
@@ -36,7 +36,7 @@ def accuracy_median_m(points_true: FloatArray, distance_to_surface: Callable[[Fl
 
 
 def completeness(surface_points: FloatArray, map_points: FloatArray) -> float | None:
-    """Share of true surface points ``(S, 3)`` that have a map point ``(P, 3)`` within 0.3 m."""
+    """Ratio of true surface points ``(S, 3)`` that have a map point ``(P, 3)`` within 0.3 m."""
     if len(surface_points) == 0:
         return None
     if len(map_points) == 0:

@@ -1,8 +1,8 @@
-"""How far a trajectory is from the truth: the object T of ``metrics.json``, with evo as a second opinion.
+"""Errors of a trajectory: the object T of ``metrics.json``, with evo as a cross-check.
 
 The paper's snippets, absolute errors under five alignments (Umeyama 1991), KITTI's segment errors (Geiger
 et al. 2012) and the errors of single steps. This is the only file that imports evo, and only inside a
-function: every other number stands without it.
+function: all other numbers are computed without it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SNIPPET_LENGTH = 5
 _SNIPPET_KEYS = ("ate_mean", "ate_std", "re_mean", "re_std", "count")
 _ALIGN_KEYS = ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale")
 _EVO_KEYS = ("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference")
-# With fewer frames an alignment leaves no freedom for an error, and its zero would mean nothing.
+# With fewer frames an alignment fits exactly, and its zero error is meaningless.
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 1, "first": 2, "scale": 2, "6dof": 2, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
 _REFERENCE_STANDS_STILL = "the reference does not move, so scaling would hide every error"
@@ -57,7 +57,7 @@ def trajectory_metrics(
     Every number that cannot be computed is None, with the reason in a sibling ``<name>_reason``.
 
     Args:
-        estimate: the trajectory to judge.
+        estimate: the trajectory to evaluate.
         reference: the truth of the same frames, row k beside row k (see `slam.trajectory.associate`).
         snippet5: the paper's protocol where it was measured directly; by default cut from the estimate.
 
@@ -122,7 +122,7 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
 
 
 def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
-    """What of T lies above its limit, one line each; a number that is missing counts as above.
+    """Metrics of T above their limits, one line each; a missing number counts as above.
 
     Args:
         metrics: the object T.
@@ -165,7 +165,7 @@ def _metric_paths() -> set[str]:
 
 
 def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
-    """Why nothing can be measured; empty where something can."""
+    """Why the trajectories cannot be compared; empty if they can."""
     if reference is None:
         return _NO_REFERENCE
     if len(estimate) != len(reference):
@@ -260,14 +260,14 @@ def _evo_metrics(
             metric.process_data((reference, estimate))
             values[key] = float(metric.get_statistic(statistic))
     except EvoException as error:
-        return dict.fromkeys(_EVO_KEYS, f"evo refuses: {error}")
+        return dict.fromkeys(_EVO_KEYS, f"evo fails: {error}")
     pairs = (("ape_rmse_m_7dof", "ate_rmse_m"), ("rpe_trans_m", "rpe_trans_m"), ("rpe_rot_deg", "rpe_rot_deg"))
     differences = [abs(float(values[theirs]) - float(ours[mine])) for theirs, mine in pairs]
     return {**values, "difference": max(differences)}
 
 
 def _stands_still(T_world_camera: FloatArray) -> bool:
-    """Whether all positions are one, up to rounding."""
+    """Whether all positions are equal, up to rounding."""
     positions = T_world_camera[:, :3, 3]
     return bool(np.ptp(positions, axis=0).max() <= 1e-12 * max(1.0, np.abs(positions).max()))
 
@@ -277,7 +277,7 @@ def _null(keys: Sequence[str], reason: str) -> dict[str, Any]:
 
 
 def _record(metrics: Mapping[str, Metric]) -> dict[str, Any]:
-    """Numbers under their names; words and numbers that are not finite become None and a reason."""
+    """Numbers by name; reasons and numbers that are not finite become None and a reason."""
     record: dict[str, Any] = {}
     for name, metric in metrics.items():
         reason = metric if isinstance(metric, str) else "" if math.isfinite(metric) else "the result is not finite"

@@ -37,7 +37,7 @@ def write_g2o(path: Path, relative_poses: Sequence[RelativePose], T_world_camera
 
 
 def _g2o_poses(T_a_b: FloatArray) -> list[str]:
-    """Translation and quaternion (xyzw) of poses ``(N, 4, 4)``, shortest digits that read back exactly."""
+    """Translation and quaternion (xyzw) of poses ``(N, 4, 4)``, shortest digits of an exact round trip."""
     if len(T_a_b) == 0:
         return []
     quaternions_xyzw = Rotation.from_matrix(T_a_b[:, :3, :3]).as_quat(canonical=True)
@@ -56,7 +56,7 @@ def _numbers(row: FloatArray) -> str:
 
 
 def check_g2o(path: Path) -> None:
-    """Make sure that a file is a whole graph as `write_g2o` writes it.
+    """Check that a file is a whole graph as written by `write_g2o`.
 
     Raises:
         RunError: it is missing, cut short, or a line is not one of the graph.
@@ -79,6 +79,6 @@ def check_g2o(path: Path) -> None:
                 ends.append((int(words[0]), int(words[1])))
         edges = np.array(ends, dtype=np.int64).reshape(-1, 2)
         if edges.size and not 0 <= edges.min() <= edges.max() < vertices:
-            raise ValueError("an edge leads to a vertex that is not there")
+            raise ValueError("an edge has a vertex that does not exist")
     except (OSError, ValueError) as error:
         raise RunError(f"{path} is no pose graph that can be read ({error}): run the sequence again") from error

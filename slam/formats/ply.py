@@ -1,7 +1,7 @@
 """Point clouds and triangle meshes as PLY files, read and written whole.
 
-Open3D's own writer reports a full disk as a line for every vertex and as success, so files are written here. They have
-the layout, and the bytes, of Open3D's.
+On a full disk Open3D's writer prints a line for every vertex and reports success, so files are written here, with the
+same layout and bytes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Ply:
     triangles: NDArray[np.int64] | None = None
 
     def columns(self, names: tuple[str, ...]) -> FloatArray | None:
-        """Fields of the vertices ``(V, len(names))``; None where the file has not all of them."""
+        """Fields of the vertices ``(V, len(names))``; None where the file lacks one of them."""
         if not set(names) <= set(self.vertices.dtype.names or ()):
             return None
         return np.stack([self.vertices[name].astype(np.float64) for name in names], axis=1)
@@ -46,7 +46,7 @@ class Ply:
 
 @dataclass
 class _Element:
-    """An element of the header: its name, how many there are, and its scalar and list properties."""
+    """An element of the header: its name, count, and scalar and list properties."""
 
     name: str
     count: int
@@ -66,7 +66,7 @@ def read_ply(path: Path) -> Ply:
             read = _read_text if is_text else _read_binary
             parts = {element.name: read(file, element) for element in elements}
             if file.read(1).strip():
-                raise ValueError("there is more in it than its header says")
+                raise ValueError("it is longer than its header states")
         ply = Ply(parts["vertex"], parts["face"].astype(np.int64) if "face" in parts else None)
         _check(ply)
         return ply
@@ -105,7 +105,7 @@ def coloured_ply(
 
 
 def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
-    """The same with vertices and normals turned by ``R_up_world`` ``(3, 3)``."""
+    """The same with vertices and normals rotated by ``R_up_world`` ``(3, 3)``."""
     vertices = ply.vertices.copy()
     for names in (_AXES, _NORMALS):
         directions = ply.columns(names)

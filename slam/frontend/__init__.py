@@ -1,1 +1,1 @@
-"""From the networks and the images to relative-pose factors and a metric scale."""
+"""Front end: relative-pose factors and a metric scale from networks and images."""

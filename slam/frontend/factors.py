@@ -1,4 +1,4 @@
-"""All relative-pose factors of a run, made once from everything that was measured, and the odometry they chain to."""
+"""All relative-pose factors of a run, made once from all measurements, and the odometry chained from them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from slam.se3 import FloatArray, invert, nearest_rotation
 
 @dataclass(frozen=True)
 class Unscaled:
-    """What was measured in the networks' unit: steps of image geometry, the pose network's snippets, gaps."""
+    """Measurements in the networks' unit: steps of image geometry, the pose network's snippets, gaps."""
 
     steps: StepTable
     snippets: Sequence[SnippetPoses]
@@ -44,7 +44,7 @@ def make_factors(
 
     Args:
         measured: in the networks' unit.
-        scale: that unit near each frame, and the lengths of steps.
+        scale: of each frame, and the lengths of steps.
         lidar_steps: already in the unit of the scale.
         noise: of the pose network; None measures it against image geometry on this drive.
         frontend: which factors of the pose network are used.
@@ -65,10 +65,10 @@ def make_factors(
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
-    """The front end without a graph ``(N, 4, 4)``: each frame by the step of geometry that leads to it, else network.
+    """Odometry without a graph ``(N, 4, 4)``: each frame by the geometric step that ends there, else the network.
 
     Args:
-        factors: in the unit of the scale; of several that lead to a frame from equally near, the last one is taken.
+        factors: in the unit of the scale; of several of equal length that end at a frame, the last one is taken.
         T_network: the raw network trajectory, unscaled.
         scale: of the network's steps.
     """
@@ -103,7 +103,7 @@ def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[R
 
 
 def _step_noise(steps: StepTable, scale: Scale, config: GeometryConfig) -> Mapping[Ends, StepNoise]:
-    """Noise of the triangulated steps beside the corners' own, by their places in the drive."""
+    """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
     motions = steps.triangulated
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}
     T_by_place = {n: motions[ends].relative_pose.T_from_to for ends, n in place.items()}

@@ -1,4 +1,4 @@
-"""The result of a measurement that could not be made."""
+"""The result of a measurement that failed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MeasurementFailure:
-    """Nothing was measured; ``reason`` says why, in words for the log and the report."""
+    """No measurement; ``reason`` is a text for the log and the report."""
 
     reason: str

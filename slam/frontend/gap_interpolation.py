@@ -24,11 +24,11 @@ _SIGMA_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class InterpolatedGaps:
-    """A run's measurements with their gaps closed, unscaled.
+    """A run's measurements with gaps interpolated, unscaled.
 
     ``snippets`` has one entry a target, gaps filled by the constant-velocity model; ``trusted`` are those that the
     network measured on usable frames. ``steps`` are without frozen frames; ``interpolated`` are the factors of steps
-    that nothing measured; ``frames`` are the interpolated frames and why.
+    without a measurement; ``frames`` are the interpolated frames and why.
     """
 
     snippets: list[SnippetPoses]
@@ -47,19 +47,19 @@ def interpolate_gaps(
     repeated: Collection[int],
     config: GapsConfig,
 ) -> InterpolatedGaps:
-    """Close the gaps of a run.
+    """Interpolate the gaps of a run.
 
     Args:
         count: frames of the sequence.
         sources: sources of a snippet.
         snippets: measured, none of them on an unusable frame.
         steps: measured between usable frames; over a gap, between its two ends.
-        unusable: frames that measured nothing, and why.
-        repeated: frames with the image of the frame before.
+        unusable: frames without a measurement, and why.
+        repeated: frames whose image repeats that of the frame before.
         config: noise of an interpolated step.
 
     Raises:
-        SlamError: no snippet was measured, so there is no motion to go on with.
+        SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
     if not snippets:
         why = next(iter(unusable.values()), "the sequence is too short")
@@ -71,7 +71,7 @@ def interpolate_gaps(
     trusted = [s for s in snippets if not frozen.intersection((s.target, *s.sources))]
     filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
     by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps if m.ends == (m.ends[0], m.ends[0] + 1)}
-    # a network that saw only a frozen image still gives the best guess there is
+    # snippets of frozen images alone are still the best estimate available
     known = network_steps(trusted) | by_image or by_network
     covered = {step for s in trusted for step in range(min(s.sources), max(s.sources))} | by_image.keys()
     loose = [step for step in range(count - 1) if step not in covered]
@@ -96,11 +96,11 @@ def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:
 def _without_frozen(
     by_network: Mapping[int, FloatArray], steps: StepTable, repeated: Collection[int], new: Collection[int]
 ) -> tuple[set[int], StepTable]:
-    """Repeated frames during which the camera went on, and the steps that remain without them.
+    """Repeated frames during which the camera moved, and the steps that remain without them.
 
-    The step to the next new image decides: from a standing camera it is short, from one that drove on it has as many
-    steps as images were repeated. A length between the two is a failed match over a wide baseline: it is not used.
-    Where no new image comes, the camera is taken to stand.
+    The length of the step to the next new image decides: short if the camera stood; the length of as many steps as
+    images were repeated if it moved. A length between the two is a failed match over a wide baseline and is not used.
+    Without a next new image the camera is assumed to stand.
     """
     frozen: set[int] = set()
     for first, last in runs(repeated):
@@ -122,7 +122,7 @@ def _without_frozen(
 
 
 def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[int, FloatArray]:
-    """Motions of all steps: unknown ones go over from the mean motion before them to that after them."""
+    """Motions of all steps: unknown ones are interpolated from the mean motion before them to that after them."""
     numbers = np.array(sorted(known))
     complete = dict(known)
     for step in steps:
@@ -135,27 +135,27 @@ def _completed(known: Mapping[int, FloatArray], steps: Collection[int]) -> dict[
                 tangents.append(np.mean([_tangent(known[k]) for k in near], axis=0))
                 distances.append(abs(int(near[0]) - step))
         weights = np.array(distances[::-1], dtype=np.float64)
-        turned, moved = np.split(weights @ np.array(tangents) / weights.sum(), 2)
-        complete[step] = from_rotation_vector(turned, moved)
+        rotation_vector, translation = np.split(weights @ np.array(tangents) / weights.sum(), 2)
+        complete[step] = from_rotation_vector(rotation_vector, translation)
     return complete
 
 
 def _equal_steps(geometric: Sequence[RelativePose], loose: set[int]) -> dict[int, FloatArray]:
-    """Equal steps over each gap whose two ends image geometry has linked."""
-    shares: dict[int, FloatArray] = {}
+    """Equal steps over each gap whose two ends are linked by image geometry."""
+    equal_steps: dict[int, FloatArray] = {}
     for factor in geometric:
         steps = range(factor.from_index, factor.to_index)
         if len(steps) > 1 and loose.issuperset(steps):
             T_step = _root(factor.T_from_to, len(steps))
-            shares |= dict.fromkeys(steps, T_step)
-    return shares
+            equal_steps |= dict.fromkeys(steps, T_step)
+    return equal_steps
 
 
 def _root(T_a_b: FloatArray, n: int) -> FloatArray:
     """The transform whose n-th power is ``T_a_b``."""
-    turned = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
-    powers = Rotation.from_rotvec(np.arange(n)[:, None] * turned).as_matrix()
-    return from_rotation_vector(turned, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
+    rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
+    powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
+    return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))
 
 
 def _filled(

@@ -1,4 +1,4 @@
-"""Images that show nothing usable are refused before they are measured: blank, noise, upside down, frozen."""
+"""Rejection of unusable images before they are measured: blank, noise, upside down, frozen."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
 
 _THUMBNAIL = (32, 16)  # width, height
-_SHRINKING = 4  # averages what compression changes
+_SHRINKING = 4  # averages out compression noise
 _LEAST_GRADIENT = 1e-3
-# an image is frozen where the one before it still moved by this times the usual difference of a copy
+# an image is frozen if the motion before it was larger than this times the usual difference of a copy
 _MOVING = 3.0
 # copies of dark or blurred images differ by more: up to this ratio of the motion before, and twice the usual difference
 _COPY_OVER_MOTION = 0.25
@@ -29,7 +29,7 @@ _Layer = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class GateState:
-    """What the gate compares the next image with.
+    """State of the gate: what the next image is compared with.
 
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
     from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length.
@@ -44,14 +44,14 @@ class GateState:
 
 
 class ImageGate:
-    """Looks at the images of one sequence in time order."""
+    """Classifies the images of one sequence in time order."""
 
     def __init__(self, config: GapsConfig, state: GateState | None = None) -> None:
         self._config = config
         self._state = state or GateState()
 
     def state(self) -> GateState:
-        """What the gate goes on from."""
+        """The state to resume from."""
         return self._state
 
     def check(self, frame: Frame) -> Verdict:
@@ -60,14 +60,14 @@ class ImageGate:
         if state.last is not None and np.array_equal(frame.image, state.last.image):
             verdict: Verdict = state.verdict if isinstance(state.verdict, MeasurementFailure) else "repeated"
         else:
-            verdict = self._judge(frame)
+            verdict = self._classify(frame)
         self._state = replace(self._state, last=frame, verdict=verdict)
         return verdict
 
-    def _judge(self, frame: Frame) -> Verdict:
+    def _classify(self, frame: Frame) -> Verdict:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < self._config.blank_contrast:
-            # after darkness the image before it is no measure of what comes
+            # images after a dark one are not compared with those before it
             self._state = GateState()
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
@@ -76,28 +76,28 @@ class ImageGate:
         if length / np.sqrt(thumbnail.size) < self._config.noise_contrast * contrast:
             return MeasurementFailure("the image is noise")
         thumbnail /= np.float32(length)
-        failure = self._unlike(thumbnail)
+        failure = self._scene_failure(thumbnail)
         if failure is not None:
             return failure
         self._state = replace(self._state, usable=thumbnail, doubtful=None)
         return "repeated" if self._is_copy(frame) else "new"
 
-    def _unlike(self, thumbnail: _Layer) -> MeasurementFailure | None:
+    def _scene_failure(self, thumbnail: _Layer) -> MeasurementFailure | None:
         usable, doubtful = self._state.usable, self._state.doubtful
         if usable is not None:
             flipped = float((thumbnail[::-1, ::-1] * usable).sum())
             if flipped > max(_LEAST_FLIPPED_CORRELATION, float((thumbnail * usable).sum())):
                 self._state = replace(self._state, usable=np.ascontiguousarray(thumbnail[::-1, ::-1]))
                 return MeasurementFailure("the image is upside down")
-        # two images in a row that agree with each other are a new scene, not damage
+        # two consecutive images that correlate with each other are a new scene, not damage
         known = [each for each in (usable, doubtful) if each is not None]
         if known and max(float((thumbnail * each).sum()) for each in known) < self._config.min_correlation:
             self._state = replace(self._state, doubtful=thumbnail)
-            return MeasurementFailure("the image is unlike those before it")
+            return MeasurementFailure("the image does not correlate with those before it")
         return None
 
     def _is_copy(self, frame: Frame) -> bool:
-        """Whether the image is the last new one, encoded again, although the camera moved just before.
+        """Whether the image is a re-encoded copy of the last new one, although the camera moved just before.
 
         A camera that comes to a stop slows down first; a video that freezes does not.
         """

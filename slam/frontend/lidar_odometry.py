@@ -1,4 +1,4 @@
-"""The path that a LiDAR on the same car measured: kiss-icp (Vizzo et al. 2023) on the scans beside the frames."""
+"""LiDAR odometry on the scans of the frames: kiss-icp (Vizzo et al. 2023)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class LidarPath:
 
 
 def has_scans(sequence: Sequence) -> bool:
-    """Whether two neighbouring frames have a scan each and the LiDAR's place on the car is known."""
+    """Whether two neighbouring frames have a scan each and the LiDAR's extrinsics are known."""
     scanned = [sequence.scan_path(k) is not None for k in range(len(sequence))]
     return sequence.T_camera_lidar is not None and any(map(all, itertools.pairwise(scanned)))
 
@@ -49,8 +49,8 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     from kiss_icp.kiss_icp import KissICP
 
     settings = load_config(None)
-    settings.data.deskew = False  # the scans carry no time of their own
-    settings.registration.max_num_threads = 1  # the same bytes every time
+    settings.data.deskew = False  # the points have no time stamps
+    settings.registration.max_num_threads = 1  # reproducible
     odometry = KissICP(settings)
     T_first_lidar = []
     for frame in frames:
@@ -62,7 +62,7 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
 
 
 def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:
-    """The motion between neighbouring frames that both have a scan, as measurements."""
+    """Relative poses of neighbouring frames that both have a scan."""
     rotation = np.deg2rad(config.rotation_sigma_deg)
     sigmas = np.repeat([rotation, config.translation_sigma_m], 3)
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]

@@ -1,14 +1,14 @@
-"""The pose network's snippets as relative-pose factors, and as the raw trajectory they chain to.
+"""The pose network's snippets as relative-pose factors, and as the raw trajectory chained from them.
 
-Noise measured beside the weights (`erfsfm.pose_noise`) gives each pair of frames one factor: the mean of what
-overlapping snippets measured of it, with the correlation of their errors. On the drive this noise is scaled to the
-disagreement with image geometry, apart for straights and turns, and geometry's own noise is added
+With calibrated noise (`erfsfm.pose_noise`) each pair of frames gets one factor: the mean of its measurements by
+overlapping snippets, with the correlation of their errors. On the drive this noise is scaled to the
+disagreement with image geometry, separately by turn rate, and the noise of image geometry is added
 (``docs/design/noise-and-the-pose-graph.md``). Errors have heavier tails than normal ones and are correlated from
 snippet to snippet: the graph takes inflated sigmas for that (``docs/design/noise-and-the-pose-graph.md``).
 
-Weights without measured noise: the network errs by a ratio of what it measures. For a pair n frames apart the rotation
-sigma is ``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` of the length plus a
-floor (a share of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
+Without calibrated noise, sigmas are proportional to the motion. For a pair n frames apart the rotation sigma is
+``rotation_sigma_deg * sqrt(n)``, the translation sigma ``translation_relative_sigma`` times the length plus a
+floor (a ratio of the median one-frame step). Overlapping snippets measure a pair again from nearly the same images, so
 their errors are taken as fully correlated: m measurements of one pair get their sigmas times sqrt(m) and count as one.
 """
 
@@ -32,7 +32,7 @@ from slam.robust import mad_sigma, mad_sigmas
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
-# image geometry errs too: sigmas are not scaled down beyond this
+# image geometry has errors too: sigmas are not scaled below this factor
 _LEAST_SCALING = 0.3
 _STRETCHES = 4
 
@@ -58,13 +58,13 @@ def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) ->
 def calibrated_factors(
     snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], noise: PoseNoise, config: FrontendConfig
 ) -> list[RelativePose]:
-    """One factor for every pair of frames that snippets measured, ``T_first_last``, unscaled, with measured noise.
+    """One factor for every pair of frames that snippets measured, ``T_first_last``, unscaled, with calibrated noise.
 
     Args:
         snippets: measured by the network.
-        geometric: what image geometry measured, unscaled, with all of its noise.
+        geometric: measured by image geometry, unscaled, with its full noise.
         noise: of this network.
-        config: ``noise_steps`` common steps are needed before the drive may scale the noise.
+        config: the noise is scaled from ``noise_steps`` common steps on.
     """
     pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
     if not pairs:
@@ -97,24 +97,24 @@ def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]
 def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
     """Factors ``(P, 6)`` on the sigmas of pairs, by ``whitened`` ``(P, 6)`` differences from image geometry.
 
-    One for each distance in frames and, where enough are measured, each third of the turns a frame; 1 where few are.
+    One for each distance in frames and, with enough measurements, each tertile of the turn rate; 1 with few.
     """
     scaling = np.ones_like(whitened)
     frames = np.array([pair.last - pair.first for pair in pairs])
-    turns = np.array([pair.turn for pair in pairs]) / frames
+    turn_rates = np.array([pair.turn for pair in pairs]) / frames
     measured = np.isfinite(whitened).all(axis=1)
     for distance in np.unique(frames):
-        alike = frames == distance
-        seen = alike & measured
+        at_distance = frames == distance
+        seen = at_distance & measured
         if seen.sum() < least:
             continue
-        borders = np.quantile(turns[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
-        third = np.searchsorted(borders, turns)
+        borders = np.quantile(turn_rates[seen], (1 / 3, 2 / 3)) if seen.sum() >= 3 * least else []
+        third = np.searchsorted(borders, turn_rates)
         for which in np.unique(third[seen]):
             factors = mad_sigmas(whitened[seen & (third == which)])
-            scaling[alike & (third == which)] = np.maximum(factors, _LEAST_SCALING)
+            scaling[at_distance & (third == which)] = np.maximum(factors, _LEAST_SCALING)
             logger.info(
-                "pose network's noise over %d frames, turns %d of %d: times %s",
+                "pose network's noise over %d frames, turn rate class %d of %d: times %s",
                 distance,
                 which + 1,
                 len(borders) + 1,
@@ -127,28 +127,28 @@ def _persistence(pairs: Sequence[PairPose], whitened: FloatArray, least: int) ->
     """Factors ``(P, 6)`` on the sigmas of pairs for the correlation of their errors along the drive.
 
     The network's errors on neighbouring snippets are correlated. Sums of whitened errors over a quarter of the drive
-    are compared with those of independent errors. Where few pairs are measured, errors are taken to be the same over a
-    quarter of the drive. Pairs of different distances in frames repeat each other, so each distance counts as a part.
+    are compared with those of independent errors. With few measured pairs, errors are taken as constant over a
+    quarter of the drive. Pairs of different distances in frames are redundant: each distance counts as one part.
     """
     factors = np.ones_like(whitened)
     frames = np.array([pair.last - pair.first for pair in pairs])
     distances = np.unique(frames)
     for distance in distances:
-        alike = frames == distance
-        errors = whitened[alike & np.isfinite(whitened).all(axis=1)]
+        at_distance = frames == distance
+        errors = whitened[at_distance & np.isfinite(whitened).all(axis=1)]
         stretch = len(errors) // _STRETCHES
         if stretch < least:
-            factors[alike] = np.sqrt(max(alike.sum() // _STRETCHES, 1))
+            factors[at_distance] = np.sqrt(max(at_distance.sum() // _STRETCHES, 1))
             continue
         added = np.cumsum(np.vstack([np.zeros(6), errors]), axis=0)
-        grown = mad_sigmas(added[stretch:] - added[:-stretch]) / np.sqrt(stretch)
-        factors[alike] = np.maximum(grown, 1.0)
-        logger.info("pose network's noise over %d frames, along the drive: times %s", distance, grown.round(2))
+        growth = mad_sigmas(added[stretch:] - added[:-stretch]) / np.sqrt(stretch)
+        factors[at_distance] = np.maximum(growth, 1.0)
+        logger.info("pose network's noise over %d frames, along the drive: times %s", distance, growth.round(2))
     return np.asarray(factors * np.sqrt(len(distances)))
 
 
 def _noise_of_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]) -> FloatArray:
-    """Sigmas ``(P, 6)`` of the steps between the frames of pairs, as geometry states them; else its usual ones."""
+    """Sigmas ``(P, 6)`` of the chained geometric steps between the frames of pairs; median ones where not measured."""
     if not steps:
         return np.zeros((len(pairs), 6))
     by_start = shortest_by_start(steps)
@@ -169,7 +169,7 @@ def without_measured(factors: Sequence[RelativePose], geometric: Sequence[Relati
     """The factors between whose frames image geometry did not measure every step.
 
     The network's errors on neighbouring snippets are correlated: beside a geometric factor of the same step, many of
-    its factors would count as many measurements where they are one, and a worse one.
+    its factors would count as many independent measurements, where they are one less accurate one.
     """
     by_start = shortest_by_start(pose.ends for pose in geometric)
     return [factor for factor in factors if path_between(by_start, *sorted(factor.ends)) is None]
@@ -178,13 +178,13 @@ def without_measured(factors: Sequence[RelativePose], geometric: Sequence[Relati
 def measured_noise(
     snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], config: FrontendConfig
 ) -> FrontendConfig:
-    """The noise of this network on this drive, where image geometry measured the same steps.
+    """The noise of this network on this drive, by comparison with image geometry.
 
-    Sigmas are 1.48 times the median absolute disagreement of one-frame steps, never below the configured ones;
-    with fewer than ``noise_steps`` common steps the configured ones stand.
+    Sigmas are 1.48 times the median absolute difference of one-frame steps, at least the configured ones;
+    with fewer than ``noise_steps`` common steps the configured ones are used.
     """
     by_pair = {(g.from_index, g.to_index): g.T_from_to for g in geometric}
-    turns, shifts = [], []
+    rotations, shifts = [], []
     for snippet in snippets:
         for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
             T_geometric = by_pair.get((source, snippet.target))
@@ -192,11 +192,11 @@ def measured_noise(
             if T_geometric is None or abs(snippet.target - source) != 1 or length == 0:
                 continue
             error = invert(T_geometric) @ T_source_target
-            turns.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
+            rotations.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
             shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
-    if len(turns) < config.noise_steps:
+    if len(rotations) < config.noise_steps:
         return config
-    rotation, shift = (mad_sigma(np.concatenate(e)) for e in (turns, shifts))
+    rotation, shift = (mad_sigma(np.concatenate(e)) for e in (rotations, shifts))
     return config.model_copy(
         update={
             "rotation_sigma_deg": max(config.rotation_sigma_deg, float(np.rad2deg(rotation))),
@@ -206,7 +206,7 @@ def measured_noise(
 
 
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
-    """The raw network trajectory: target to next source of each snippet in turn, and nothing else.
+    """The raw network trajectory: target to next source of each snippet, without a graph.
 
     Frames before the first target and after the last come from those two snippets' direct poses.
 

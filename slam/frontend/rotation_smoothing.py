@@ -1,7 +1,7 @@
 """Rotations of single steps corrected by relative rotations across several steps.
 
-A corner errs by as much over two steps as over one, and where its window drifts to one side it does so in every step.
-Measured between frames that lie farther apart, the same error is made half as often
+The tracking error of a corner is the same over two steps as over one, and a drift of its window is a bias of every
+step. Measured between frames two steps apart, the same error enters half as often
 (``docs/design/visual-front-end.md``).
 """
 
@@ -28,14 +28,14 @@ _BLOCK = np.arange(9)
 
 
 def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRotation]) -> StepTable:
-    """The table with the rotations that explain single steps and relative rotations best, robustly.
+    """The table with rotations fitted robustly to single steps and relative rotations.
 
-    Least squares over one small rotation for each triangulated step, in its current camera. The error of a relative
-    rotation is the sum of those of its steps, each seen from its last camera.
+    Least squares over one small rotation for each triangulated step, in its current camera. The residual of a
+    relative rotation is the sum of the corrections of its steps, each in its last camera.
 
     Args:
         table: of all steps.
-        relative_rotations: those with a step that is not triangulated are not used.
+        relative_rotations: those over a step that is not triangulated are not used.
     """
     motions = table.triangulated
     by_start = shortest_by_start(motions)
@@ -44,7 +44,7 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
     if not usable:
         return table
     A, target = _equations(motions, usable)
-    # relative rotations that overlap share their images: as many as overlap count as one
+    # relative rotations that overlap share their images: overlapping ones count as one
     overlapping = max(len(path) for _, path in usable)
     sigmas = np.concatenate([motion.relative_pose.sigmas[:3] for motion in motions.values()])
     own = 1.0 / (_STEP_WIDENING * sigmas) ** 2
@@ -64,7 +64,7 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
 def _equations(
     motions: Mapping[Ends, Motion], usable: Sequence[tuple[RelativeRotation, list[Ends]]]
 ) -> tuple[csr_array, FloatArray]:
-    """Whitened rows of all relative rotations over the steps' corrections, and what they should come to."""
+    """Whitened equations of all relative rotations in the corrections of steps: matrix and right side."""
     place = {ends: 3 * n for n, ends in enumerate(motions)}
     rows, columns, entries, target = [], [], [], []
     for n, (rotation, path) in enumerate(usable):

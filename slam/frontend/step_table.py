@@ -1,8 +1,8 @@
 """Every motion that image geometry measured, kept once under its two frames, unscaled.
 
-A step leads from a frame to a later one: mostly to the next, but it may also lead over a gap or from a keyframe. The
-links of a drive are the steps that follow each other from the first frame to the last; where no step was measured, a
-link leads to the next frame.
+A step is from a frame to a later one: usually the next, but it may also cross a gap or start at a keyframe. The
+links of a drive are consecutive steps from the first frame to the last; where no step was measured, a
+link is to the next frame.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class StepTable:
 
     @classmethod
     def of(cls, motions: Iterable[Motion]) -> StepTable:
-        """A table of motions; a later one takes the place of an earlier one between the same frames."""
+        """A table of motions; a later one replaces an earlier one between the same frames."""
         return cls({motion.ends: motion for motion in motions})
 
     def __iter__(self) -> Iterator[Motion]:
@@ -36,26 +36,26 @@ class StepTable:
 
     @property
     def relative_poses(self) -> list[RelativePose]:
-        """What was measured, unscaled."""
+        """All relative poses, unscaled."""
         return [motion.relative_pose for motion in self]
 
     @property
     def triangulated(self) -> dict[Ends, Motion]:
-        """The motions whose rotation and direction are by corners alone: their length may come from elsewhere."""
+        """The motions whose rotation and direction are by corners alone, so that their length is free."""
         return {ends: motion for ends, motion in self.motions.items() if motion.triangulated is not None}
 
     def replaced(self, motions: Mapping[Ends, Motion]) -> StepTable:
-        """The same with other motions in the place of some."""
+        """The same with some motions replaced."""
         return replace(self, motions={**self.motions, **motions})
 
     def without_frames(self, frames: Collection[int]) -> StepTable:
-        """The steps that neither begin nor end at some frames."""
+        """The steps that neither begin nor end at these frames."""
         kept = {ends: motion for ends, motion in self.motions.items() if not set(ends).intersection(frames)}
         return replace(self, motions=kept)
 
 
 def shortest_by_start(steps: Iterable[Ends]) -> dict[int, Ends]:
-    """Of the steps that begin at a frame the shortest one, by that frame."""
+    """The shortest step from each frame, by that frame."""
     shortest: dict[int, Ends] = {}
     for ends in sorted(steps):
         shortest.setdefault(ends[0], ends)
@@ -63,7 +63,7 @@ def shortest_by_start(steps: Iterable[Ends]) -> dict[int, Ends]:
 
 
 def path_between(by_start: Mapping[int, Ends], first: int, last: int) -> list[Ends] | None:
-    """Steps from a frame to a later one, each beginning where the one before ends; None where one is missing."""
+    """Consecutive steps from a frame to a later one; None where one is missing."""
     path: list[Ends] = []
     while first < last:
         if first not in by_start:
@@ -74,7 +74,7 @@ def path_between(by_start: Mapping[int, Ends], first: int, last: int) -> list[En
 
 
 def links(steps: Iterable[Ends], frames: int) -> list[Ends]:
-    """The steps that follow each other from frame 0 to the last one; single frames where no step begins."""
+    """Consecutive steps from frame 0 to the last one; from a frame without a step, to the next frame."""
     by_start = shortest_by_start(steps)
     found: list[Ends] = []
     frame = 0

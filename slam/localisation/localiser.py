@@ -54,7 +54,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
     paths = _image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
-        raise RunError(f"{run.path} keeps no places: it ran with loops.enabled=false; run the sequence again")
+        raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
     own_camera = _camera_file(camera, paths[0].parent)
     localiser = Localiser(
         places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
@@ -79,7 +79,7 @@ class Localiser:
         Args:
             places: of an old run, at least one view.
             config: thresholds, those of the run's own loops.
-            intrinsics: of the new images; None for those of the run, to whose size images are resized.
+            intrinsics: of the new images; None for those of the run, with images resized to it.
         """
         self._places = places
         self._config = config
@@ -98,7 +98,7 @@ class Localiser:
         view = self._view(image)
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
-            return Localisation(name, reason="no place of the map looks like it")
+            return Localisation(name, reason="no place of the map is similar")
         hypotheses: list[_PoseHypothesis] = []
         reasons: list[str] = []
         for row in rows:
@@ -108,11 +108,11 @@ class Localiser:
             else:
                 hypotheses.append(found)
         if not hypotheses:
-            return Localisation(name, reason=f"{len(rows)} places look like it; of the first, {reasons[0]}")
+            return Localisation(name, reason=f"{len(rows)} similar places; at the first, {reasons[0]}")
         best = max(hypotheses, key=lambda hypothesis: hypothesis.inliers)
         support = sum(self._agree(best, other) for other in hypotheses) - 1
         if support == 0 and best.inliers < self._config.alone_inliers:
-            reason = f"frame {best.frame} sees it with {best.inliers} corners, and no other place agrees"
+            reason = f"only the place of frame {best.frame} supports a pose ({best.inliers} inliers)"
             return Localisation(name, reason=reason)
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - best.T_world_camera[:3, 3], axis=1)
         nearest = self._places.views[int(away.argmin())].index

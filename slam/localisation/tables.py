@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def localisation_table(found: Sequence[Localisation]) -> Table:
-    """One row an image: position in the map, nearest frame of the run, corners that agree, or why not found."""
+    """One row an image: position in the map, nearest frame of the run, inliers, or why not found."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text
@@ -39,7 +39,7 @@ def localisation_table(found: Sequence[Localisation]) -> Table:
 
 
 def localisation_json(found: Sequence[Localisation]) -> list[dict[str, Any]]:
-    """One object an image; what is not known is null with a reason."""
+    """One object an image; unknown values are null with a reason."""
     entries: list[dict[str, Any]] = []
     for each in found:
         entry: dict[str, Any] = {"image": each.image, "found": each.T_world_camera is not None}

@@ -26,9 +26,9 @@ MOST_REJECTED = 200
 
 @dataclass(frozen=True)
 class LoopClosures:
-    """The result for all candidates: ``verified`` were measured, ``accepted`` are those of them that are consistent.
+    """The result for all candidates: ``verified`` loops were measured, ``accepted`` ones are consistent.
 
-    ``not_sought`` is the reason where no search was made.
+    ``not_sought`` is the reason for no search.
     """
 
     candidates: int = 0
@@ -66,7 +66,7 @@ class LoopClosures:
             "accepted": [
                 {
                     **_entry(*loop.ends, loop.inliers, loop.score),
-                    "reason": f"{loop.inliers} corners agree in both directions",
+                    "reason": f"{loop.inliers} inliers in both directions",
                     "T_from_to": loop.measured.T_from_to.tolist(),
                     "sigmas": loop.measured.sigmas.tolist(),
                 }
@@ -96,7 +96,7 @@ def close_loops(
     get_or_compute: GetOrCompute = without_cache,
     seed: int = 0,
 ) -> LoopClosures:
-    """Find the loops of a drive, after its last frame: some drives close only in their last metres.
+    """Find the loops of a drive, once after its last frame.
 
     Args:
         views: in time order, their points in the unit of the trajectory.

@@ -23,7 +23,7 @@ def agreeing(
     Args:
         loops: verified, in the unit of the trajectory.
         T_world_camera: odometry ``(N, 4, 4)``.
-        config: thresholds; how near neighbours are and how much they may differ.
+        config: thresholds of nearness and of agreement.
     """
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))])
     possible, kept, refused = [], [], []
@@ -31,16 +31,16 @@ def agreeing(
         earlier, later = loop.ends
         T_earlier_later = invert(T_world_camera[earlier]) @ T_world_camera[later]
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
-        way = path[later] - path[earlier]
-        if drift > config.max_drift_ratio * way:
-            refused.append(loop.refused(f"corrects the odometry by {drift:.1f} over a path of {way:.0f}"))
+        length = path[later] - path[earlier]
+        if drift > config.max_drift_ratio * length:
+            refused.append(loop.refused(f"corrects the odometry by {drift:.1f} over a path of {length:.0f}"))
         else:
             possible.append(loop)
     for loop, (supporting, conflicting) in zip(possible, _votes(possible, T_world_camera, config), strict=True):
         if conflicting > supporting:
             refused.append(loop.refused(f"contradicted by {conflicting} of {conflicting + supporting} loops nearby"))
         elif supporting < config.min_support and loop.inliers < config.alone_inliers:
-            refused.append(loop.refused(f"stands alone: {supporting} loops nearby agree"))
+            refused.append(loop.refused(f"lacks support: {supporting} loops nearby agree"))
         else:
             kept.append(loop)
     return kept, refused
@@ -57,13 +57,13 @@ def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfi
         near = np.flatnonzero((distance <= config.support_frames).all(axis=1) & (distance[:, 1] > 0))
         T_earlier = invert(T_world_camera[earlier]) @ T_world_camera[ends[near, 0]]
         T_later = invert(T_world_camera[ends[near, 1]]) @ T_world_camera[later]
-        ring = invert(T_from_to[k]) @ T_earlier @ T_from_to[near] @ T_later
-        turned = rotation_angle(ring[:, :3, :3])
-        moved = np.linalg.norm(ring[:, :3, 3], axis=1)
+        cycle = invert(T_from_to[k]) @ T_earlier @ T_from_to[near] @ T_later
+        rotation = rotation_angle(cycle[:, :3, :3])
+        translation = np.linalg.norm(cycle[:, :3, 3], axis=1)
         own = np.hypot(sigmas[near], sigmas[k])
-        way = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
+        length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
         drift = np.deg2rad(config.support_drift_deg) * distance[near].sum(axis=1)
-        agrees = turned < config.support_sigmas * own[:, 0] + drift
-        agrees &= moved < config.support_sigmas * own[:, 3] + config.support_drift_ratio * way
+        agrees = rotation < config.support_sigmas * own[:, 0] + drift
+        agrees &= translation < config.support_sigmas * own[:, 3] + config.support_drift_ratio * length
         votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
     return votes

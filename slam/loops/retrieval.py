@@ -1,7 +1,7 @@
-"""Place recognition: a bag of binary words learned on the run itself, compared by tf-idf.
+"""Place recognition: a bag of binary words trained on the run itself, compared by tf-idf.
 
 As in DBoW2 (Galvez-Lopez and Tardos 2012), with one flat vocabulary instead of a downloaded tree: a run has
-few enough frames for it, and words learned on its own images discriminate better.
+few enough frames for it, and words trained on its own images discriminate better.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def find_candidates(
     Args:
         views: in time order.
         path_m: distance driven up to each view ``(V,)``, in the unit of the trajectory.
-        config: how many, and how far apart in time and distance.
+        config: number of candidates, least distance in time and path.
         get_or_compute: cache of the words.
     """
     everything = _all_descriptors(views)
@@ -87,8 +87,8 @@ class PlaceIndex:
         if not len(self._words) or not len(view):
             return []
         word = nearest_words(view.descriptors, self._words)
-        asked = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
-        scores = (self._weights @ asked.T).toarray().ravel()
+        query = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
+        scores = (self._weights @ query.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
 

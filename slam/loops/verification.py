@@ -68,7 +68,7 @@ class LoopVerifier:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
         given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
         rows_earlier, rows_later = self._get_or_compute(
-            "corners alike", given, lambda: matches(earlier, later, self._config)
+            "loop matches", given, lambda: matches(earlier, later, self._config)
         )
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
@@ -85,11 +85,11 @@ class LoopVerifier:
             return refused(f"backwards {backward}", forward.inliers, T_earlier_later)
         inliers = min(forward.inliers, backward.inliers)
         difference = forward.T_image_points @ backward.T_image_points
-        turned_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
+        rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, backward.depth)
-        moved_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
-        if turned_deg > self._config.agreement_deg or moved_ratio > self._config.agreement_ratio:
-            reason = f"both directions differ by {turned_deg:.1f} degrees and {moved_ratio:.0%} of the depth"
+        translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
+        if rotation_deg > self._config.agreement_deg or translation_ratio > self._config.agreement_ratio:
+            reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers, T_earlier_later)
         T_middle = _halfway(T_earlier_later, backward.T_image_points)
         sigmas = self._sigmas(T_middle, depth, difference, forward, backward)
@@ -97,7 +97,7 @@ class LoopVerifier:
         return Loop(measured, inliers, score)
 
     def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
-        """The camera that sees ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or why there is none.
+        """The camera pose from ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or the reason for none.
 
         Points with NaN are left out.
         """
@@ -110,10 +110,10 @@ class LoopVerifier:
         found = consensus(points_known, pixels_known, K, config.ransac_iterations, config.reprojection_px, self._seed)
         count = 0 if found is None else len(found[2])
         if found is None or count < config.min_inliers or count < config.min_inlier_ratio * len(points_known):
-            return f"only {count} of {len(points_known)} matches agree"
+            return f"only {count} of {len(points_known)} matches are inliers"
         extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < config.min_spread_ratio or extent[1] < config.min_spread_ratio / 2:
-            return f"{count} agreeing matches in a corner of the image"
+            return f"{count} inliers in a small part of the image"
         return Sighting(refine(points_known, pixels_known, K, found), float(np.median(points_known[found[2], 2])))
 
     def _sigmas(
@@ -121,34 +121,34 @@ class LoopVerifier:
     ) -> FloatArray:
         """Sigmas ``(6,)`` in camera b: of corners, of learned depth, and half the difference of both directions.
 
-        Both directions use the same corners, whose errors are correlated: averaging them does not narrow the sigmas.
+        Both directions use the same corners, whose errors are correlated: averaging does not reduce the sigmas.
         """
         config = self._config
         corners = config.corner_sigma_widening * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
-        turned = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
-        disagreement = np.concatenate([turned, difference[:3, 3]]) / 2
-        way = config.length_relative_sigma * float(np.linalg.norm(T_a_b[:3, 3]))
+        rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
+        disagreement = np.concatenate([rotation, difference[:3, 3]]) / 2
+        length_sigma = config.length_relative_sigma * float(np.linalg.norm(T_a_b[:3, 3]))
         floors = np.repeat(
-            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_ratio * depth, way)], 3
+            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_ratio * depth, length_sigma)], 3
         )
         return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """Points seen again by the camera of an image, at a median z-depth in the camera that measured them."""
+    """Points resected in an image; ``depth`` is their median z-depth in the camera that measured them."""
 
     resection: Resection
     depth: float
 
     @property
     def T_image_points(self) -> FloatArray:
-        """Takes the points to the camera of the image ``(4, 4)``."""
+        """Transform ``(4, 4)`` of the points to the camera of the image."""
         return self.resection.T_camera_points
 
     @property
     def inliers(self) -> int:
-        """Number of points that agree."""
+        """Number of inliers."""
         return len(self.resection.inliers)
 
 

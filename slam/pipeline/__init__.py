@@ -1,1 +1,1 @@
-"""The system at work: one pass over all frames, frames as they come, and a session kept on disk."""
+"""The pipeline: batch runs over all frames, live sessions frame by frame, and their checkpoints on disk."""

@@ -1,4 +1,4 @@
-"""The whole system on one sequence: `SlamPipeline.run` is its table of contents."""
+"""The whole system on one sequence; `SlamPipeline.run` lists its stages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ EXAMPLES = 5
 
 @dataclass(frozen=True)
 class Measurements:
-    """All relative poses with their noise, and the trajectories that they chain to ``(N, 4, 4)``."""
+    """All relative poses with their noise, and the trajectories chained from them ``(N, 4, 4)``."""
 
     T_network: FloatArray
     lidar: LidarPath | None
@@ -53,9 +53,9 @@ class Measurements:
 
 @dataclass(frozen=True)
 class SlamResult:
-    """Trajectories with one row a frame, the graph, the map and how they came about.
+    """Trajectories with one row a frame, the graph, the map and the measurements.
 
-    ``state`` is what another run goes on from.
+    ``state`` is that of the observer, for a run that continues this one.
     """
 
     network: Trajectory
@@ -93,10 +93,10 @@ class SlamPipeline:
             sequence: frames in time order.
             predictor: depth and snippet poses.
             config: of all parts.
-            progress: told the stage, and how much of it is done.
+            progress: called with the stage, done and total.
             noise: of the snippet poses; None measures it against image geometry alone.
-            get_or_compute: a cache of what depends on images alone.
-            checkpoint: what was measured on the first frames of the sequence, whose images are then not read.
+            get_or_compute: a cache of image measurements.
+            checkpoint: measurements of the first frames of the sequence, whose images are then not read.
             seed: of all RANSAC draws.
         """
         if noise is None:
@@ -115,8 +115,8 @@ class SlamPipeline:
         """Run the whole system.
 
         Raises:
-            SlamError: the sequence is too short, unreadable, lacks what the scale mode wants, or leaves the graph
-                without a solution.
+            SlamError: the sequence is too short, unreadable or lacks what the scale mode needs, or the graph has no
+                solution.
         """
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
@@ -129,7 +129,7 @@ class SlamPipeline:
         observations, state = self._observe()
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
-            logger.warning("frames %d to %d bridged by interpolation: %s", first, last, reason)
+            logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
         graph, T_optimised = self._optimise(measured.factors, loops, measured.T_odometry)
@@ -150,17 +150,17 @@ class SlamPipeline:
         )
 
     def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
-        """The front end: rotations, scale and lengths, then all factors and the odometry they chain to."""
+        """The front end: rotations, scale and lengths, then all factors and the odometry chained from them."""
         T_network = chain_raw(seen.snippets, len(self._sequence))
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
-        lidar = self._follow_lidar()
+        lidar = self._register_lidar()
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated)
         scale = self._find_scale(mode, seen, unscaled, lidar, T_network)
         factors = self._factors(unscaled, scale, self._lidar_factors(lidar))
         return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))
 
     def close_loops(self, views: Sequence[View], measured: Measurements) -> LoopClosures:
-        """Places seen before, looked for among all views after the last frame."""
+        """Loops among all views, after the last frame."""
         with self._watch.stage("loops"):
             scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in views]
             intrinsics, config = self._sequence.intrinsics, self._config.loops
@@ -185,10 +185,10 @@ class SlamPipeline:
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
-        """The scale mode of this run; refuses before any work what could only fail after all of it.
+        """The scale mode of this run, after checks that it can succeed.
 
         Raises:
-            SlamError: too few frames, or something is missing that the configuration asks for.
+            SlamError: too few frames, or the sequence lacks what the configuration needs.
         """
         sequence, shortest = self._sequence, self._predictor.sources + 1
         if len(sequence) < shortest:
@@ -220,7 +220,9 @@ class SlamPipeline:
         first = 0 if checkpoint is None else len(checkpoint.stamps)
         state = None if checkpoint is None else checkpoint.state
         if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
-            logger.warning("the map begins at frame %d: nothing for it is kept (output.keep=keyframes does)", first)
+            logger.warning(
+                "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
+            )
         examples = np.linspace(first, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
         observer = Observer(
             self._predictor,
@@ -249,7 +251,7 @@ class SlamPipeline:
         lidar: LidarPath | None,
         T_network: FloatArray,
     ) -> Scale:
-        """The unit of length, as the mode wants it, and the lengths of all steps."""
+        """The unit of length by the mode, and the lengths of all steps."""
         config, sequence = self._config, self._sequence
         by_lidar = [] if lidar is None else lidar_steps(lidar, config.lidar)
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
@@ -269,7 +271,7 @@ class SlamPipeline:
     def _optimise(
         self, factors: Sequence[RelativePose], loops: LoopClosures, T_odometry: FloatArray
     ) -> tuple[PoseGraph, FloatArray]:
-        """The trajectory that explains all measurements best, without the loops that contradict it."""
+        """The optimised trajectory, without the loops that contradict it."""
         graph = PoseGraph(self._config.pose_graph)
         graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
         with self._watch.stage("graph"):
@@ -278,8 +280,8 @@ class SlamPipeline:
                 T_optimised = graph.optimise(T_odometry)
         return graph, T_optimised
 
-    def _follow_lidar(self) -> LidarPath | None:
-        """What the LiDAR on the same car measured."""
+    def _register_lidar(self) -> LidarPath | None:
+        """LiDAR odometry, where the sequence has scans."""
         with self._watch.stage("lidar"):
             return lidar_path(self._sequence)
 

@@ -1,6 +1,6 @@
-"""A session on disk: all that was measured of a drive so far, without its images, so that it can go on.
+"""A checkpoint of a session on disk: all measurements of a drive so far, without its images.
 
-The frames that follow are looked at as if there had been no pause. Lengths, noise, loops and graph are then found anew
+The frames that follow are measured as without an interruption. Lengths, noise, loops and graph are then computed anew
 for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 
@@ -43,7 +43,7 @@ DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
 
 @dataclass(frozen=True)
 class SessionCheckpoint:
-    """A drive up to its last frame, measured with the networks ``weights_sha256``; the rest as of a `Sequence`."""
+    """A drive up to its last frame, measured with the networks ``weights_sha256``; other fields as of a `Sequence`."""
 
     name: str
     sources: tuple[str, ...]
@@ -56,7 +56,7 @@ class SessionCheckpoint:
 
     @classmethod
     def of(cls, sequence: FrameSequence, state: ObserverState, weights_sha256: str) -> Self:
-        """A drive whose last frame an observer has seen; of its images nothing is kept."""
+        """From the state of an observer after the last frame, without images."""
         without_images = replace(state, seen=replace(state.seen, keyframes=[], examples=[]))
         return cls(
             sequence.name,
@@ -70,7 +70,7 @@ class SessionCheckpoint:
         )
 
     def write(self, path: Path) -> None:
-        """Write all of it; what is in the file stands in ``docs/outputs.md``."""
+        """Write a file as in ``docs/outputs.md``."""
         _SERIALISER.write(path, self)
 
     @classmethod
@@ -87,7 +87,7 @@ class SessionCheckpoint:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Read what a run left in its folder, keyframes where it kept them; raises as ``read``."""
+        """Read the checkpoint of a run folder, with keyframes where they were kept; raises as ``read``."""
         if not (folder / DRIVE).is_file():
             raise RunError(
                 f"{folder} cannot be continued: it has no {DRIVE}; give a folder that 'erfsfm-slam run' wrote and "
@@ -99,7 +99,7 @@ class SessionCheckpoint:
         return checkpoint
 
     def continued(self, following: FrameSequence) -> Continued:
-        """All frames of the drive with those that follow.
+        """The drive extended by the frames that follow.
 
         Raises:
             SequenceError: another camera.

@@ -1,4 +1,4 @@
-"""The system on frames as they come: the pipeline's own steps, and iSAM2 in place of the batch solver."""
+"""Live sessions: the steps of the batch pipeline frame by frame, and iSAM2 in place of the batch solver."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from slam.trajectory import Trajectory
 
 
 class Slam:
-    """Monocular SLAM fed frame by frame; it keeps no images and makes no map.
+    """Monocular SLAM frame by frame; it keeps no images and makes no map.
 
     Measurements are those of the pipeline, causally. Lengths and noise are estimated anew as the drive goes on, so
     earlier poses move a little with every update.
@@ -52,23 +52,23 @@ class Slam:
             intrinsics: of all images.
             config: None for the defaults.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
-            update_frames: the graph is solved after so many frames, and when it is asked.
-            sweep_frames: loops are looked for after so many frames; 0 leaves it to ``close_loops``.
+            update_frames: the graph is solved after so many frames, and in `trajectory`.
+            sweep_frames: loops are searched after so many frames; 0: only in ``close_loops``.
             noise: of the snippet poses; None measures it against image geometry alone.
-            weights_sha256: of the networks, so that a session of others is not resumed.
+            weights_sha256: of the networks, to refuse resuming a session of others.
             seed: of all RANSAC draws.
 
         Raises:
-            SlamError: a scale mode that wants more than images.
+            SlamError: a scale mode that needs more than images.
         """
         config = config or SlamConfig()
         self._mode = resolve_mode(config.scale, camera_height_m)
         if self._mode in ("reference", "lidar"):
-            raise SlamError(f"scale mode {self._mode} wants a whole sequence: choose camera-height or none")
+            raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
         if config.lidar.factors:
-            raise SlamError("lidar.factors=true wants a whole sequence with LiDAR scans: leave the setting out")
+            raise SlamError("lidar.factors=true needs a whole sequence with LiDAR scans: leave the setting out")
         if self._mode == "camera-height" and camera_height_m is None:
-            raise SlamError("scale mode camera-height wants camera_height_m: give it or choose scale.mode=none")
+            raise SlamError("scale mode camera-height needs camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = config.model_copy(update={"mapping": without_map})
         self._weights_sha256 = weights_sha256
@@ -80,7 +80,7 @@ class Slam:
         self._graph = IncrementalPoseGraph(config.pose_graph)
         self._shortest = predictor.sources + 1
         self._update_frames, self._sweep_frames = update_frames, sweep_frames
-        self._loops = LoopClosures(not_sought="no sweep yet")
+        self._loops = LoopClosures(not_sought="no search for loops yet")
         self._per_frame = np.ones(0)  # scale at which the loops were measured
         self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
 
@@ -115,7 +115,7 @@ class Slam:
         self.close()
 
     def close(self) -> None:
-        """Finish with every frame so far and end the threads; what was measured can still be asked for."""
+        """Finish every frame so far and end the threads; results stay available."""
         self._is_closed = True
         try:
             self._observer.flush()
@@ -123,7 +123,7 @@ class Slam:
             self._observer.close()
 
     def add_frame(self, image: Image, stamp: float) -> None:
-        """Take the next frame.
+        """Process the next frame.
 
         Args:
             image: ``(H, W, 3)`` uint8 RGB at the size of the intrinsics.
@@ -140,12 +140,12 @@ class Slam:
             raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
         if not np.isfinite(stamp) or (len(self) and not stamp > self._sequence.stamps[-1]):
             raise ValueError(f"stamps must increase; got {stamp} after {self._sequence.stamps[-1:].tolist()}")
-        image = image.copy()  # it is looked at again when the next one comes
+        image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)
         try:
             self._observer.add(index, Frame(index, float(stamp), image))
-        finally:  # an error may be about the frame before
+        finally:  # the error may be of the frame before
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
@@ -154,7 +154,7 @@ class Slam:
             self._update()
 
     def save(self, path: str | Path) -> None:
-        """Keep all that was measured in a file, for `resume`; frames may go on coming.
+        """Write all measurements to a file for `resume`; more frames may follow.
 
         Raises:
             SlamError: the file cannot be written.
@@ -163,13 +163,13 @@ class Slam:
         write_atomically(Path(path), checkpoint.write)
 
     def resume(self, path: str | Path) -> None:
-        """Go on after the last frame of what `save` kept, as if there had been no pause; loops are looked for anew.
+        """Continue after the last frame of a file by `save`, as without an interruption; loops are searched anew.
 
         Raises:
-            SlamError: frames came already, or the file is missing, damaged or of another camera or other weights.
+            SlamError: there are frames already, or the file is missing, damaged or of another camera or other weights.
         """
         if len(self):
-            raise SlamError(f"{path} is resumed before the first frame; {len(self)} came already")
+            raise SlamError(f"{path} can only be resumed before the first frame; there are {len(self)} already")
         checkpoint = SessionCheckpoint.read(Path(path))
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
@@ -179,7 +179,7 @@ class Slam:
         self._sequence.stamps = checkpoint.stamps
 
     def trajectory(self) -> Trajectory:
-        """All frames so far; where no snippet has been seen yet, the camera is taken to stand.
+        """All frames so far; before the first snippet the camera is assumed to stand.
 
         Raises:
             SlamError: no frame yet, or the graph cannot be solved.
@@ -191,7 +191,7 @@ class Slam:
         return Trajectory(self._sequence.stamps, self._T_world_camera.copy())
 
     def close_loops(self) -> LoopClosures:
-        """Look for places seen before among all frames so far; the graph takes those that agree."""
+        """Search loops among all frames so far and add the consistent ones to the graph."""
         measured = self._measure()
         if measured is not None:
             self._loops = self._pipeline.close_loops(self._observer.closed().views, measured)
@@ -226,7 +226,7 @@ class Slam:
 
 @dataclass
 class LiveSequence:
-    """A sequence that grows and is never read again."""
+    """A sequence that grows by a frame at a time; its images are not kept."""
 
     intrinsics: Intrinsics
     camera_height_m: float | None
@@ -239,7 +239,7 @@ class LiveSequence:
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
-        """Never: frames are looked at as they come."""
+        """Always ``SlamError``: images are not kept."""
         raise SlamError(f"frame {index} of a live drive is not kept")
 
     def scan_path(self, index: int) -> None:

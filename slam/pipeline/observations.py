@@ -1,4 +1,4 @@
-"""What one pass over the frames of a sequence measured."""
+"""The measurements of one pass over the frames of a sequence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from slam.storage.spill import SpilledArray, SpillFile
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What fusion needs of a frame, thinned, on disk until then."""
+    """A frame for fusion, thinned and spilled to disk."""
 
     index: int
     spilled_image: SpilledArray
@@ -56,8 +56,8 @@ class Observations:
     """Measurements in the networks' unit of length, collected frame by frame.
 
     ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
-    ``relative_rotations`` the rotations across several steps; ``failures`` says of which steps there is nothing and
-    why. ``unusable`` are frames that measured nothing and why, ``repeated`` those with the image of the one before.
+    ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
+    ``unusable`` are frames without a measurement, with the reason, ``repeated`` those with the image of the one before.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
@@ -75,7 +75,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class ClosedObservations:
-    """The observations of a pass with its gaps interpolated; nothing of interpolated frames is left but their steps."""
+    """The observations of a pass with its gaps interpolated; of interpolated frames only steps are kept."""
 
     roads: list[GroundPlane | MeasurementFailure]
     road_steps: dict[Ends, RoadStep]
@@ -88,7 +88,7 @@ class ClosedObservations:
 
     @classmethod
     def of(cls, seen: Observations, gaps: InterpolatedGaps) -> ClosedObservations:
-        """Leave out what was seen on interpolated frames."""
+        """Leave out views and keyframes of interpolated frames."""
         return cls(
             seen.roads,
             seen.road_steps,

@@ -44,7 +44,7 @@ def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
 
 @dataclass(frozen=True)
 class RecentFrame:
-    """A frame that later ones are measured against, with its depth ``(H, W)`` and camera height, both unscaled."""
+    """A frame to measure steps from, with its depth ``(H, W)`` and camera height, both unscaled."""
 
     frame: Frame
     depth: DepthMap
@@ -53,7 +53,7 @@ class RecentFrame:
 
 @dataclass(frozen=True)
 class ObserverState:
-    """Everything that an observer goes on from after a frame."""
+    """State of an observer after a frame."""
 
     seen: Observations
     gate: GateState
@@ -66,7 +66,7 @@ class ObserverState:
 
 @dataclass(frozen=True)
 class PendingFrame:
-    """A frame of which nothing but the networks was asked yet."""
+    """A frame submitted to the networks, whose other measurements are pending."""
 
     frame: Frame
     depth: Future[DepthMap]
@@ -83,11 +83,11 @@ class PendingTask:
 
 
 class Observer:
-    """Watches the frames of one sequence in time order; a context that ends its threads.
+    """Measures the frames of one sequence in time order; a context that ends its threads.
 
-    The networks look at a frame in a second thread while corners of the one before are tracked in the first; the road's
-    homography, relative rotations and keyframes are made in a third. A task that depends on another waits for it, and
-    its result is taken up with the next frame: results do not depend on which thread is faster.
+    The networks run in a second thread while corners of the frame before are tracked in the first; road homography,
+    relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
+    result is collected with the next frame, so results do not depend on the timing of threads.
     """
 
     def __init__(
@@ -101,16 +101,16 @@ class Observer:
         seed: int = 0,
         state: ObserverState | None = None,
     ) -> None:
-        """Prepare for the first frame, or go on from a state.
+        """Prepare for the first frame, or resume from a state.
 
         Args:
             predictor: depth and snippet poses.
             intrinsics: of all images.
             config: of all parts.
-            stopwatch: told where the time goes.
+            stopwatch: measures the time of stages.
             examples: frames to keep whole for the report.
-            get_or_compute: a cache of what depends on images alone.
-            seed: other seeds draw other RANSAC samples.
+            get_or_compute: a cache of image measurements.
+            seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
         """
         self._predictor = predictor
@@ -150,13 +150,13 @@ class Observer:
             executor.shutdown(wait=True, cancel_futures=True)
 
     def add(self, index: int, frame: Frame | SequenceError) -> None:
-        """Watch the next frame, or learn that there is no image of it.
+        """Process the next frame, or the reason why its image cannot be read.
 
         Raises:
             SequenceError: the frame's own, where too many in a row could not be read.
         """
         if isinstance(frame, SequenceError):
-            self._require_patience(frame)
+            self._require_readable(frame)
             self._leave_out(index, str(frame))
             return
         self._unread = 0
@@ -168,19 +168,19 @@ class Observer:
                 return
             if verdict == "repeated":
                 self._seen.repeated.append(index)
-        pending = self._ask_networks(frame)
+        pending = self._submit_networks(frame)
         try:
-            self._watch_pending()
+            self._process_pending()
         finally:
             self._pending = pending
 
     def flush(self) -> None:
-        """Finish with every frame so far."""
-        self._watch_pending()
+        """Finish every frame so far."""
+        self._process_pending()
         self._finish_tasks()
 
     def state(self) -> ObserverState:
-        """What another observer goes on from as if there had been no pause."""
+        """The state from which another observer continues as without an interruption."""
         self.flush()
         return ObserverState(
             self._seen,
@@ -194,7 +194,7 @@ class Observer:
 
     @property
     def frames(self) -> int:
-        """Number of frames taken so far."""
+        """Number of frames so far."""
         return len(self._seen.roads) + (self._pending is not None)
 
     @property
@@ -221,8 +221,8 @@ class Observer:
         )
         return ClosedObservations.of(seen, gaps)
 
-    def _require_patience(self, error: SequenceError) -> None:
-        """Let an unreadable image pass, a missing one always."""
+    def _require_readable(self, error: SequenceError) -> None:
+        """Raise after too many unreadable images in a row; missing ones are always accepted."""
         if isinstance(error, MissingFrameError) and self._config.gaps.enabled:
             return
         self._unread += 1
@@ -231,13 +231,13 @@ class Observer:
 
     def _leave_out(self, index: int, reason: str) -> None:
         try:
-            self._watch_pending()
-        finally:  # an error is about the frame before
+            self._process_pending()
+        finally:  # the error is of the frame before
             self._seen.unusable[index] = reason
             self._seen.roads.append(MeasurementFailure(reason))
             self._window = ()
 
-    def _ask_networks(self, frame: Frame) -> PendingFrame:
+    def _submit_networks(self, frame: Frame) -> PendingFrame:
         length = self._predictor.sources + 1
         self._window = (*self._window, frame)[-length:]
         depth = self._networks.submit(self._predictor.depth, frame)
@@ -245,22 +245,22 @@ class Observer:
             return PendingFrame(frame, depth, None)
         return PendingFrame(frame, depth, self._networks.submit(self._predictor.snippet, list(self._window)))
 
-    def _watch_pending(self) -> None:
-        """All but the networks, of the frame that arrived last."""
+    def _process_pending(self) -> None:
+        """All measurements but the networks' of the pending frame."""
         pending, self._pending = self._pending, None
         if pending is None:
             return
         try:
-            self._watch(pending)
+            self._process(pending)
         except Exception as error:
-            # whoever catches this may go on: the frame is a gap, and there is still one road a frame
+            # callers may continue after this: the frame becomes a gap, with one entry in ``roads`` as all frames
             self._tasks.clear()
             self._seen.unusable[pending.frame.index] = f"it could not be measured ({error})"
             if len(self._seen.roads) == pending.frame.index:
                 self._seen.roads.append(MeasurementFailure(str(error)))
             raise
 
-    def _watch(self, pending: PendingFrame) -> None:
+    def _process(self, pending: PendingFrame) -> None:
         frame = pending.frame
         with self._stopwatch.stage("geometry"):
             steps = self._measure_steps(frame)
@@ -285,7 +285,7 @@ class Observer:
         self._keep(frame, depth)
 
     def _measure_steps(self, current: Frame) -> list[tuple[Frame, Motion]]:
-        """Steps from earlier frames, by the depth of these; of those with triangulated points their first frame too."""
+        """Measure steps from earlier frames; returns those with triangulated points, with their first frames."""
         triangulated = []
         for back in self._steps:
             if len(self._recent) < back:
@@ -302,7 +302,7 @@ class Observer:
         return triangulated
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
-        """How to measure the rotation across the last steps, where each of them was triangulated."""
+        """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
         baseline = self._config.geometry.rotation_baseline_steps
         if baseline < 2 or len(self._recent) < baseline:
             return None
@@ -330,7 +330,7 @@ class Observer:
 
     def _finish_tasks(self) -> None:
         """Wait for the tasks of the last frame."""
-        tasks, self._tasks = self._tasks, []  # one that fails is not waited for again
+        tasks, self._tasks = self._tasks, []  # so that a failed one is not raised again
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 task.keep(task.result.result())

@@ -1,1 +1,1 @@
-"""Who answers for depth and snippet poses: the networks, a cache before them, or an oracle."""
+"""Predictors of depth and snippet poses: the networks, optionally cached, and an oracle for tests."""

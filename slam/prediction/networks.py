@@ -1,7 +1,7 @@
 """The trained networks behind the ``Predictor`` protocol: frames in, snippet poses and depth out.
 
-Answers of the networks may come from a cache. They are named there by the networks' identity and the digest of each
-image; disparity is kept as the network gave it, at its own size and precision.
+Outputs of the networks can be cached. Their key is the networks' identity and the digest of each image; disparity is
+cached at the size and precision of the network.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 
 class Networks(Protocol):
-    """What is asked of the networks (``erfsfm.inference.DepthPosePredictor``): each image is prepared once."""
+    """Interface of the networks (``erfsfm.inference.DepthPosePredictor``); each image is prepared once."""
 
     sources: int
 
     def prepare(self, image: Image) -> Any:
-        """An image as the networks take it."""
+        """An image as input of the networks."""
         ...
 
     def disparity(self, image: Any) -> NDArray[np.float32]:
@@ -48,24 +48,24 @@ class NetworkPredictor:
         get_or_compute: GetOrCompute = without_cache,
         answers: GetOrCompute = without_cache,
     ) -> None:
-        """Ask networks about the frames of one sequence.
+        """Predict for the frames of one sequence.
 
         Args:
-            networks: whom to ask.
+            networks: depth and pose network.
             intrinsics: of all images.
-            get_or_compute: a cache of what is measured on images and answers together.
-            answers: a cache of the networks' answers, of these very networks alone.
+            get_or_compute: a cache of measurements on images and network outputs.
+            answers: a cache of outputs of these networks alone.
         """
         self._networks = networks
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
         self._answers = answers
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
-        self._key = object()  # names answers in frames, which outlive the networks
+        self._key = object()  # key of outputs cached in frames, which outlive the networks
         self.sources = networks.sources
 
     def executor(self) -> Executor:
-        """One thread, in which torch leaves a core to whatever goes on beside the networks."""
+        """One thread, in which torch leaves a core to the other threads."""
         return ThreadPoolExecutor(max_workers=1, thread_name_prefix="networks", initializer=limit_torch_threads)
 
     def depth(self, frame: Frame) -> DepthMap:
@@ -76,10 +76,10 @@ class NetworkPredictor:
     def snippet(self, frames: Sequence[Frame]) -> SnippetPoses:
         """Poses of the sources of a snippet; the target is the middle frame."""
 
-        def ask() -> Answer:
+        def compute() -> Answer:
             return (self._networks.poses([self._prepared(frame) for frame in frames]),)
 
-        (T_source_target,) = self._answers("poses", frames, ask)
+        (T_source_target,) = self._answers("poses", frames, compute)
         middle = self.sources // 2
         sources = tuple(f.index for k, f in enumerate(frames) if k != middle)
         residuals = self._residuals(frames, self._disparity(frames[middle]), T_source_target)
@@ -88,7 +88,7 @@ class NetworkPredictor:
     def _residuals(
         self, frames: Sequence[Frame], disparity: NDArray[np.float32], T_source_target: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Photometric residual ``(N,)`` of each source, as a share of the images' difference."""
+        """Photometric residual ``(N,)`` of each source, over the difference of the images."""
 
         def measure() -> Answer:
             thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
@@ -99,10 +99,10 @@ class NetworkPredictor:
         return residuals
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
-        def ask() -> Answer:
+        def compute() -> Answer:
             return (self._networks.disparity(self._prepared(frame)),)
 
-        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], ask)[0])
+        return frame.derived((self._key, "disparity"), lambda: self._answers("disparity", [frame], compute)[0])
 
     def _prepared(self, frame: Frame) -> Any:
         return frame.derived((self._key, "prepared"), lambda: self._networks.prepare(frame.image))

@@ -1,4 +1,4 @@
-"""A predictor that knows the truth and errs by a chosen amount: it drives the whole SLAM without networks."""
+"""A predictor from ground truth with simulated errors, to test the system without networks."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _NOISE_CELL_PX = 32
 
 @dataclass(frozen=True)
 class OracleNoise:
-    """How an oracle errs.
+    """Simulated errors of an oracle.
 
     ``rotation_sigma`` (radians) is for a pair one frame apart and grows with the square root of the
-    distance; ``translation_relative_sigma`` is a share of the pair's length. ``scale_drift_sigma`` is the step
-    of a random walk of the logarithm of the unscaled unit, shared by depth and translation.
+    distance; ``translation_relative_sigma`` is relative to the pair's length. ``scale_drift_sigma`` is the step
+    of a random walk of the logarithm of the unscaled unit, common to depth and translation.
     ``depth_relative_sigma`` is the relative error of depth, smooth over patches as a network's is.
     """
 
@@ -36,7 +36,7 @@ class OracleNoise:
 
 
 class OraclePredictor:
-    """Implements ``Predictor`` from the truth; the answer for a frame does not depend on earlier calls."""
+    """Implements ``Predictor`` from ground truth; outputs do not depend on earlier calls."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class OraclePredictor:
         Args:
             T_world_camera: true poses ``(N, 4, 4)``, metres.
             depth_of: true z-depth ``(H, W)`` of a frame, metres, at the size of its image.
-            noise: how to err.
+            noise: the errors.
             unscaled_factor: unscaled lengths per metre.
             sources: source frames of a snippet, an even number.
         """
@@ -98,7 +98,7 @@ class OraclePredictor:
 
 
 class _Stream(IntEnum):
-    """What a random stream is for."""
+    """Purpose of a random stream."""
 
     SCALE = 0
     DEPTH = 1

@@ -1,1 +1,1 @@
-"""A run folder and everything that is written to it or made from it."""
+"""Run folders: their files, report, tables, figures and exports."""

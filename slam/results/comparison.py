@@ -18,7 +18,7 @@ NOT_RECORDED = "not recorded"
 
 @dataclass(frozen=True)
 class ErrorColumn:
-    """One number of a trajectory: where it stands inside T, what it is called, how it is written."""
+    """One number of a trajectory: its path inside T, name and number of decimals."""
 
     path: tuple[str, ...]
     name: str
@@ -71,7 +71,7 @@ def written(value: Any, decimals: int) -> str:
 
 
 def failure(metrics: Mapping[str, Any]) -> str:
-    """Why a run did not end well, in one line; empty for a run that did."""
+    """Why a run failed, in one line; empty if it did not."""
     if metrics.get("status") == "ok":
         return ""
     reason = metrics.get("reason") or metrics.get("status_reason") or metrics.get("error") or "no reason recorded"
@@ -79,7 +79,7 @@ def failure(metrics: Mapping[str, Any]) -> str:
 
 
 def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
-    """What a reader must know about the lengths of a run before comparing them."""
+    """Notes on the unit of length of a run."""
     mode, _ = lookup(metrics, "scale", "mode")
     notes = []
     if mode == "none":
@@ -94,7 +94,7 @@ def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def comparison_table(runs: Sequence[RunFolder]) -> Table:
-    """One row for each run and trajectory; runs that failed or were killed say why.
+    """One row for each run and trajectory; runs that failed or were killed with the reason.
 
     Raises:
         RunError: no run was given, or its ``metrics.json`` is damaged.
@@ -120,7 +120,7 @@ def comparison_table(runs: Sequence[RunFolder]) -> Table:
         names, *columns = zip(*rows) if rows else [()] * (1 + len(STATISTICS))
         table.add_row(title, *("\n".join(cells) for cells in (names, *columns)), end_section=True)
         if leak:
-            notes["LEAK: the weights have seen the sequence in training; the numbers are no test."] = None
+            notes["LEAK: the weights were trained on the sequence; the numbers are no test."] = None
         notes.update({f"{name}: {note}": None for note in unit_notes(metrics)})
     table.caption = Text("\n".join(["ATE and snippet ATE in metres, snippet RE in radians.", *notes]))
     return table
@@ -145,7 +145,7 @@ def comparison_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
 
 
 def run_names(runs: Sequence[RunFolder]) -> list[str]:
-    """Short names of runs: the folder's own, or the whole path where two share it."""
+    """Short names of runs: the folder's own, or the whole path where it is not unique."""
     names = [run.path.resolve().name for run in runs]
     return [str(run.path) if names.count(name) > 1 else name for run, name in zip(runs, names)]
 
@@ -157,7 +157,7 @@ def _contents(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
 
 
 def _numbers(run: RunFolder) -> dict[str, Any]:
-    """The metrics of a run; where it was killed before it wrote them, those of the trajectories that it left."""
+    """The metrics of a run; where it was killed before it wrote them, those of its trajectories."""
     metrics = run.metrics()
     if "trajectories" not in metrics and run.trajectory("optimised") is not None:
         from slam.results.metrics import trajectory_metrics_of
@@ -167,7 +167,7 @@ def _numbers(run: RunFolder) -> dict[str, Any]:
 
 
 def _rows(name: str, metrics: Mapping[str, Any], notes: dict[str, None]) -> list[list[str]]:
-    """Cells of each trajectory, its own name first; why numbers are missing goes to the notes."""
+    """Cells of each trajectory, its name first; reasons of missing numbers go to the notes."""
     rows = []
     missing: dict[str, dict[str, None]] = {}
     for trajectory in TRAJECTORIES:

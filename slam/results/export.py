@@ -36,7 +36,7 @@ def export(folder: RunFolder, what: str, output: Path, up: str) -> Path:
             ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o) or ``colmap`` (a model in text form).
         output: the file; for ``colmap`` the folder.
         up: ``y-down`` as the run has it, or ``z``: x right, y ahead, z up. A trajectory's cameras keep
-            their own axes, only the world is turned.
+            their own axes, only the world is rotated.
 
     Returns:
         What was written.
@@ -96,7 +96,7 @@ def _export_colmap(folder: RunFolder, output: Path, up: str) -> None:
 
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
-    """The optimised trajectory in the axes asked for."""
+    """The optimised trajectory in the given axes."""
     folder.require("trajectory_optimised.tum.txt")
     trajectory = folder.trajectory("optimised")
     if trajectory is None:

@@ -1,4 +1,4 @@
-"""A run folder: everything that a run leaves behind, each file whole or absent."""
+"""A run folder: all files of a run, each whole or absent."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class RunFolder:
 
         Args:
             path: where its files are.
-            replaces: the folder of an earlier run, whose place this one takes with `publish`.
+            replaces: the folder of an earlier run, which `publish` replaces by this one.
         """
         self.path = path
         self.replaces = replaces
 
     @classmethod
     def create(cls, output: Path | None, results: Path, sequence: str) -> RunFolder:
-        """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` to it.
+        """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` linked to it.
 
         Where ``output`` holds an earlier run, the new one is written to ``output/unfinished`` until `publish`.
 
         Raises:
-            RunError: ``output`` exists and holds something that is not a run, or no folder can be made there.
+            RunError: ``output`` exists and holds something else than a run, or the folder cannot be made.
         """
         try:
             if output is None:
@@ -50,7 +50,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
-        """An existing run, also one that failed or was killed: one line of the log says so.
+        """An existing run, also one that failed or was killed, with a warning.
 
         Raises:
             RunError: no run there.
@@ -65,7 +65,7 @@ class RunFolder:
         return folder
 
     def publish(self) -> None:
-        """Take the place of the earlier run; nothing to do where there is none.
+        """Replace the earlier run, if there is one.
 
         Raises:
             RunError: a file cannot be moved or removed.
@@ -79,15 +79,15 @@ class RunFolder:
         self.path, self.replaces = self.replaces, None
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a text file at once."""
+        """Write a text file atomically."""
         self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
 
     def write(self, name: str, fill: Callable[[Path], object]) -> None:
-        """Let ``fill`` write a file beside its place, then put it there."""
+        """Write a file atomically: ``fill`` writes it under a temporary name."""
         write_atomically(self.path / name, fill, RunError)
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write ``metrics.json``; a number that is not finite is a mistake and is refused."""
+        """Write ``metrics.json``; a number that is not finite is an error."""
         self.write_text(METRICS, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, stem: str, trajectory: Trajectory) -> None:
@@ -96,7 +96,7 @@ class RunFolder:
         write_tum(self.path / f"{stem}.tum.txt", trajectory)
 
     def metrics(self) -> dict[str, Any]:
-        """What ``metrics.json`` says; of a run without one, that it was killed.
+        """The content of ``metrics.json``; without the file, the status of a killed run.
 
         Raises:
             RunError: the file is damaged.
@@ -119,7 +119,7 @@ class RunFolder:
         return read_trajectory(path, "tum") if path.is_file() else None
 
     def require(self, name: str) -> Path:
-        """A file of the run.
+        """The path of a file of the run.
 
         Raises:
             RunError: it is not there.

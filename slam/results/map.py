@@ -1,4 +1,4 @@
-"""The map of a run: its files, and how good it is."""
+"""The map of a run: its files and its accuracy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Surface:
 
 
 def write_map(folder: RunFolder, result: SlamResult, sequence: Sequence) -> Surface:
-    """Write mesh and cloud; a map that is empty is a reason and no error.
+    """Write mesh and cloud; an empty map gives a reason and no error.
 
     Raises:
         RunError: a file cannot be written.
@@ -56,7 +56,7 @@ def _no_map(reason: str) -> dict[str, Any]:
 
 
 def _map_quality(points: NDArray[np.float64], result: SlamResult, sequence: Sequence) -> dict[str, Any]:
-    """Distance to the true street and share of it found, the map moved with its trajectory to the truth."""
+    """Accuracy and completeness against the true street, after alignment of the trajectory."""
     base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
     street = getattr(base, "street", None)
     if result.reference is None or street is None:

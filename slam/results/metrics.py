@@ -26,14 +26,14 @@ from slam.trajectory import Trajectory, associate
 
 
 def lidar_trajectory(result: SlamResult) -> Trajectory | None:
-    """The LiDAR's path with the stamps of its frames."""
+    """LiDAR odometry with the stamps of its frames."""
     if result.lidar is None:
         return None
     return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
 
 
 def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
-    """Errors of the LiDAR's path against the truth at its own frames."""
+    """Errors of LiDAR odometry at its frames."""
     lidar = lidar_trajectory(result)
     if lidar is None or result.lidar is None:
         return null("lidar", "the sequence has no LiDAR scans")
@@ -42,7 +42,7 @@ def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
 
 
 def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provenance) -> dict[str, Any]:
-    """Everything that is known before the map is fused; a number that cannot be known is null with its reason."""
+    """All metrics before the map is fused; a missing number is null with its reason."""
     reference = result.reference
     trajectories = {
         "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
@@ -73,20 +73,20 @@ def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provena
 def whole_metrics(
     metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any]
 ) -> dict[str, Any]:
-    """The metrics of an estimate, of a run that ended well: with its map, and timed again."""
+    """The metrics of a complete run: those of the estimate, with the map and the final timing."""
     rest = {"timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)), "map": map_summary}
     whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)
     return {key: value for key, value in whole.items() if key not in ("reason", "map_reason")}
 
 
 def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
-    """Errors of the trajectories that a killed run left in its folder; of those that are not there, why."""
+    """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
     reference = folder.trajectory("reference")
     numbers: dict[str, Any] = {}
     for name in TRAJECTORIES:
         estimate = folder.trajectory(name)
         if estimate is None:
-            numbers |= null(name, "the run left no such trajectory")
+            numbers |= null(name, "the run did not write this trajectory")
         elif reference is None:
             numbers[name] = trajectory_metrics(estimate, None)
         else:
@@ -95,12 +95,12 @@ def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
 
 
 def _frames_before(sequence: Sequence) -> int:
-    """Frames that an earlier run has seen (``run --continue``)."""
+    """Number of frames of earlier runs (``run --continue``)."""
     return sequence.before if isinstance(sequence, Continued) else 0
 
 
 def _network_snippets(result: SlamResult) -> SnippetErrors | None:
-    """The paper's protocol on the network's direct answers; None without truth or with other snippets."""
+    """The paper's protocol on the network's snippet poses; None without truth or with other snippets."""
     snippets = result.observations.snippets
     if result.reference is None or len(snippets[0].sources) != 4:
         return None
@@ -121,12 +121,12 @@ def _scale(result: SlamResult) -> dict[str, Any]:
 
 
 def _graph(result: SlamResult) -> dict[str, Any]:
-    """Size of the graph, and coverage of its noise by the truth, brought to the graph's scale."""
+    """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
     summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
     if result.reference is None:
         return summary | null("coverage", "the sequence has no true poses")
     aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
     if not aligned.scale > 0:
-        return summary | null("coverage", "the estimate does not move: the truth cannot be brought to its scale")
+        return summary | null("coverage", "the estimate does not move: the truth cannot be scaled to it")
     covered = coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
     return summary | {"coverage": covered.overall, "coverage_by_source": covered.by_source}

@@ -1,6 +1,6 @@
-"""Where a run writes: ``--output`` itself, or a folder in it while it still holds an earlier run.
+"""The output folder of a run: ``--output`` itself, or a folder in it while it still holds an earlier run.
 
-Only files of a run are ever removed, and only from a folder whose ``metrics.json`` says that a run wrote them.
+Only files of a run are ever removed, and only from a folder whose ``metrics.json`` is that of a run.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
 
 
 def check_output(output: Path) -> None:
-    """Make sure that a run may write to ``output``: it is new, empty, or holds an earlier run.
+    """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
 
     Raises:
-        RunError: it is a file, or holds something that no run wrote.
+        RunError: it is a file, or holds files of something else.
     """
     if not output.exists():
         return
@@ -54,10 +54,10 @@ def check_output(output: Path) -> None:
 
 
 def claim(output: Path) -> Path:
-    """The folder to write a new run to, made and without files of a run.
+    """Make the folder of a new run, without files of earlier ones.
 
     It is ``output``, or ``output/unfinished`` where the trajectories of an earlier run are whole: they stay until
-    `replace_run` puts the new run in their place.
+    `replace_run`.
 
     Raises:
         RunError: as `check_output`.
@@ -74,7 +74,7 @@ def claim(output: Path) -> Path:
 def replace_run(output: Path, place: Path) -> None:
     """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
 
-    ``metrics.json`` goes first and old files go before new ones come: no reader ever sees parts of both as one run.
+    ``metrics.json`` is removed first, and old files before new ones are moved: no reader sees parts of both as one run.
     """
     (place / METRICS).replace(output / METRICS)
     for path in _files(output):
@@ -82,7 +82,7 @@ def replace_run(output: Path, place: Path) -> None:
             path.unlink()
     for path in _files(place):
         path.replace(output / path.name)
-    with suppress(OSError):  # it holds a file of another kind
+    with suppress(OSError):  # it holds other files
         place.rmdir()
 
 
@@ -110,17 +110,17 @@ def _is_run(metrics: Path) -> bool:
 
 
 def _is_rest(path: Path) -> bool:
-    """Whether a killed run left it half written."""
+    """Whether it is a partial file of a killed run."""
     return unfinished_name(path) in _OWN
 
 
 def _files(folder: Path) -> list[Path]:
-    """Files of a run, whole or half written."""
+    """Files of a run, whole or partial."""
     return [path for path in folder.iterdir() if path.name in _OWN or _is_rest(path)]
 
 
 def _clear(folder: Path) -> None:
-    """Remove an earlier run and what it left unfinished; files of other kinds stay."""
+    """Remove an earlier run with its partial files; other files stay."""
     check_output(folder / UNFINISHED)
     for path in _files(folder):
         path.unlink()
@@ -130,7 +130,7 @@ def _clear(folder: Path) -> None:
 
 
 def _link(link: Path, target: Path) -> None:
-    """Point ``link`` to a sibling; a file system without links keeps the folders and loses the shortcut."""
+    """Point ``link`` to a sibling; on a file system without links, only warn."""
     temporary = link.with_name(f".{link.name}.{os.getpid()}")
     try:
         temporary.unlink(missing_ok=True)

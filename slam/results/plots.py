@@ -1,7 +1,7 @@
 """Figures for a paper and for the report: trajectories, errors, drift, depth and the map from above.
 
-Colours are those of Okabe and Ito (2008), which stay apart for colour-blind readers; line styles keep them
-apart in grey. Matplotlib is imported inside the functions, and no global state of it changes.
+Colours are those of Okabe and Ito (2008), distinct for colour-blind readers; line styles are distinct in
+grey. Matplotlib is imported inside the functions, without changes of its global state.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def trajectory_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
-    """Top view, x to the right and z ahead, all estimates brought to the reference by 7 degrees of freedom.
+    """Top view, x to the right and z ahead, all estimates aligned to the reference by 7 degrees of freedom.
 
     Args:
         trajectories: by name: ``reference``, ``network``, ``odometry``, ``optimised``, ``lidar``.
@@ -185,7 +185,7 @@ def map_figure(
     unit: str = "m",
     most: int = 150_000,
 ) -> Figure:
-    """The map from above in its own colours, what is highest drawn last, with the trajectory over it.
+    """The map from above in its colours, highest points drawn last, with the trajectory over it.
 
     Args:
         points: ``(P, 3)`` in the world, y down.
@@ -291,7 +291,7 @@ def _figure(
 
 @contextmanager
 def _figure_style() -> Iterator[Callable[..., Figure]]:
-    """The figure class under our style; without pyplot nothing outlives the block."""
+    """The figure class under our style; without pyplot it leaves no global state."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -316,7 +316,7 @@ def _disparity(depth: DepthMap) -> Any:
 
 
 def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
-    """Give the axes of a row one upper limit, so that runs can be compared by eye."""
+    """Set one upper limit for the axes of a row, so that runs can be compared."""
     for same in zip(*drawn):
         top = max(axes.get_ylim()[1] for axes in same)
         for axes in same:
@@ -324,7 +324,7 @@ def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
 
 
 def _save(figure: Figure, output: Path) -> None:
-    """Write beside the target and move into place; without a date, so that alike figures are alike files."""
+    """Write atomically, without a date, so that equal figures are equal files."""
     kind = output.suffix.lower().removeprefix(".")
     undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
     write_atomically(output, lambda path: figure.savefig(path, format=kind, dpi=200, metadata=undated), RunError)

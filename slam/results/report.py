@@ -1,4 +1,4 @@
-"""The report of a run: one page that says what ran, how good it is and why; it opens without a network."""
+"""The report of a run: one self-contained page with its inputs, errors and figures."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _MEANINGS = {
     "trajectory_lidar": "KISS-ICP on the LiDAR scans",
     "reference": "ground truth",
     "graph.g2o": "pose graph",
-    "loops.json": "loop candidates and verdicts",
+    "loops.json": "accepted and rejected loops",
     "places.npz": "features of places, for localize",
     "drive.zip": "measurements of every frame, for run --continue",
     "keyframes.npz": "keyframes of the map, for run --continue",
@@ -92,7 +92,7 @@ def write_report(
     map_points: NDArray[np.floating] | None,
     map_colours: NDArray[np.floating] | None,
 ) -> None:
-    """Write ``report.html`` from what the folder holds; a run that failed gets one too.
+    """Write ``report.html`` from the files of a folder; also for a failed run.
 
     Args:
         folder: the run, with its ``metrics.json`` and trajectories written.
@@ -133,7 +133,7 @@ def write_report(
 
 
 def _absence(metrics: Metrics, name: str) -> str:
-    """Why a run has no such part; empty where it has one, or failed before it said anything of it."""
+    """Why a run has no such part; empty where it has one, or failed before."""
     part, reason = lookup(metrics, name)
     return "" if part is not None or (failure(metrics) and name not in metrics) else reason
 
@@ -142,7 +142,9 @@ def _trajectory_picture(trajectories: Mapping[str, Trajectory], unit: str) -> Pi
     if not trajectories:
         return None
     if REFERENCE in trajectories:
-        caption = "Seen from above. Each estimate is laid over the ground truth by rotation, translation and one scale."
+        caption = (
+            "Seen from above. Each estimate is aligned to the ground truth by rotation, translation and one scale."
+        )
     else:
         caption = "Seen from above, as written; no ground truth is known. The raw network chain is scaled to the rest."
     return _drawn(lambda: trajectory_figure(trajectories, unit=unit), "Trajectories from above", caption)
@@ -190,7 +192,7 @@ def _files(folder: RunFolder) -> Table | None:
 
 
 def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
-    """What there is to draw; a damaged or missing file must not cost the rest of the report."""
+    """Trajectories to draw; none if a file is damaged or missing, so that the report is still written."""
     try:
         return trajectories_of(folder)
     except SlamError as error:
@@ -199,7 +201,7 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
 
 
 def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
-    """A picture, or why it cannot be drawn (trajectories that share no time, for one)."""
+    """A picture, or why it cannot be drawn (for example, trajectories without common stamps)."""
     buffer = io.BytesIO()
     try:
         draw().savefig(buffer, format="png", dpi=160, metadata={"Software": None})

@@ -70,7 +70,7 @@ def number(metrics: Metrics, *path: str, decimals: int = 0) -> Cell:
 
 
 def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
-    """The numbers to see first: name, value and unit of each."""
+    """The key numbers: name, value and unit of each."""
     best = ("trajectories", "optimised")
     return [
         ("Position error", number(metrics, *best, "align", "7dof", "ate_rmse_m", decimals=2), "m, 7 dof"),
@@ -84,32 +84,32 @@ def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
 
 
 def what_ran(metrics: Metrics) -> Table:
-    """Sequence, weights, scale and command; a run that failed early has less to say."""
+    """Sequence, weights, scale and command; a run that failed early has fewer rows."""
 
-    def say(*path: str, decimals: int = 1, unit: str = "") -> str:
+    def text(*path: str, decimals: int = 1, unit: str = "") -> str:
         value, reason = lookup(metrics, *path)
         return f"{MISSING} ({reason})" if value is None else f"{written(value, decimals)}{unit}"
 
     seen, _ = lookup(metrics, "provenance", "trained_on")
     leak, _ = lookup(metrics, "provenance", "leak")
-    sha256 = say("provenance", "weights_sha256")
+    sha256 = text("provenance", "weights_sha256")
     rows = [
-        ("Sequence", f"{say('sequence', 'name')}, {say('sequence', 'frames')} frames"),
-        ("Bridged frames", _bridged(metrics)),
-        ("True length", say("sequence", "length_m", unit=" m")),
-        ("Frame rate", say("sequence", "fps", unit=" frames/s")),
-        ("Scale", f"mode {say('scale', 'mode')}, value {say('scale', 'value', decimals=4)}"),
-        ("Speed", say("timing", "frames_per_second", unit=" frames/s over the whole run")),
-        ("Weights", f"{say('provenance', 'weights')}, sha256 {sha256 if MISSING in sha256 else sha256[:16]}"),
-        ("Licence of the weights", say("provenance", "weights_licence")),
+        ("Sequence", f"{text('sequence', 'name')}, {text('sequence', 'frames')} frames"),
+        ("Interpolated frames", _interpolated(metrics)),
+        ("True length", text("sequence", "length_m", unit=" m")),
+        ("Frame rate", text("sequence", "fps", unit=" frames/s")),
+        ("Scale", f"mode {text('scale', 'mode')}, value {text('scale', 'value', decimals=4)}"),
+        ("Speed", text("timing", "frames_per_second", unit=" frames/s over the whole run")),
+        ("Weights", f"{text('provenance', 'weights')}, sha256 {sha256 if MISSING in sha256 else sha256[:16]}"),
+        ("Licence of the weights", text("provenance", "weights_licence")),
         ("Trained on", _shortened([str(name) for name in seen]) if seen else MISSING),
         ("Leak", {True: "yes: trained on this sequence", False: "none known"}.get(leak, MISSING)),
-        ("Command", say("provenance", "command")),
-        ("Seed, device", f"{say('provenance', 'seed')}, {say('provenance', 'device')}"),
-        ("Version, commit", f"{say('provenance', 'version')}, {say('provenance', 'commit')}"),
+        ("Command", text("provenance", "command")),
+        ("Seed, device", f"{text('provenance', 'seed')}, {text('provenance', 'device')}"),
+        ("Version, commit", f"{text('provenance', 'version')}, {text('provenance', 'commit')}"),
     ]
-    told = [row for row in rows if NOT_RECORDED not in row[1]] if failure(metrics) else rows
-    return Table((), _texts(told), "words")
+    recorded = [row for row in rows if NOT_RECORDED not in row[1]] if failure(metrics) else rows
+    return Table((), _texts(recorded), "words")
 
 
 def no_errors(metrics: Metrics) -> str:
@@ -209,14 +209,14 @@ def graph(metrics: Metrics) -> dict[str, Any] | None:
         return size | {"coverage": None, "reasons": _notes([f"coverage: {reason}"])}
     rows = []
     for level in ("50", "90", "95"):
-        share, why = lookup(coverage, level)
-        shown = MISSING if share is None else f"{100 * share:.0f} %"
+        ratio, why = lookup(coverage, level)
+        shown = MISSING if ratio is None else f"{100 * ratio:.0f} %"
         rows.append([Cell(f"inside the {level} % quantile"), Cell(shown, why, "missing" if why else "")])
     words = (
-        "Share of factors whose error at the truth lies inside a quantile of their stated noise. A share below its "
-        "quantile means sigmas that are too small, one above it sigmas that are too large."
+        "Fraction of factors whose error at the truth lies inside a quantile of their stated noise. A fraction below "
+        "its quantile means sigmas that are too small, one above it sigmas that are too large."
     )
-    return size | {"coverage": Table(("factors", "share"), rows, "words", [words]), "reasons": []}
+    return size | {"coverage": Table(("factors", "fraction"), rows, "words", [words]), "reasons": []}
 
 
 def timing(metrics: Metrics) -> Table | None:
@@ -255,8 +255,8 @@ def _texts(rows: Iterable[Sequence[str]]) -> list[list[Cell]]:
     return [[Cell(text) for text in row] for row in rows]
 
 
-def _bar(share: float) -> Cell:
-    return Cell("", style="track", bar=100.0 * min(max(share, 0.0), 1.0))
+def _bar(ratio: float) -> Cell:
+    return Cell("", style="track", bar=100.0 * min(max(ratio, 0.0), 1.0))
 
 
 def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) -> list[Cell]:
@@ -271,13 +271,13 @@ def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) ->
 
 
 def _notes(reasons: Iterable[str]) -> list[str]:
-    """One line that says why numbers are missing, each reason once; none where nothing is missing."""
+    """One line with the reasons of missing numbers, each once; none where nothing is missing."""
     distinct = [reason for reason in dict.fromkeys(reasons) if reason]
     return [f"{MISSING}  {'; '.join(distinct)}."] if distinct else []
 
 
 def _details(loops_file: Path, verdict: str) -> list[Any]:
-    """One list of ``loops.json``; empty where the file is missing or damaged: the report goes on."""
+    """One list of ``loops.json``; empty where the file is missing or damaged."""
     try:
         tree = json.loads(loops_file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -286,8 +286,8 @@ def _details(loops_file: Path, verdict: str) -> list[Any]:
     return entries if isinstance(entries, list) else []
 
 
-def _bridged(metrics: Metrics) -> str:
-    """Frames that measured nothing, with the reason of each run of them."""
+def _interpolated(metrics: Metrics) -> str:
+    """Interpolated frames, with the reason of each gap."""
     found, _ = lookup(metrics, "sequence", "bridged")
     gaps = [f"{gap['first']} to {gap['last']}: {gap['reason']}" for gap in found or ()]
     return _shortened(gaps) if gaps else "none"

@@ -24,7 +24,7 @@ _POINT_VOXELS = 0.25  # radius of a map point in voxels
 def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics, voxel_size: float) -> None:
     """Write ``.rrd``: on the timeline ``frame`` the camera with image and depth, over all time trajectories and map.
 
-    The world is that of the optimised trajectory, y down. Images and depth are those that the map was offered,
+    The world is that of the optimised trajectory, y down. Images and depth are those of keyframes,
     thinned; depth is in the unit of the trajectory.
 
     Args:

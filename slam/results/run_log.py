@@ -11,9 +11,9 @@ LOG = "run.log"
 
 
 class RunLog(logging.Handler):
-    """Keeps records until there is a file for them, then writes each at once.
+    """Buffers records until there is a file, then writes each at once.
 
-    On a full disk lines are lost, and nothing is printed about it.
+    On a full disk lines are lost without a message.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class RunLog(logging.Handler):
         self._file: _QuietFile | None = None
 
     def begin(self, path: Path) -> None:
-        """Write what was kept, and from now on everything, to a file."""
+        """Write the buffered and all further records to a file."""
         self._file = _QuietFile(path, encoding="utf-8")
         self._file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         for record in self._kept:
@@ -30,14 +30,14 @@ class RunLog(logging.Handler):
         self._kept.clear()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write or keep a record."""
+        """Write or buffer a record."""
         if self._file is None:
             self._kept.append(record)
         else:
             self._file.emit(record)
 
     def failed(self, reason: str) -> None:
-        """Write why the run failed here and nowhere else: its caller hears of it as an exception."""
+        """Write the reason of a failure to the file alone: the caller gets the exception."""
         message = f"the run failed: {reason}"
         self.handle(logging.LogRecord("slam.run", logging.ERROR, __file__, 0, message, None, None))
 
@@ -53,13 +53,13 @@ class _QuietFile(logging.FileHandler):
         pass
 
     def close(self) -> None:
-        with suppress(OSError):  # what a full disk did not take is written once more
+        with suppress(OSError):  # flushes again what a full disk refused
             super().close()
 
 
 @contextmanager
 def run_log() -> Iterator[RunLog]:
-    """The package's log, beside wherever it goes already."""
+    """Add a `RunLog` to the logger of the package."""
     log, root = RunLog(), logging.getLogger("slam")
     level = root.level
     root.addHandler(log)

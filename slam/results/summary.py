@@ -1,4 +1,4 @@
-"""``metrics.json``: what ran, how long, how good; every missing number has its reason beside it."""
+"""Parts of ``metrics.json``: inputs, gaps, timing; every missing number has a reason."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Provenance:
-    """Which program, which weights, which data they saw."""
+    """Version, command, weights and their training data."""
 
     version: str
     commit: str
@@ -31,7 +31,7 @@ class Provenance:
 
 
 def null(name: str, reason: str) -> dict[str, Any]:
-    """A number that cannot be given, and why."""
+    """A missing number and its reason."""
     return {name: None, f"{name}_reason": reason}
 
 
@@ -41,12 +41,12 @@ def describe_sequence(sequence: Sequence, length_m: float | None) -> dict[str, A
     span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
     summary: dict[str, Any] = {"name": sequence.name, "frames": frames}
     summary |= {"length_m": length_m} if length_m is not None else null("length_m", "the sequence has no true poses")
-    summary |= {"fps": (frames - 1) / span} if span > 0 else null("fps", "the stamps span no time")
+    summary |= {"fps": (frames - 1) / span} if span > 0 else null("fps", "all stamps are equal")
     return summary
 
 
 def describe_gaps(frames: Mapping[int, str]) -> dict[str, Any]:
-    """How many frames measured nothing, and the runs of them with the first one's reason."""
+    """Number of interpolated frames, and the gaps with the reason of their first frame."""
     return {
         "bridged_frames": len(frames),
         "bridged": [{"first": first, "last": last, "reason": frames[first]} for first, last in runs(frames)],
@@ -57,7 +57,7 @@ def describe_timing(watch: Stopwatch, frames: int) -> dict[str, Any]:
     """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
     seconds, peak = watch.seconds, peak_rss_mb()
     timing = {"seconds_total": seconds, "frames_per_second": frames / seconds, "cpu_seconds": watch.cpu_seconds}
-    memory = null("peak_rss_mb", "Windows does not tell") if peak is None else {"peak_rss_mb": peak}
+    memory = null("peak_rss_mb", "not available on Windows") if peak is None else {"peak_rss_mb": peak}
     return timing | memory | {"stages": dict(watch.stages)}
 
 
@@ -88,5 +88,5 @@ def finite(tree: Any) -> Any:
 
 
 def as_json(metrics: dict[str, Any]) -> str:
-    """The metrics as text; only finite numbers pass."""
+    """The metrics as text; ``ValueError`` for a number that is not finite."""
     return json.dumps(metrics, indent=2, allow_nan=False)

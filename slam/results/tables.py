@@ -26,11 +26,11 @@ _COLUMNS = (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, EVO_APE, EVO_DI
 
 
 def metrics_table(trajectories: Mapping[str, Mapping[str, Any] | None], title: str) -> Table:
-    """One row a trajectory, in the order given; below, why numbers are missing.
+    """One row a trajectory, in the order given; below, the reasons of missing numbers.
 
     Args:
         trajectories: the object T of ``metrics.json`` (or None) by the name of the trajectory.
-        title: what was compared; must say the scale mode, which decides the unit of every length.
+        title: what was compared, with the scale mode, which decides the unit of lengths.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table

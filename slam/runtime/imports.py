@@ -1,4 +1,4 @@
-"""Doors to foreign libraries that need help before they can be imported."""
+"""Imports of third-party libraries that need preparation."""
 
 import ctypes
 import functools
@@ -38,7 +38,7 @@ def import_rerun() -> ModuleType:
 
 
 def import_open3d_beside() -> None:
-    """Begin to import Open3D, which takes a second, in another thread; whoever needs it hears of errors."""
+    """Import Open3D, which takes a second, in another thread; errors are raised by the next `import_open3d`."""
 
     def begin() -> None:
         with suppress(SlamError):

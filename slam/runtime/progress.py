@@ -1,4 +1,4 @@
-"""How far long work has come, for whoever watches a terminal."""
+"""Progress bar of long work."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class progress_bar:  # noqa: N801 - reads as the function it stands for
-    """A progress bar on a terminal, silence in a pipe."""
+    """A progress bar on a terminal, nothing in a pipe."""
 
     def __enter__(self) -> Callable[[str, int, int], None]:
         if sys.stderr is None or not sys.stderr.isatty():

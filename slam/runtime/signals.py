@@ -1,4 +1,4 @@
-"""SIGTERM and SIGHUP as exceptions, so that a run that is told to end can say so."""
+"""SIGTERM and SIGHUP as exceptions, so that a terminated run can record its reason."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 
 
 class Terminated(SystemExit):
-    """A signal asked the process to end; the exit code is 128 and the signal's number."""
+    """The process was terminated by a signal; the exit code is 128 plus the signal's number."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -23,13 +23,13 @@ class Terminated(SystemExit):
 
 @contextmanager
 def raising_on_termination() -> Iterator[Callable[[], None]]:
-    """Raise `Terminated` in the block when the process is told to end.
+    """Raise `Terminated` in the block at a signal to terminate.
 
-    Only in the main thread, and only for signals that nobody handles or ignores already.
+    Only in the main thread, and only for signals that are not handled or ignored already.
 
     Yields:
         A function that ignores these signals for the rest of the block: ``timeout`` and shells send the same one
-        several times, and what the first one makes the block write must become whole.
+        several times, and the files written after the first one must become whole.
     """
     numbers: list[int] = []
     if threading.current_thread() is threading.main_thread():

@@ -14,7 +14,7 @@ _CORES = 2
 
 
 def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
-    """What ``read`` gives for each of some numbers, in another thread while the one before is used."""
+    """The result of ``read`` for each number, computed in another thread while the one before is used."""
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
         waiting: deque[Future[T]] = deque()
         for number in numbers:
@@ -26,6 +26,6 @@ def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
 
 
 def side_by_side(do: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """What ``do`` gives for each item, in their order; each depends on its item alone."""
+    """The result of ``do`` for each item, in order; the calls must be independent."""
     with ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="side") as side:
         return list(side.map(do, items))

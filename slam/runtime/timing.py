@@ -1,4 +1,4 @@
-"""Where a run spends its time."""
+"""Time and memory of a run."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Stopwatch:
     def stage(self, name: str) -> Iterator[None]:
         """Add the time of the block to a stage; a stage may be entered many times.
 
-        Stages are kept by the thread that waits for all others, so that they add up: work in another thread counts
-        for as long as it is waited for.
+        Stages are measured in the main thread, so that they add up: work in another thread counts as long as the
+        main thread waits for it.
         """
         start = time.perf_counter()
         try:
@@ -45,7 +45,7 @@ class Stopwatch:
 
 
 def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far, MiB; None on Windows, where Python cannot tell."""
+    """Largest resident memory of this process so far, MiB; None on Windows, where Python has no `resource`."""
     if sys.platform == "win32":
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,1 +1,1 @@
-"""Where frames come from: recordings on disk and the simulated street; ``catalogue`` is the door."""
+"""Sequences of frames: recordings on disk and the simulated street; ``catalogue`` opens them."""

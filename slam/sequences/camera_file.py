@@ -1,4 +1,4 @@
-"""Which ``camera.yaml`` belongs to a sequence; its keys stand in `erfsfm.readers.camera_file`."""
+"""Search for the ``camera.yaml`` of a sequence; its keys are described in `erfsfm.readers.camera_file`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The single door to every sequence: which kind of data set a path is, and which sequence of it is meant."""
+"""Opening of sequences: detects the kind of a data set and chooses a sequence of it."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def open_sequence(
 
     Args:
         dataset: a KITTI odometry root, a KITTI raw drive or the folder of several, a TUM folder, a folder
-            of images, a video, or the word ``KITTI`` for ``$KITTI_ODOMETRY``. Without it, a name is looked
-            for in ``$KITTI_ODOMETRY``; without either, the embedded simulated sequence is opened.
+            of images, a video, or the word ``KITTI`` for ``$KITTI_ODOMETRY``. Without it, a name is searched
+            in ``$KITTI_ODOMETRY``; without either, the embedded simulated sequence is opened.
         name: which sequence of ``dataset``; optional where there is one only.
-        camera: a ``camera.yaml``; it takes the place of the data set's own calibration.
+        camera: a ``camera.yaml``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
 
     Returns:
         The sequence, or the ``Excerpt`` of it.
 
     Raises:
-        SequenceError: one line on what was looked for, where, what is there and what to do.
+        SequenceError: one line on what was searched, where, what was found and what to do.
     """
     if dataset is None and name is None:
         if camera is not None:
@@ -74,7 +74,7 @@ def sequence_names(dataset: Path) -> list[str]:
 
 
 def _open_embedded() -> SourcedSequence:
-    # Rendering needs Open3D, which nobody else should wait for.
+    # rendering needs Open3D, which is slow to import
     from slam.sequences.simulation.sequence import SimulatedSequence
     from slam.sequences.simulation.street import SimulationOptions
 
@@ -82,7 +82,7 @@ def _open_embedded() -> SourcedSequence:
 
 
 def _root(dataset: Path | None, name: str | None) -> Path:
-    """The path meant by the user: their own, or that of the environment."""
+    """The path given by the user or by the environment."""
     variable = os.environ.get(KITTI_VARIABLE)
     if dataset is None or (str(dataset) == KITTI_NAME and (variable or not dataset.exists())):
         if not variable:
@@ -91,11 +91,11 @@ def _root(dataset: Path | None, name: str | None) -> Path:
                 f"{wanted} is looked for in ${KITTI_VARIABLE}, which is not set: set it to a KITTI odometry "
                 f"root or give --dataset ROOT"
             )
-        path, told_by = Path(variable).expanduser(), f"${KITTI_VARIABLE}"
+        path, origin = Path(variable).expanduser(), f"${KITTI_VARIABLE}"
     else:
-        path, told_by = dataset.expanduser(), "--dataset"
+        path, origin = dataset.expanduser(), "--dataset"
     if not path.exists():
-        raise SequenceError(f"no data set at {path} ({told_by}): check the path")
+        raise SequenceError(f"no data set at {path} ({origin}): check the path")
     return path
 
 
@@ -107,7 +107,7 @@ def _openers(root: Path, name: str | None, camera: Path | None) -> dict[str, Ope
     if kitti is not None:
         names = kitti.names()
         if name is not None and name not in names and (kitti.sequences / name).is_dir():
-            names.append(name)  # to hear what it lacks
+            names.append(name)  # for the error about what it lacks
         return {n: _odometry(kitti, n, camera) for n in names}
     where = root.absolute()
     above = find_odometry_root(where.parent) if where.parent.name == "sequences" else None
@@ -122,7 +122,7 @@ def _openers(root: Path, name: str | None, camera: Path | None) -> dict[str, Ope
 
 
 def _own(root: Path, camera: Path | None) -> dict[str, Opener]:
-    """A folder of the user's: TUM, images or one video."""
+    """A folder in another format: TUM, images or one video."""
     where = root.absolute()
     if (root / tum.INDEX_FILE).is_file():
         return {
@@ -161,7 +161,7 @@ def _explicit(camera: Path | None) -> CameraFile | None:
 
 
 def _choose(openers: dict[str, Opener], root: Path, name: str | None) -> SourcedSequence:
-    """Open the sequence that was asked for, or the only one."""
+    """Open the sequence by its name, or the only one."""
     if not openers:
         raise SequenceError(_unknown(root))
     found = ", ".join(openers)

@@ -1,4 +1,4 @@
-"""A drive that goes on: frames that were looked at before, of which stamps are left, and those that follow."""
+"""A continued drive: earlier frames, of which only stamps are kept, and the frames that follow."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _OWN = ("folder/", "tum/")  # names of recordings that the user gave
 
 
 class Continued:
-    """So many frames of before, then all of another sequence of the same camera. LiDAR scans are not followed.
+    """Earlier frames, then all of another sequence of the same camera. LiDAR scans are not used.
 
-    Frames of the recording between the last one of before and the first that follows are missing frames.
+    Frames of the recording between the last earlier one and the first that follows are missing frames.
     """
 
     T_camera_lidar: FloatArray | None = None
@@ -42,15 +42,15 @@ class Continued:
         """Append a sequence.
 
         Args:
-            name, intrinsics, stamps, camera_height_m, reference: of the frames of before, as of a `Sequence`.
+            name, intrinsics, stamps, camera_height_m, reference: of the earlier frames, as of a `Sequence`.
             sources: their ``provenance``.
-            following: where its stamps do not come after the last one of before, they are moved there.
+            following: stamps that are not after the earlier ones are shifted to be.
 
         Raises:
-            SequenceError: another camera, frames of another recording or of before the last one, or a gap longer
+            SequenceError: another camera, another recording, frames before the last earlier one, or a gap longer
                 than 100 frames or 10 seconds.
         """
-        if not _alike(following.intrinsics, intrinsics):
+        if not _same_camera(following.intrinsics, intrinsics):
             raise SequenceError(
                 f"{following.name} was taken with another camera, {_described(following.intrinsics)}, than the frames "
                 f"before it, {_described(intrinsics)}: give frames of the same camera and size"
@@ -64,30 +64,30 @@ class Continued:
         self.reference = _joined_poses(stamps, reference, self._missing, following)
 
     def __len__(self) -> int:
-        """Number of frames, those of before and the missing ones among them."""
+        """Number of frames, with the earlier and the missing ones."""
         return len(self.stamps)
 
     def frame(self, index: int) -> Frame:
         """Read one of the frames that follow.
 
         Raises:
-            MissingFrameError: it lies between those of before and those that follow.
-            SequenceError: its image cannot be read, or it is one of before.
+            MissingFrameError: it is between the earlier frames and those that follow.
+            SequenceError: its image cannot be read, or it is an earlier one.
         """
         require_frame(self.name, index, len(self))
         if index < self.before:
-            raise SequenceError(f"frame {index} of {self.name} was looked at before and is not kept")
+            raise SequenceError(f"frame {index} of {self.name} is of an earlier run, which keeps no images")
         first = self.before + self._missing
         if index < first:
-            raise MissingFrameError(f"frame {index} of {self.name} lies between two runs: neither looked at it")
+            raise MissingFrameError(f"frame {index} of {self.name} is missing between two runs")
         return Frame(index, float(self.stamps[index]), self._following.frame(index - first).image)
 
     def scan_path(self, index: int) -> Path | None:
-        """None: scans of before are not kept."""
+        """None: scans of earlier frames are not kept."""
         return None
 
     def provenance(self) -> tuple[str, ...]:
-        """Names of all that it is made of, as the leak record of a checkpoint writes them."""
+        """Names of all parts, as in the leak record of a checkpoint."""
         return (*self._sources, *self._following.provenance())
 
     def _require_short_gap(self) -> None:
@@ -104,10 +104,10 @@ class Continued:
 
 
 def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
-    """How many frames of a recording lie between those of before and those that follow, by their leak-record names.
+    """Number of frames of a recording between the earlier ones and those that follow, by their leak-record names.
 
-    Simulated worlds have no frames in their names, so that none are missing. Of folders with other names nothing is
-    known: they are taken to follow, with a warning.
+    Names of simulated worlds have no frame numbers: none are missing. Folders with other names are assumed to follow,
+    with a warning.
 
     Raises:
         SequenceError: other recordings, or frames from before the last one.
@@ -122,7 +122,7 @@ def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
         ends += [(wanted.start - span.stop, name) for span in same if span is not None]
     if not ends:
         if all(name.startswith(_OWN) for name in following):
-            logger.warning("%s is taken to follow right on %s", ", ".join(following), ", ".join(before))
+            logger.warning("%s is assumed to follow %s without a gap", ", ".join(following), ", ".join(before))
             return 0
         raise SequenceError(
             f"{', '.join(following)} cannot continue {', '.join(before)}: it is another recording; give the frames "
@@ -136,7 +136,7 @@ def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
     return missing
 
 
-def _alike(a: Intrinsics, b: Intrinsics) -> bool:
+def _same_camera(a: Intrinsics, b: Intrinsics) -> bool:
     """The same camera, up to the rounding of calibration files."""
     return (a.width, a.height) == (b.width, b.height) and bool(np.abs(a.K - b.K).max() < _ROUNDING_PX)
 
@@ -157,7 +157,7 @@ def _after(stamps: FloatArray, missing: int, following: FloatArray) -> FloatArra
         return following
     interval = float(np.median(np.diff(np.concatenate([stamps, stamps[-1] + following - following[0]]))))
     logger.info(
-        "stamps of the frames that follow begin at %.3f s: moved to come after %.3f s", following[0], stamps[-1]
+        "stamps of the frames that follow begin at %.3f s: shifted to come after %.3f s", following[0], stamps[-1]
     )
     return np.asarray(following - following[0] + stamps[-1] + (missing + 1) * max(interval, 1e-3))
 
@@ -165,7 +165,7 @@ def _after(stamps: FloatArray, missing: int, following: FloatArray) -> FloatArra
 def _joined_poses(
     stamps: FloatArray, reference: FloatArray | None, missing: int, following: Sequence
 ) -> FloatArray | None:
-    """True poses of all frames, where both parts are of one recording and nothing but missing frames is between."""
+    """True poses of all frames, where both parts are of one recording with only missing frames between."""
     if reference is None or not isinstance(following, Excerpt) or following.start <= missing:
         return None
     last = following.start - missing - 1

@@ -11,7 +11,7 @@ from slam.sequences.recording import Source, labels, rebased, require_frame
 
 
 class SourcedSequence(Sequence, Protocol):
-    """A sequence that knows the recordings it was cut from."""
+    """A sequence with the recordings that it was cut from."""
 
     sources: tuple[Source, ...]
 
@@ -51,14 +51,14 @@ class Excerpt:
         return self.base.scan_path(self.start + index)
 
     def provenance(self) -> tuple[str, ...]:
-        """Names of what this is, as the leak record of a checkpoint writes them."""
+        """Names of the recordings, as in the leak record of a checkpoint."""
         return labels(self.sources, len(self))
 
 
 def frame_range(text: str, frames: int) -> tuple[int, int]:
     """Read ``A:B`` as Python reads a slice of so many frames: half-open, either end optional or negative.
 
-    Unlike Python it does not cut what lies beyond the end: that is a mistake worth hearing about.
+    Unlike in Python, an end beyond the sequence is an error.
 
     Raises:
         SequenceError: if the text is no range, or the range is empty or reaches outside the sequence.

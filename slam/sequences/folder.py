@@ -1,4 +1,4 @@
-"""One's own images: a folder of them and a ``camera.yaml``."""
+"""A folder of images with a ``camera.yaml``."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class ImageFiles:
         self.height, self.width = read_image(files.paths[0]).shape[:2]
 
     def __len__(self) -> int:
-        """Number of frames, those without an image among them."""
+        """Number of frames, with those without an image."""
         return len(self.files)
 
     def read(self, index: int) -> Image:
@@ -55,7 +55,7 @@ class ImageFiles:
 
 
 def too_long(files: NumberedFiles, first: int, last: int) -> SequenceError:
-    """What to say of a gap from row ``first`` to ``last`` across which no motion can be interpolated."""
+    """The error of a gap from row ``first`` to ``last``, too long to be interpolated."""
     return SequenceError(
         f"no images {files.file_name(first)} to {files.file_name(last)} in {files.paths[0].parent}: a gap of "
         f"{last - first + 1} frames is too long to interpolate; split the recording there"

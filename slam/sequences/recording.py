@@ -1,7 +1,7 @@
-"""A recording on disk: images from a file source and what lies beside them, as a ``Sequence``.
+"""A recording on disk as a ``Sequence``: images with calibration, stamps and ground truth.
 
-Every kind of data set is opened by a function that returns a ``RecordedSequence``; only where the images
-come from (``ImageSource``) differs.
+Every kind of data set is opened by a function that returns a ``RecordedSequence``; only the source of images
+(``ImageSource``) differs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class ImageSource(Protocol):
 
 @dataclass(frozen=True)
 class Source:
-    """A name in the leak record and where a sequence begins in it.
+    """A name in the leak record and the frame of it where a sequence begins.
 
     ``first`` is the number that frame 0 has in the named recording (negative where the sequence begins
     earlier), or None for a source that is used as a whole, such as a simulated world. ``length`` is the
@@ -109,7 +109,7 @@ class RecordedSequence:
         return self.scans.get(index)
 
     def provenance(self) -> tuple[str, ...]:
-        """Names of what this is, as the leak record of a checkpoint writes them."""
+        """Names of the recordings, as in the leak record of a checkpoint."""
         return labels(self.sources, len(self))
 
 
@@ -139,7 +139,7 @@ def uniform_stamps(frames: int, fps: float) -> FloatArray:
 
 def fallback_stamps(path: Path, frames: int) -> FloatArray:
     """Uniform stamps in place of a missing file of stamps, with a warning."""
-    logger.warning("no %s: the frames are taken to be %g a second", path, DEFAULT_FPS)
+    logger.warning("no %s: %g frames a second are assumed", path, DEFAULT_FPS)
     return uniform_stamps(frames, DEFAULT_FPS)
 
 
@@ -153,7 +153,7 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
         files: images, or packets of a GPS/INS.
 
     Raises:
-        SequenceError: if there are as many as nothing has, one is not finite, or they do not increase.
+        SequenceError: if their number matches none of these, one is not finite, or they do not increase.
     """
     assigned = files.rows_of(len(stamps))
     if assigned is None:

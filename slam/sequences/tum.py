@@ -23,7 +23,7 @@ _MAX_GAP_S = 0.1
 
 
 def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
-    """Open a TUM folder; poses between two of the ground truth are interpolated.
+    """Open a TUM folder; poses of the ground truth are interpolated.
 
     Raises:
         SequenceError: if ``rgb.txt`` is malformed or names images that are missing.

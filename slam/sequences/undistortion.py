@@ -1,4 +1,4 @@
-"""Images of a lens made into images of a pinhole, once and for all while they are read."""
+"""Undistortion of images to a pinhole camera, as they are read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ZOOM_LIMITS = (0.2, 8.0)
 
 
 class Undistortion:
-    """The pinhole camera inside a distorting one: same image size, no black borders.
+    """The pinhole camera of a distorted one: same image size, no black borders.
 
     The new camera keeps the principal point and the ratio fx : fy; its focal length is the shortest one
     whose whole image lies inside the distorted image (OpenCV's ``alpha = 0``, but exact at the border
@@ -49,7 +49,7 @@ class Undistortion:
         return flat
 
     def distort(self, pixels: FloatArray, K: FloatArray) -> FloatArray:
-        """Where the lens sees the points that a pinhole ``K`` ``(3, 3)`` sees at ``pixels`` ``(N, 2)``."""
+        """Distorted pixels of the ``pixels`` ``(N, 2)`` of a pinhole ``K`` ``(3, 3)``."""
         rays = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
         if self._is_fisheye:
             distorted = cv2.fisheye.distortPoints(rays[:, None], self._K, self._coefficients)
@@ -99,7 +99,7 @@ class UndistortedImages:
 
 
 def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[ImageSource, Intrinsics]:
-    """Images as a pinhole would take them, and that pinhole.
+    """Undistorted images and their pinhole camera.
 
     Raises:
         SequenceError: if the images have another size than the camera.
@@ -117,7 +117,7 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
 
 
 def _scaled_hint(camera: CameraFile, width: int, height: int) -> str:
-    """What a camera file would say for images of another size, as YAML on one line."""
+    """The camera file scaled to images of another size, as YAML on one line."""
     scaled = camera.pinhole.resized(width, height)
     values = ", ".join(f"{name}: {getattr(scaled, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
     return f"width: {width}, height: {height}, {values}"

@@ -1,4 +1,4 @@
-"""One's own video: a file and a ``camera.yaml``."""
+"""A video file with a ``camera.yaml``."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What is kept on disk: atomic files, the cache, sessions, and arrays spilled out of memory."""
+"""Storage on disk: atomic files, the cache, serialised sessions and spilled arrays."""

@@ -1,4 +1,4 @@
-"""Archives (zip, npz) that may be damaged: every way in which reading them fails is one `RunError`."""
+"""Archives (zip, npz) that may be damaged: every failure of reading is one `RunError`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from slam.errors import RunError, SlamError
 
 @contextmanager
 def reading_archive(path: Path) -> Iterator[None]:
-    """Turn whatever fails inside the block into one line about ``path``; a `SlamError` passes as it is.
+    """Turn any failure inside the block into one line about ``path``; a `SlamError` is passed on.
 
     Raises:
         RunError: the file is missing, unreadable or damaged.

@@ -1,4 +1,4 @@
-"""A cache of computed arrays on disk; each entry is named by everything that it depends on.
+"""A cache of computed arrays on disk; the key of an entry is a digest of all its inputs.
 
 An entry is a file with a checksum before its arrays. It appears whole or not at all, and a damaged one is computed
 again. Arrays are kept at their own precision, so that a run with the cache and one without give the same bytes.
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 class Digestible(Protocol):
-    """Something large that names itself by a digest of its content."""
+    """A large object with a digest of its content."""
 
     @property
     def digest(self) -> bytes:
@@ -63,7 +63,7 @@ class DiskCache:
             raise SlamError(f"no cache can be made in {folder}: {error.strerror or error}") from error
 
     def read(self, key: str) -> Answer | None:
-        """An entry, or None where it is missing or not as it was written."""
+        """An entry, or None where it is missing or damaged."""
         path = self._path(key)
         try:
             raw = path.read_bytes()
@@ -84,10 +84,10 @@ class DiskCache:
             return
         content = _packed(answer)
         try:
-            entry = _checksum(content) + content  # the checksum finds what the disk lost: no need to wait for it
+            entry = _checksum(content) + content  # damage is found by the checksum: no fsync needed
             write_atomically(self._path(key), lambda file: file.write_bytes(entry), sync=False)
         except SlamError as error:
-            logger.warning("the cache keeps nothing more: %s", error)
+            logger.warning("the cache is not written any more: %s", error)
             self._is_writable = False
 
     def _path(self, key: str) -> Path:
@@ -95,14 +95,14 @@ class DiskCache:
 
 
 class CacheNamespace:
-    """The entries of one user of a cache: no other user's entries are mistaken for them."""
+    """The entries of one user of a cache, separated from those of others by its identity."""
 
     def __init__(self, cache: DiskCache, identity: str) -> None:
         """Use a cache.
 
         Args:
             cache: shared with others.
-            identity: everything that decides the answers beside the arguments of each question.
+            identity: all inputs besides the arguments of `get_or_compute`.
         """
         self._cache = cache
         self._identity = identity.encode()
@@ -110,12 +110,12 @@ class CacheNamespace:
         self.asked = 0
 
     def get_or_compute(self, kind: str, given: Sequence[Given], compute: Callable[[], Answer]) -> Answer:
-        """The arrays that ``compute`` gives, read where they are in the cache.
+        """The arrays by ``compute``, read from the cache where they are there.
 
         Args:
-            kind: names the question.
-            given: all arguments that the answer depends on, of fixed types for a kind.
-            compute: computes the answer.
+            kind: name of the computation.
+            given: all arguments of the computation, of fixed types for a kind.
+            compute: the computation.
         """
         named = hashlib.sha256(b"\0".join((_FORMAT, self._identity, kind.encode())))
         for each in given:
@@ -132,7 +132,7 @@ class CacheNamespace:
 
 
 def _digest(given: Given) -> bytes:
-    """Of a text, of shape and bytes of an array, or what something says of itself."""
+    """Digest of a text, of shape and bytes of an array, or of a `Digestible`."""
     if not isinstance(given, str | np.ndarray):
         return given.digest
     content = given.encode() if isinstance(given, str) else repr(given.shape).encode() + given.tobytes()

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and one line where they cannot."""
+"""Atomic writes, with one line of error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slam.errors import SlamError
 def write_atomically(
     path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
 ) -> None:
-    """`erfsfm.files.write_atomically` for those who catch a `SlamError`.
+    """`erfsfm.files.write_atomically` that raises a `SlamError`.
 
     Raises:
         SlamError: (or the given kind) the file cannot be written.

@@ -1,4 +1,4 @@
-"""Which code computed a cached answer: the sources of both packages and the versions of the libraries below them."""
+"""Fingerprint of the code behind cached results: sources of both packages and versions of libraries."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import scipy
 
 import erfsfm
 
-# They use what was computed, and compute nothing that is cached: the layers in pyproject.toml keep all other code from
-# importing them.
+# They compute nothing that is cached; by the layers in pyproject.toml no other code imports them.
 _ABOVE_THE_CACHE = (
     *("slam/cli.py", "slam/__main__.py", "slam/doctor.py", "slam/run.py", "slam/localisation/", "slam/results/"),
     *("erfsfm/cli.py", "erfsfm/training/"),
@@ -24,14 +23,14 @@ _ABOVE_THE_CACHE = (
 
 @functools.cache
 def code_fingerprint() -> str:
-    """Of all code that decides a cached answer, and of torch, NumPy, OpenCV and SciPy: another one, other answers."""
+    """Fingerprint of all code behind cached results, with the versions of torch, NumPy, OpenCV and SciPy."""
     own = Path(__file__).parents[1], Path(erfsfm.__file__).parent
     libraries = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
     return " ".join((fingerprint(own), *libraries, f"torch {version('torch')}"))
 
 
 def fingerprint(packages: Sequence[Path]) -> str:
-    """Of the sources of some packages, each given by its folder."""
+    """Fingerprint of the sources of some packages, each given by its folder."""
     digest = hashlib.sha256()
     for package in packages:
         for path in sorted(package.rglob("*.py")):

@@ -1,7 +1,7 @@
 """Trees of numbers, texts, arrays and known dataclasses on disk and back; reading never executes code.
 
-A file is a zip of ``tree.json`` and ``arrays.bin``. Arrays keep their own precision, and an array that stands in two
-places is one array again, so that a session which is resumed gives the bytes of one that was never interrupted.
+A file is a zip of ``tree.json`` and ``arrays.bin``. Arrays keep their own precision, and an array referenced
+twice is read as one array, so that a resumed session gives the bytes of one without interruption.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class Serialiser:
     """Writes and reads trees of lists, tuples, dictionaries, arrays and dataclasses of the given kinds."""
 
     def __init__(self, *kinds: type) -> None:
-        """Know some dataclasses; no others are ever made."""
+        """Register the dataclasses; no others are constructed."""
         self._kinds = {kind.__name__: kind for kind in kinds}
 
     def write(self, path: Path, value: Any) -> None:
         """Write a value.
 
         Raises:
-            TypeError: something that is not plain.
+            TypeError: a value of another type.
         """
         packing = _Packing(self._kinds)
         tree = packing.packed(value)
@@ -90,7 +90,7 @@ class _Packing:
 
     def packed(self, value: Any) -> Tree:
         if isinstance(value, float):
-            return float(value) if math.isfinite(value) else {"float": repr(float(value))}  # JSON knows finite ones
+            return float(value) if math.isfinite(value) else {"float": repr(float(value))}  # JSON has finite ones only
         if value is None or isinstance(value, bool | int | str):
             return value
         if isinstance(value, np.integer | np.bool_):
@@ -119,7 +119,7 @@ class _Packing:
 
 
 def _given(value: Any) -> Iterable[Field[Any]]:
-    """The fields that the constructor takes; others are derived from them."""
+    """The fields of the constructor; others are derived from them."""
     return (field for field in fields(value) if field.init)
 
 

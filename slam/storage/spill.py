@@ -1,4 +1,4 @@
-"""Arrays kept in a temporary file until they are needed again, so that a long drive does not fill the memory."""
+"""Arrays spilled to a temporary file, which limits the memory of a long drive."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from slam.errors import SlamError
 
 
 class SpillFile:
-    """An unnamed temporary file; the operating system removes it when the process ends, however that ends."""
+    """An unnamed temporary file; the operating system removes it when the process ends."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
         self._end = 0
 
     def put(self, array: NDArray[Any]) -> SpilledArray:
-        """Keep an array.
+        """Write an array.
 
         Raises:
             SlamError: the disk is full.

@@ -1,5 +1,5 @@
-"""What several tests of the system stand on: a run folder of a drive around a block, as ``erfsfm-slam run`` leaves
-it, a few frames of the simulated street on disk, and networks that have learned nothing."""
+"""Fixtures of the system's tests: a run folder of a drive around a block, as ``erfsfm-slam run`` writes it, a few
+frames of the simulated street on disk, and untrained networks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PLY = (
 
 
 def drive(frames: int, step_m: float, yaw_bias: float) -> FloatArray:
-    """Poses ``(N, 4, 4)``: once around a block, with a constant error of the turn a step."""
+    """Poses ``(N, 4, 4)``: once around a block, with a constant error of rotation a step."""
     phase = np.linspace(0.0, 2.0 * np.pi, frames - 1)
     yaw = 2.0 * np.pi / frames * (1.0 + 0.9 * np.cos(4.0 * phase)) + yaw_bias
     rotation_vector = np.stack([np.zeros_like(yaw), yaw, np.zeros_like(yaw)], axis=1)
@@ -64,15 +64,15 @@ def errors_of(ate: float) -> dict[str, Any]:
 
 
 def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool = True) -> dict[str, Any]:
-    """``metrics.json`` as section 7 of the design has it."""
+    """``metrics.json`` as in section 7 of the design."""
     truth = "the sequence has no true poses"
     unknown = {"snippet5": None, "snippet5_reason": truth, "align": None, "align_reason": truth}
     unknown |= {"evo": None, "evo_reason": truth}
     numbers = {"network": 6.21, "odometry": 2.43, "optimised": 0.87}
     trajectories: dict[str, Any] = {k: errors_of(v) if reference else unknown for k, v in numbers.items()}
     if reference:
-        for way in trajectories["odometry"]["align"].values():
-            way |= {"t_rel_percent": None, "t_rel_percent_reason": "no segment of 100 m was left"}
+        for alignment in trajectories["odometry"]["align"].values():
+            alignment |= {"t_rel_percent": None, "t_rel_percent_reason": "no segment of 100 m was left"}
     trajectories |= {"lidar": None, "lidar_reason": "the sequence has no LiDAR scans"}
     return {
         "schema": 1,
@@ -166,7 +166,7 @@ def copy_of_kitti_root(kitti_root: Path, tmp_path: Path) -> Callable[[], Path]:
 
 @pytest.fixture(scope="session")
 def write_weights() -> Callable[..., Path]:
-    """Writes small networks with their first random weights, as a training run would have."""
+    """Writes small networks with random weights, as a training run would."""
 
     def write(folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4) -> Path:
         import torch
@@ -185,11 +185,11 @@ def write_weights() -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def tiny_weights(tmp_path_factory: pytest.TempPathFactory, write_weights: Callable[..., Path]) -> Path:
-    """Small networks that have learned nothing."""
+    """Small untrained networks."""
     return write_weights(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture
 def leaky_weights(tmp_path: Path, write_weights: Callable[..., Path]) -> Path:
-    """The same, said to be trained on the world of ``kitti_root``."""
+    """The same, recorded as trained on the world of ``kitti_root``."""
     return write_weights(tmp_path / "leaky", ("simulated/1000-1100",))

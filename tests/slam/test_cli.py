@@ -1,4 +1,4 @@
-"""The command line: help without weight, one line for an error, results on stdout."""
+"""The command line: light help, one line for an error, results on stdout."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_a_closed_stderr_stops_nothing(tmp_path: Path) -> None:
     assert finished.returncode == 0 and "5 frames in world" in finished.stdout
 
 
-def test_an_error_of_several_lines_is_told_in_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_several_lines_is_printed_as_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(**_: Any) -> None:
         raise SlamError("first line\nsecond line")
 
@@ -235,11 +235,11 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
     ]
 
 
-def test_run_says_what_it_bridged(call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path) -> None:
+def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path) -> None:
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
     code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
-    assert code == 0 and re.search(r"^BRIDGED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
+    assert code == 0 and re.search(r"^INTERPOLATED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
 
 
 def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:
@@ -320,8 +320,8 @@ def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: st
     assert code == 0 and output in out and Path(output).read_text().startswith(start)
 
 
-def test_export_turned_up(call: Call, make_run: MakeRun) -> None:
-    """Open3D reads the run's mesh and writes it turned: y down becomes z up."""
+def test_export_with_z_up(call: Call, make_run: MakeRun) -> None:
+    """The mesh read by Open3D is rotated: y down becomes z up."""
     assert call("export", make_run().path, "--what", "mesh", "--output", "up.ply", "--up", "z")[0] == 0
     from slam.runtime.imports import import_open3d
 
@@ -374,7 +374,7 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert "sequence sim: 14 frames" in out
 
 
-def test_a_drive_goes_on_and_says_how_many_frames_it_looked_at(
+def test_a_continued_run_prints_its_numbers_of_frames(
     call: Call, kitti_root: Path, tiny_weights: Path, tmp_path: Path
 ) -> None:
     run = ("run", "--dataset", kitti_root, "--sequence", "sim", "--weights", tiny_weights)

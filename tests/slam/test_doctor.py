@@ -1,4 +1,4 @@
-"""The doctor says what is there, what is not, and what to do."""
+"""The doctor lists what is installed, what is missing, and what to do."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_weights_are_named_with_their_licence(monkeypatch: pytest.MonkeyPatch, t
     assert line.startswith("ok") and "depthnet and posenet" in line and "none, untrained" in line
 
 
-def test_a_package_that_is_gone_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_comes_with_its_installation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "PACKAGES", ("no_such_package",))
     line = finding(examine(None), "no_such_package")
     assert line.startswith("missing") and "pip install" in line
@@ -51,7 +51,7 @@ def test_a_data_set_sequence_by_sequence(kitti_root: Path, by_variable: bool, mo
     assert line.startswith("ok") and "14 frames of 208x64, true poses, camera 1.54 m high" in line
 
 
-def test_an_empty_variable_is_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KITTI_ODOMETRY", "")
     assert "set $KITTI_ODOMETRY" in finding(examine(None), "KITTI_ODOMETRY")
 

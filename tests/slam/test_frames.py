@@ -1,4 +1,4 @@
-"""The small records between the parts."""
+"""Data types shared by the parts."""
 
 from __future__ import annotations
 

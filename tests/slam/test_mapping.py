@@ -60,7 +60,7 @@ def test_one_wall_lands_where_the_camera_saw_it():
     np.testing.assert_allclose(tsdf_map.mesh().colours, 128 / 255, atol=0.01)
 
 
-def test_one_wall_seen_sideways():
+def test_one_wall_from_a_rotated_camera():
     tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)
     for x in (0.0, 0.5, 1.0):
         tsdf_map.integrate(plate(8.05 - x), GREY, pose(x, 0.0, 3.0, yaw=np.pi / 2))
@@ -90,7 +90,7 @@ def test_thinned_keyframes_keep_the_geometry():
     assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15
 
 
-def test_what_two_views_do_not_agree_on_is_left_out():
+def test_depth_inconsistent_between_views_is_left_out():
     def ghost(depth, k):
         depth = depth.copy()
         if k == 11:  # a body that hangs before the last camera only

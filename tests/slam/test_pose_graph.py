@@ -103,8 +103,8 @@ def test_world_stays_at_the_first_pose():
     np.testing.assert_allclose(solved, moved, atol=1e-5)
 
 
-def test_a_chain_that_errs_together_yields_to_a_loop_and_boasts_of_no_more():
-    """The graph weighs ``correlated_sigmas``; what a single factor promises stays."""
+def test_correlated_sigmas_weigh_a_chain_against_a_loop_and_leave_sigmas_as_they_are():
+    """The graph uses ``correlated_sigmas``; the sigmas of single factors stay."""
     truth, edges, _, loops, initial = noisy_problem()
     chained = [replace(each, correlated_sigmas=4.0 * each.sigmas) for each in edges]
     looser = [replace(each, sigmas=4.0 * each.sigmas) for each in edges]
@@ -178,7 +178,7 @@ def test_wrong_input_is_refused_with_its_name():
         graph.optimise(truth[:3])
 
 
-def test_newest_loops_are_given_up_when_the_system_is_singular(monkeypatch):
+def test_newest_loops_are_dropped_when_the_system_is_singular(monkeypatch):
     _, odometry, _, loops, initial = noisy_problem(count=40)
     graph = PoseGraph(PoseGraphConfig())
     graph.add_relative(*odometry, *loops[:3])
@@ -197,7 +197,7 @@ def test_newest_loops_are_given_up_when_the_system_is_singular(monkeypatch):
         graph.optimise(initial)
 
 
-def test_a_loop_that_the_rest_contradicts_is_given_up():
+def test_a_loop_contradicted_by_the_rest_is_dropped():
     truth, odometry, skips, loops, initial = noisy_problem()
     wrong = truth[0] @ truth[100] @ se3.from_rotation_vector(np.zeros(3), np.array([30.0, 0.0, 0.0]))
     false = RelativePose(20, 120, wrong, loops[0].sigmas, LOOP_SOURCE)
@@ -210,7 +210,7 @@ def test_a_loop_that_the_rest_contradicts_is_given_up():
 
 
 def apart(T_world_camera, T_other) -> float:
-    """Largest distance of two trajectories as a share of the path."""
+    """Largest distance of two trajectories over the length of the path."""
     path = np.linalg.norm(np.diff(T_other[:, :3, 3], axis=0), axis=1).sum()
     return float(np.linalg.norm(T_world_camera[:, :3, 3] - T_other[:, :3, 3], axis=1).max() / path)
 
@@ -232,7 +232,7 @@ def test_incremental_and_batch_agree(kernel):
     assert apart(T_world_camera, initial) > 5e-3
 
 
-def test_incremental_exchanges_what_now_reads_differently():
+def test_incremental_replaces_changed_measurements():
     _, odometry, skips, loops, initial = noisy_problem(count=60)
     incremental = IncrementalPoseGraph(PoseGraphConfig())
     incremental.update([*odometry, *skips, *loops], initial)
@@ -245,7 +245,7 @@ def test_incremental_exchanges_what_now_reads_differently():
     np.testing.assert_allclose(T_world_camera, expected, atol=1e-3)
 
 
-def test_incremental_refuses_loose_frames_and_goes_on():
+def test_incremental_refuses_unconnected_frames_and_goes_on():
     _, odometry, skips, loops, initial = noisy_problem(count=60)
     incremental = IncrementalPoseGraph(PoseGraphConfig())
     incremental.update(odometry[:29], initial[:30])
@@ -256,7 +256,7 @@ def test_incremental_refuses_loose_frames_and_goes_on():
     assert apart(solved, batch) < 1e-3
 
 
-def test_incremental_starts_again_where_the_system_broke(monkeypatch, caplog):
+def test_incremental_restarts_after_an_indeterminate_system(monkeypatch, caplog):
     _, odometry, skips, loops, initial = noisy_problem(count=60)
     incremental = IncrementalPoseGraph(PoseGraphConfig())
     incremental.update(odometry[:29], initial[:30])
@@ -269,10 +269,10 @@ def test_incremental_starts_again_where_the_system_broke(monkeypatch, caplog):
     solved = incremental.update([*odometry, *skips, *loops], initial)
     _, batch = solve([*odometry, *skips, *loops], initial)
     assert apart(solved, batch) < 1e-3
-    assert "starts again: Indeterminant linear system" in caplog.text
+    assert "is restarted: Indeterminant linear system" in caplog.text
 
 
-def test_incremental_that_breaks_twice_is_one_error_and_goes_on_afterwards(monkeypatch):
+def test_incremental_that_fails_twice_is_one_error_and_goes_on_afterwards(monkeypatch):
     """The restart fails as well: one line, and the next update is not left with an unusable iSAM2."""
     _, odometry, skips, loops, initial = noisy_problem(count=60)
     incremental = IncrementalPoseGraph(PoseGraphConfig())

@@ -46,7 +46,7 @@ def test_pixels_without_a_common_camera_have_none() -> None:
     assert found is None or len(found[2]) < 12
 
 
-def test_sigmas_are_how_far_refined_cameras_err() -> None:
+def test_sigmas_are_those_of_the_errors_of_refined_cameras() -> None:
     whitened = []
     for seed in range(60):
         points, pixels, _ = scene(seed, noise_px=0.5, outliers=0)

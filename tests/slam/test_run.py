@@ -1,4 +1,4 @@
-"""From a data set and weights to a run folder, the way a user goes; the networks have learned nothing."""
+"""Whole runs from a data set and weights to a run folder, with untrained networks."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_configuration_reads_back(run: RunFolder) -> None:
     assert load_config(run.path / "config.yaml") == load_config()
 
 
-def test_the_report_and_the_log_tell_of_it(run: RunFolder) -> None:
+def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
     report = (run.path / "report.html").read_text()
     assert "none, untrained" in report and ">FAILED<" not in report and ">LEAK<" not in report
     assert not re.search(r"(src|href)=['\"]https?:", report)
@@ -80,8 +80,8 @@ def test_the_report_and_the_log_tell_of_it(run: RunFolder) -> None:
     assert all(not isinstance(handler, logging.FileHandler) for handler in logging.getLogger("slam").handlers)
 
 
-def test_the_snippets_of_the_network_are_its_own_answers(run: RunFolder) -> None:
-    """Cut from the chain they would be other numbers: an untrained net's answers do not fit each other."""
+def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> None:
+    """Cut from the chain they would be other numbers: poses of an untrained network are inconsistent."""
     numbers = run.metrics()["trajectories"]
     assert numbers["network"]["snippet5"]["ate_mean"] != numbers["odometry"]["snippet5"]["ate_mean"]
     assert numbers["network"]["snippet5"]["ate_mean"] > 0
@@ -117,7 +117,7 @@ def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], t
     assert not (tmp_path / "results").exists() and not (output / "unfinished").exists()
 
 
-def test_without_map_and_truth_the_reasons_stand_there(
+def test_without_map_and_truth_the_reasons_are_written(
     reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
 ) -> None:
     root = copy_of_kitti_root()
@@ -170,7 +170,7 @@ def test_an_unreadable_image_is_bridged_and_reported(
 @pytest.mark.parametrize(
     "error", [Terminated(15), KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")]
 )
-def test_whatever_ends_a_run_its_folder_says_so(
+def test_however_a_run_ends_its_folder_has_the_reason(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     def stop(self: SlamPipeline) -> None:
@@ -180,8 +180,8 @@ def test_whatever_ends_a_run_its_folder_says_so(
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
     metrics = RunFolder.open(tmp_path / "ended").metrics()
-    told = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
-    wanted = told.get(type(error).__name__, type(error).__name__)
+    known = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
+    wanted = known.get(type(error).__name__, type(error).__name__)
     assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
 
 
@@ -192,17 +192,17 @@ def test_an_untrained_pose_network_with_two_sources_runs(
     assert metrics["trajectories"]["network"]["snippet5"]["count"] == 2
 
 
-def test_wishes_that_cannot_be_met_make_no_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -> None:
     for wish in ({"sequence": "09"}, {"frames": "0:99"}, {"overrides": ["map.enabled=false"]}):
         with pytest.raises(SlamError):
             run_slam(**quick | wish, output=tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
-def test_progress_is_told(quick: dict[str, Any]) -> None:
-    told: list[tuple[str, int, int]] = []
-    run_slam(**quick, progress=lambda *words: told.append(words))
-    assert told == [("frames", k, 6) for k in range(1, 7)]
+def test_progress_is_reported(quick: dict[str, Any]) -> None:
+    calls: list[tuple[str, int, int]] = []
+    run_slam(**quick, progress=lambda *words: calls.append(words))
+    assert calls == [("frames", k, 6) for k in range(1, 7)]
 
 
 def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,8 +225,8 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
 def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
     kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def asked(*_: object, **__: object) -> None:
-        raise AssertionError("a network was asked, or an image measured")
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("a network was run, or an image measured")
 
     def run(name: str, *overrides: str, cache: Path | None = tmp_path / "cache") -> RunFolder:
         given = [NO_REPORT, *overrides]
@@ -234,9 +234,9 @@ def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
 
     plain, cold = run("plain", cache=None), run("cold")
     for name in ("disparity", "poses"):
-        monkeypatch.setattr(slam.run.DepthPosePredictor, name, asked)
+        monkeypatch.setattr(slam.run.DepthPosePredictor, name, forbidden)
     for name in ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat", "remap"):
-        monkeypatch.setattr(cv2, name, asked)
+        monkeypatch.setattr(cv2, name, forbidden)
     warm = run("warm")
     names = sorted(path.name for path in plain.path.iterdir())
     assert names == sorted(path.name for path in warm.path.iterdir())

@@ -122,7 +122,7 @@ def test_a_run_that_breaks_off_leaves_an_earlier_one_and_stays_beside_it(
     assert set(contents(output)) == set(before)
 
 
-def test_a_disk_that_fills_up_with_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     overrides = ["geometry.enabled=false", "output.report=false", "output.keep=nothing", "loops.enabled=false"]
     overrides.append("mapping.voxel_size_m=0.1")  # a map larger than any other file
     arguments = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:7"]
@@ -148,13 +148,13 @@ def test_a_disk_that_fills_up_with_the_map(kitti_root: Path, tmp_path: Path, cap
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_run_that_is_told_to_end_says_so(
+def test_a_terminated_run_has_its_reason(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    def told_to_end(self: SlamPipeline, estimate: object) -> None:
+    def terminated(self: SlamPipeline, estimate: object) -> None:
         os.kill(os.getpid(), getattr(signal, name))
 
-    monkeypatch.setattr(SlamPipeline, "fuse", told_to_end)
+    monkeypatch.setattr(SlamPipeline, "fuse", terminated)
     with pytest.raises(Terminated) as raised:
         run_slam(**quick, output=tmp_path / "run")
     assert raised.value.code == 128 + getattr(signal, name)

@@ -175,7 +175,7 @@ def test_stamps_match_one_to_one_within_half_a_period() -> None:
     assert matching_tolerance_s(estimate, reference) == pytest.approx(0.05)
 
 
-def test_two_rows_never_share_a_partner() -> None:
+def test_no_row_is_matched_twice() -> None:
     poses = wander(4).T_world_camera
     reference = Trajectory(np.array([0.0, 1.0, 2.0, 3.0]), poses)
     estimate = Trajectory(np.array([0.1, 0.9, 1.05, 9.0]), poses)
@@ -184,7 +184,7 @@ def test_two_rows_never_share_a_partner() -> None:
     np.testing.assert_array_equal(theirs.stamps, [0.0, 1.0])
 
 
-def test_other_clocks_are_said_and_gaps_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_other_clocks_are_an_error_and_gaps_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     reference = wander(20)
     with pytest.raises(TrajectoryError, match=r"1000\.000 to 1001\.900 s and the reference 0\.000 to 1\.900 s"):
         associate(Trajectory(reference.stamps + 1000.0, reference.T_world_camera), reference)
@@ -194,7 +194,7 @@ def test_other_clocks_are_said_and_gaps_are_warned_of(caplog: pytest.LogCaptureF
     assert "10 of 20" in caplog.text
 
 
-def test_a_single_row_finds_its_partner() -> None:
+def test_a_single_row_is_matched() -> None:
     reference = wander(5)
     one = Trajectory(np.array([0.21]), reference.T_world_camera[:1])
     assert associate(one, reference)[1].stamps.tolist() == [0.2]

@@ -1,6 +1,6 @@
 """The unit of a run and the lengths of its steps, by mode: camera height over the ground plane, LiDAR, a reference.
 
-Lengths are solved in ``frontend/scale/step_lengths.py``; the mode decides which measurements are in the unit wanted.
+Lengths are estimated in ``frontend/scale/step_lengths.py``; the mode decides which measurements are absolute.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StepLength:
-    """A length, its relative sigma, and that of independent errors that add up along the drive as its errors do."""
+    """A length, its relative sigma, and the sigma of independent errors that add up as its correlated ones do."""
 
     value: float
     relative_sigma: float
@@ -39,8 +39,8 @@ class StepLength:
 class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in the mode's unit.
 
-    ``lengths`` are those of the steps that were measured apart from learned depth, unscaled: times ``per_frame`` at a
-    step's first frame they are in the mode's unit.
+    ``lengths`` are those of the steps measured without learned depth, unscaled: times ``per_frame`` at a step's first
+    frame they are in the mode's unit.
     """
 
     mode: ScaleMode
@@ -49,20 +49,20 @@ class Scale:
     lengths: Mapping[Ends, StepLength]
 
     def in_unit_of(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
-        """The same times an estimate that was made in this unit; unchanged where that failed."""
+        """The same times an estimate in this unit; unchanged where that failed."""
         if isinstance(other, MeasurementFailure):
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
         return replace(self, estimate=replace(other, value=float(np.median(per_frame))), per_frame=per_frame)
 
     def unit_at(self, measured: RelativePose) -> float:
-        """The mode's unit per unscaled length where something was measured."""
+        """The mode's unit per unscaled length at the first frame of a measurement."""
         return float(self.per_frame[min(measured.ends)])
 
 
 @dataclass(frozen=True)
 class LengthMeasurements:
-    """What one pass measured: ground planes of learned depth by frame; triangulated motions and road steps by step."""
+    """Measurements of one pass: ground planes by frame, triangulated motions and road steps by step."""
 
     planes: Sequence[GroundPlane | MeasurementFailure]
     motions: Mapping[Ends, Motion]
@@ -94,14 +94,14 @@ def find_scale(
     if isinstance(by_planes, MeasurementFailure):
         prior_unit = np.full(frames, _unit_by_steps(measured.motions, absolute))
     elif absolute:
-        # steps of known length measure how the unit drifts; rain or a car ahead bends the learned ground plane
+        # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
         prior_unit = np.full(frames, by_planes.value)
     else:
         prior_unit = scale_track(measured.planes, height, by_planes, config)
     steps = links(measured.motions, frames)
     evidence = gather_evidence(steps, measured.motions, absolute, prior_unit)
     if not isinstance(by_planes, MeasurementFailure):
-        # a car ahead that is taken for the road, for seconds on end, would outvote everything else
+        # a car ahead taken for the road for seconds would outweigh all other measurements
         evidence = evidence.without_contradicted(lengths.max_contradiction)
     solved = solve_lengths(evidence, lengths)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
@@ -118,7 +118,7 @@ def find_scale(
 
 
 def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: FloatArray) -> dict[Ends, StepLength]:
-    """Of the steps that something measured."""
+    """Unscaled lengths of the measured steps."""
     rows = zip(steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True)
     return {
         ends: StepLength(float(length / per_frame[ends[0]]), float(sigma), float(correlated))
@@ -128,7 +128,7 @@ def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: Flo
 
 
 def _height_by_lidar(metres: Mapping[Ends, float], road_steps: Mapping[Ends, RoadStep]) -> float | None:
-    """The camera's height from steps that LiDAR and road both measured."""
+    """The camera's height from steps measured by both LiDAR and road; None where there are none."""
     heights = [metres[ends] / road.length_heights for ends, road in road_steps.items() if ends in metres]
     return float(np.median(heights)) if heights else None
 

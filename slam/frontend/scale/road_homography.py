@@ -1,9 +1,9 @@
 """The length of a step in camera heights, by the homography of the road between two images.
 
-A plane ``n . X = h`` of the current camera moves by the homography ``R + t n^T / h`` to the previous one
+A plane ``n . X = h`` of the current camera maps to the previous one by the homography ``R + t n^T / h``
 (Hartley and Zisserman 2004, Eq. 13.2). Rotation and direction of ``t`` are known from corners; the vector
-``m = |t| n / h`` that aligns both images of the road is estimated, and its norm is the length sought. Learned depth
-is not used, so this length neither shares the networks' bias nor drifts.
+``m = |t| n / h`` that aligns both images of the road is estimated; its norm is the length. Learned depth is
+not used, so this length has neither the bias nor the drift of the networks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
-_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # where the search begins; refinement reaches the next
+_LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
 _STEPS_KEPT = 100
@@ -40,10 +40,10 @@ class RoadStep:
 
 
 class RoadHomography:
-    """Aligns the road between two frames of one sequence by its homography, and learns the road's normal.
+    """Aligns the road between two frames of one sequence by its homography, and tracks the direction of motion.
 
-    A car ahead hides most of a long strip of road and stands still in the image. Where the long strip fails, a short
-    and wide one is used, which ends before such a car; it is less accurate.
+    A car ahead occludes most of a long strip of road and stands still in the image. Where the long strip fails, a
+    short and wide one is used, which ends before such a car; it is less accurate.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class RoadHomography:
         get_or_compute: GetOrCompute = without_cache,
         directions: tuple[FloatArray, ...] = (),
     ) -> None:
-        """Prepare for the first step, or go on from the ``directions`` of motion so far (`state`)."""
+        """Prepare for the first step, or resume with the ``directions`` of motion so far (`state`)."""
         self._config = config
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
@@ -98,17 +98,15 @@ class RoadHomography:
         if not np.isfinite(length) or deviation > np.deg2rad(self._config.max_tilt_deg):
             return MeasurementFailure(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
         if correlation < self._config.min_correlation:
-            return MeasurementFailure(f"the road looks different in both images (correlation {correlation:.2f})")
+            return MeasurementFailure(f"both images of the road do not correlate ({correlation:.2f})")
         if 1.0 - correlation > (1.0 - self._config.min_gain) * (1.0 - standing):
-            return MeasurementFailure(
-                f"what is in front of the car stands still in the image (correlation {standing:.2f})"
-            )
+            return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
         return RoadStep(length, float(np.hypot(strip.shape.relative_sigma, self._config.tilt_gain * deviation)), normal)
 
     def _aligned(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> tuple[FloatArray, float, float]:
-        """The plane ``m`` ``(3,)`` that aligns the road, the correlation of both views then, and without alignment."""
+        """The plane ``m`` ``(3,)`` that aligns the road, and the correlation of both images with and without it."""
         config = self._config
 
         def align() -> Answer:
@@ -123,13 +121,13 @@ class RoadHomography:
 
         settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
         given = (previous, current, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
-        plane, alike = self._get_or_compute("road homography", given, align)
-        return plane, float(alike[0]), float(alike[1])
+        plane, correlations = self._get_or_compute("road homography", given, align)
+        return plane, float(correlations[0]), float(correlations[1])
 
     def _expected(self) -> FloatArray:
-        """The normal to expect ``(3,)``: a level camera's, pitched until the car moves along the road.
+        """The expected normal ``(3,)``: that of a level camera, pitched so that the motion is parallel to the road.
 
-        The images determine pitch and length poorly together; the direction of motion determines pitch well.
+        The images alone determine pitch and length poorly; the direction of motion determines pitch well.
         """
         direction = np.median(self._directions, axis=0)
         along = direction / max(float(np.linalg.norm(direction)), 1e-9)
@@ -137,7 +135,7 @@ class RoadHomography:
         return np.asarray(normal / np.linalg.norm(normal))
 
     def _layers(self, frame: Frame) -> list[_Layer]:
-        """Coarse and fine image ``(H', W, 3)`` below the horizon, freed of slow shading, each with its gradients."""
+        """Coarse and fine image ``(H', W, 3)`` below the horizon, high-pass filtered, each with its gradients."""
         return frame.derived(("road layers", self._top_row, self._intrinsics.fx), lambda: self._filtered(frame))
 
     def _filtered(self, frame: Frame) -> list[_Layer]:
@@ -147,7 +145,7 @@ class RoadHomography:
         return [_with_gradients(layer) for layer in (coarse, fine)]
 
     def _sampled(self, layer: _Layer, points_previous: _Layer) -> _Layer:
-        """Grey and slopes ``(..., P, 3)`` of the earlier image where points ``(..., 3, P)`` of its camera fall."""
+        """Grey levels and gradients ``(..., P, 3)`` of the earlier image at points ``(..., 3, P)`` of its camera."""
         camera = self._intrinsics
         x, y, z = np.moveaxis(points_previous, -2, 0)
         u = camera.fx * x / z + camera.cx
@@ -156,7 +154,7 @@ class RoadHomography:
         return np.asarray(cv2.remap(layer, columns, rows, cv2.INTER_LINEAR)).reshape(*u.shape, 3)
 
     def _search(self, strip: _Strip, before: _Layer, now: _Layer, T_unit: FloatArray, normal: FloatArray) -> FloatArray:
-        """The best of some lengths at the expected normal, from every third pixel of the coarse image."""
+        """The best of fixed lengths at the expected normal, on every third pixel of the coarse image."""
         rays, seen = strip.rays[:, ::3], now[strip.rows[::3], strip.columns[::3], 0]
         R, t, n = _single(T_unit[:3, :3], T_unit[:3, 3], normal)
         shift = np.outer(t, n @ rays)
@@ -174,14 +172,14 @@ class RoadHomography:
         expected: FloatArray,
         tilt: float,
     ) -> tuple[FloatArray, float]:
-        """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also how alike both views of the road are."""
+        """Gauss-Newton with Cauchy weights on the plane ``m`` ``(3,)``; also the correlation of both images."""
         fx, fy, (tx, ty, tz) = self._intrinsics.fx, self._intrinsics.fy, T_unit[:3, 3].tolist()
         R, t = _single(T_unit[:3, :3], T_unit[:3, 3])
-        turned, seen = R @ strip.rays, now[strip.rows, strip.columns, 0]
+        rotated, seen = R @ strip.rays, now[strip.rows, strip.columns, 0]
         across = np.eye(3) - np.outer(expected, expected)
         for _ in range(_ITERATIONS):
             (m,) = _single(plane)
-            points = _ahead(turned + np.outer(t, m @ strip.rays))
+            points = _ahead(rotated + np.outer(t, m @ strip.rays))
             grey, slope_x, slope_y = np.ascontiguousarray(self._sampled(before, points).T)
             residual = grey - seen
             x, y, z = points
@@ -199,7 +197,7 @@ class RoadHomography:
 
 @dataclass(frozen=True)
 class _Shape:
-    """How far a strip of road reaches, half its width, in camera heights, and the least sigma of a length by it."""
+    """Length and half width of a strip of road, in camera heights, and the least relative sigma of its step lengths."""
 
     far_heights: float
     half_width_heights: float
@@ -227,12 +225,12 @@ def _strip(intrinsics: Intrinsics, top_row: int, shape: _Shape, points: int) -> 
 
 
 def _single(*parts: FloatArray) -> tuple[_Layer, ...]:
-    """In single precision, as the strip's rays are: one double among them makes all of the arithmetic double."""
+    """In single precision, as the rays: one double operand would make all arithmetic double."""
     return tuple(part.astype(np.float32) for part in parts)
 
 
 def _ahead(points: _Layer) -> _Layer:
-    """Points ``(..., 3, P)`` with depths kept off zero, where a plane that is far from true would put them."""
+    """Points ``(..., 3, P)`` with positive depth, also for a wrong plane."""
     np.maximum(points[..., 2, :], 1e-3, out=points[..., 2, :])
     return points
 

@@ -1,7 +1,7 @@
 """The ground plane in front of the camera, fitted to learned depth.
 
 With the plane ``n . X = h`` and a pixel's ray ``r`` (z = 1), ``1 / z = (n / h) . r``: inverse depth is linear in the
-ray, and the ray is free of noise, so the fit is not biased by the depth's errors as a fit of points is.
+ray, and the ray has no noise, so errors of depth do not bias the fit as they bias a fit to points.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class GroundPlaneFitter:
     """Fits the road in a trapezoid in front of the car, by RANSAC and reweighted least squares on inverse depth."""
 
     def __init__(self, config: ScaleConfig, intrinsics: Intrinsics, seed: int = 0) -> None:
-        """Choose the pixels of the trapezoid; other seeds draw other RANSAC samples."""
+        """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
         self._config = config
         self._seed = seed
         self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)

@@ -18,7 +18,7 @@ from slam.se3 import FloatArray
 class ScaleEstimate:
     """``value`` times an unscaled length is a length in the mode's unit.
 
-    ``spread`` is the relative sigma of the single frames' values.
+    ``spread`` is the relative sigma of the values of single frames.
     """
 
     value: float
@@ -27,7 +27,7 @@ class ScaleEstimate:
 
 
 def resolve_mode(config: ScaleConfig, camera_height_m: float | None) -> ScaleMode:
-    """The mode that ``auto`` stands for: camera-height where the height is known, else none."""
+    """The mode, with ``auto`` resolved: camera-height where the height is known, else none."""
     if config.mode != "auto":
         return config.mode
     return "none" if camera_height_m is None else "camera-height"
@@ -59,7 +59,7 @@ def scale_from_reference(
 
 
 def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
-    """One scale from a ratio per frame ``(K,)``: their median, frames many MADs away left out."""
+    """One scale from a ratio per frame ``(K,)``: their median without outliers, which are many MADs away."""
     ratios = np.asarray(ratios, dtype=np.float64)
     ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
     if len(ratios) < config.min_frames:
@@ -77,10 +77,10 @@ def scale_track(
     estimate: ScaleEstimate,
     config: ScaleConfig,
 ) -> FloatArray:
-    """The scale near each frame ``(N,)``: a running median of the road's ratios.
+    """The scale near each frame ``(N,)``: a running median over ground planes.
 
-    Learned depth breathes: its unit wanders along a drive. Where ``smoothing_frames`` around a frame hold
-    too few usable roads, the estimate of the whole drive stands in.
+    The unit of learned depth drifts along a drive. Where ``smoothing_frames`` around a frame hold too few
+    usable planes, the estimate of the whole drive is used.
     """
     height = 1.0 if camera_height_m is None else camera_height_m
     ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])

@@ -1,4 +1,4 @@
-"""The lengths of all steps, solved together, with the drifting unit of learned depth as a state.
+"""Joint estimation of the lengths of all steps and of the drifting unit of learned depth.
 
 A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
 that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
@@ -6,7 +6,7 @@ it in a unit that drifts. In logarithms all of them are linear in the lengths ``
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
 
-so one robust sparse least squares solves the whole drive (``docs/design/scale-and-lengths.md``).
+solved for the whole drive by robust sparse least squares (``docs/design/scale-and-lengths.md``).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _MOST_CORRELATED = 0.999
 
 @dataclass(frozen=True)
 class StepEvidence:
-    """What was measured of S steps, logarithms and their sigmas ``(S,)`` each, NaN where nothing was.
+    """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
-    ``ratio`` is the length over that of the step before; ``absolute`` the length in the unit wanted; ``learned``
+    ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's unit; ``learned``
     the length by learned depth, already in the prior unit of the networks.
     """
 
@@ -48,20 +48,20 @@ class StepEvidence:
 
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:
-        """Nothing measured yet."""
+        """Without a measurement."""
         return cls(*(np.full(steps, np.nan) for _ in range(5)))
 
     def without_contradicted(self, factor: float) -> StepEvidence:
-        """The same without absolute lengths that are more than ``factor`` times longer or shorter than learned ones."""
+        """The same without absolute lengths that differ from learned ones by more than ``factor``."""
         contradicted = np.abs(self.absolute - self.learned) > np.log(factor)
         return replace(self, absolute=np.where(contradicted, np.nan, self.absolute))
 
 
 @dataclass(frozen=True)
 class StepLengths:
-    """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN where nothing measured it.
+    """``length`` ``(S,)`` of each step and its ``relative_sigma`` ``(S,)``, NaN without a measurement.
 
-    Steps that are tied by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
+    Steps linked by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
     would add up along the drive as those do. ``unit_correction`` ``(S,)`` times the prior unit of learned depth is its
     unit near that step.
     """
@@ -78,12 +78,12 @@ def gather_evidence(
     absolute: Mapping[Ends, tuple[float, float]],
     prior_unit: FloatArray,
 ) -> StepEvidence:
-    """All that was measured of the lengths of a drive's steps, one row a link.
+    """All measurements of the lengths of a drive's steps, one row a link.
 
     Args:
-        links: steps that follow each other.
+        links: consecutive steps.
         motions: the triangulated ones.
-        absolute: length in the unit wanted, and its relative sigma.
+        absolute: length in the mode's unit, and its relative sigma.
         prior_unit: that unit per unscaled length near each frame ``(N,)``.
     """
     evidence = StepEvidence.empty(len(links))
@@ -119,7 +119,7 @@ def length_ratio(earlier: TriangulatedPoints, later: TriangulatedPoints) -> tupl
 
 
 def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
-    """The lengths that explain all evidence best: Huber first, then Cauchy weights against what is wrong."""
+    """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers."""
     steps = len(evidence.learned)
     lengths, units = np.arange(steps), steps + np.arange(steps)
     ratio_sigma = np.hypot(config.ratio_widening * evidence.ratio_sigma, config.ratio_sigma)
@@ -129,7 +129,7 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
         _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
         _Rows(units[1:], units[:-1], 0.0 * ones[1:], config.unit_walk_sigma * ones[1:]),
-        # one belief about the whole drive, spread over its steps
+        # one prior on the unit of the whole drive, divided among its steps
         _Rows(units, None, 0.0 * ones, config.unit_sigma * np.sqrt(steps) * ones),
     ]
     A, target = _whitened(rows, 2 * steps)
@@ -152,10 +152,10 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
 
 
 def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArray]:
-    """What an information matrix ``(2 S, 2 S)`` of lengths, then units, leaves of every length.
+    """Marginals of every length from an information matrix ``(2 S, 2 S)`` of lengths, then units.
 
-    Only neighbours are tied to each other, so what all steps before and all steps after say of one are two chains of
-    2x2 Schur complements.
+    The matrix is block tridiagonal by step, so the marginal information from all earlier and from all later steps is
+    each a chain of 2x2 Schur complements.
 
     Returns:
         Sigmas ``(S,)``, and correlations ``(S,)`` with the neighbours' lengths in [0, 1), the mean of both sides.
@@ -166,22 +166,22 @@ def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArra
     own = np.zeros((steps, 2, 2))
     own[:, 0, 0], own[:, 1, 1] = main[:steps], main[steps:]
     own[:, 0, 1] = own[:, 1, 0] = information.diagonal(steps)
-    tie = np.zeros((steps, 2, 2))  # of a step and the next
-    tie[:-1, 0, 0], tie[:-1, 1, 1] = neighbour[: steps - 1], neighbour[steps:]
+    coupling = np.zeros((steps, 2, 2))  # of a step and the next
+    coupling[:-1, 0, 0], coupling[:-1, 1, 1] = neighbour[: steps - 1], neighbour[steps:]
     before, after = own.copy(), own.copy()
     for k in range(1, steps):
-        before[k] -= tie[k - 1] @ np.linalg.inv(before[k - 1]) @ tie[k - 1]
-        after[-k - 1] -= tie[-k - 1] @ np.linalg.inv(after[-k]) @ tie[-k - 1]
+        before[k] -= coupling[k - 1] @ np.linalg.inv(before[k - 1]) @ coupling[k - 1]
+        after[-k - 1] -= coupling[-k - 1] @ np.linalg.inv(after[-k]) @ coupling[-k - 1]
     sigmas = np.sqrt(np.linalg.inv(before + after - own)[:, 0, 0])
-    pairs = np.block([[before[:-1], tie[:-1]], [tie[:-1], after[1:]]])  # (S - 1, 4, 4)
-    alike = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED)
-    ends = alike[:1], alike[-1:]
-    return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], alike]) + np.concatenate([alike, ends[1]]))
+    pairs = np.block([[before[:-1], coupling[:-1]], [coupling[:-1], after[1:]]])  # (S - 1, 4, 4)
+    coupled = np.clip(np.linalg.inv(pairs)[:, 0, 2] / (sigmas[:-1] * sigmas[1:]), 0.0, _MOST_CORRELATED)
+    ends = coupled[:1], coupled[-1:]
+    return np.asarray(sigmas), 0.5 * (np.concatenate([ends[0], coupled]) + np.concatenate([coupled, ends[1]]))
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Equations ``state[plus] - state[minus] = value``, each with its sigma; NaN values say nothing."""
+    """Equations ``state[plus] - state[minus] = value``, each with its sigma; those with NaN are left out."""
 
     plus: np.ndarray[tuple[int], np.dtype[np.int64]]
     minus: np.ndarray[tuple[int], np.dtype[np.int64]] | None

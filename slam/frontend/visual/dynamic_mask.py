@@ -1,7 +1,7 @@
-"""Where in the image objects lately moved by themselves.
+"""Regions of the image that recently showed dynamic objects.
 
 A car ahead stays at one place of the image for minutes. Some of its corners fit the camera's motion by chance and bias
-it, but most do not: where many corners were outliers lately, the others are weighted down
+it, but most do not: where many corners were outliers recently, the others are weighted down
 (``docs/design/visual-front-end.md``).
 """
 
@@ -18,7 +18,7 @@ from slam.se3 import FloatArray
 
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5
-# a step's inliers are half forgotten after seven steps
+# decay a step: a half-life of seven steps
 _KEPT = 0.9
 # weight, in corners, of the prior that a cell has the inlier ratio of the whole image
 _PRIOR_CORNERS = 0.5
@@ -28,7 +28,7 @@ _PRIOR_CORNERS = 0.5
 class DynamicMask:
     """Inliers and all corners of the last steps by cell of the image ``(h, w)``, decayed exponentially.
 
-    ``sharpness`` is the power of a cell's inlier ratio over that of the whole image; 0 weights all cells alike.
+    ``sharpness`` is the power of a cell's inlier ratio over that of the whole image; 0 weights all cells equally.
     """
 
     inliers: FloatArray
@@ -37,7 +37,7 @@ class DynamicMask:
 
     @classmethod
     def empty(cls, width: int, height: int, sharpness: float) -> Self:
-        """Nothing seen yet in images of so many pixels."""
+        """A mask without observations for images of ``width`` x ``height`` pixels."""
         shape = int(np.ceil(height / _CELL_PX)), int(np.ceil(width / _CELL_PX))
         return cls(np.zeros(shape), np.zeros(shape), sharpness)
 

@@ -1,4 +1,4 @@
-"""Two-view geometry of calibrated points: motions proposed by consensus, and what they triangulate.
+"""Two-view geometry of calibrated points: motions by consensus, and triangulation.
 
 A motion is ``x_current ~ R_current_previous @ X_previous + direction``; ``frontend/visual/two_view.py`` refines it.
 """
@@ -22,7 +22,7 @@ _LEAST_POINTS = 8
 
 @dataclass(frozen=True)
 class UnitRelativePose:
-    """A motion between two views apart from its length: ``direction`` ``(3,)`` in the current camera, unit length."""
+    """A motion between two views without its length: ``direction`` ``(3,)`` in the current camera, unit length."""
 
     R_current_previous: FloatArray
     direction: FloatArray
@@ -44,7 +44,7 @@ class TriangulatedPoints:
 def unit_pose_by_essential(
     rays_previous: FloatArray, rays_current: FloatArray, tolerance: float, seed: int = 0
 ) -> UnitRelativePose | None:
-    """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` of z = 1."""
+    """The motion with most support among matched rays ``(M, 3)`` with z = 1, within ``tolerance`` on z = 1."""
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]
     cv2.setRNGSeed(seed)
@@ -67,7 +67,7 @@ def _in_front(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray
     """Of the four motions of an essential matrix the one with most points in front of both cameras."""
     R, R_twisted, direction = cv2.decomposeEssentialMat(E)
     unit_poses = [
-        UnitRelativePose(turned, sign * direction.ravel()) for turned in (R, R_twisted) for sign in (1.0, -1.0)
+        UnitRelativePose(rotated, sign * direction.ravel()) for rotated in (R, R_twisted) for sign in (1.0, -1.0)
     ]
 
     def in_front_of_both(unit_pose: UnitRelativePose) -> int:
@@ -82,7 +82,7 @@ def unit_pose_by_pnp(
 ) -> UnitRelativePose | None:
     """The motion with most support among the same rays where their depths ``(M,)`` are known, else NaN.
 
-    Dynamic objects do not fit the static scene here: their depth tells them apart.
+    Known depth separates dynamic objects from the static scene.
     """
     known = np.isfinite(depth_previous)
     if known.sum() < _LEAST_POINTS:
@@ -102,15 +102,15 @@ def parallax_px(
     R_current_previous: FloatArray,
     intrinsics: Intrinsics,
 ) -> FloatArray:
-    """Motion of each point in pixels ``(M,)`` that the rotation does not explain."""
-    turned = rays_previous @ R_current_previous.T
-    turned = turned[:, :2] / np.where(turned[:, 2:] > 1e-6, turned[:, 2:], 1e-6)
-    difference = (rays_current[:, :2] - turned) * [intrinsics.fx, intrinsics.fy]
+    """Optical flow of each point in pixels ``(M,)`` without that of the rotation."""
+    rotated = rays_previous @ R_current_previous.T
+    rotated = rotated[:, :2] / np.where(rotated[:, 2:] > 1e-6, rotated[:, 2:], 1e-6)
+    difference = (rays_current[:, :2] - rotated) * [intrinsics.fx, intrinsics.fy]
     return np.asarray(np.linalg.norm(difference, axis=1))
 
 
 def rotation_between(rays_previous: FloatArray, rays_current: FloatArray) -> FloatArray:
-    """``R_current_previous`` that explains the matched rays ``(M, 3)`` best without any translation.
+    """``R_current_previous`` that fits the matched rays ``(M, 3)`` best without translation.
 
     Orthogonal Procrustes on unit rays, trimmed to the better three quarters, so that dynamic objects do not bias it.
     """

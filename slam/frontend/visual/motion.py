@@ -1,4 +1,4 @@
-"""A motion measured by optical flow: a relative pose whose length may come from elsewhere."""
+"""A motion measured by optical flow: a relative pose whose length may be measured separately."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class Motion:
         """Sigmas of rotation and direction by the corners' own covariance.
 
         Raises:
-            ValueError: it has no direction apart from its length.
+            ValueError: its direction was not measured separately from its length.
         """
         if self.direction_sigmas is None:
-            raise ValueError(f"a motion by {self.relative_pose.source} has no direction apart from its length")
+            raise ValueError(f"a motion by {self.relative_pose.source} has no separate noise of its direction")
         return StepNoise(self.relative_pose.sigmas[:3], self.direction_sigmas)
 
     def with_rotation(self, R_current_previous: FloatArray) -> Motion:
@@ -55,13 +55,13 @@ class Motion:
     def with_length(
         self, length: float, relative_sigma: float, relative_correlated_sigma: float, noise: StepNoise
     ) -> RelativePose:
-        """The same rotation and direction with another length, and noise beside the corners' own.
+        """The same rotation and direction with another length, and noise besides that of the corners.
 
         Args:
-            length: in the unit wanted.
+            length: in any unit, that of the result.
             relative_sigma: of the length.
             relative_correlated_sigma: of independent errors that add up along the steps as those of the lengths do.
-            noise: of rotation and direction, added in squares to the corners' own.
+            noise: of rotation and direction, added in squares to that of the corners.
         """
         own = self.own_noise
         T_previous_current = self.relative_pose.T_from_to.copy()

@@ -1,4 +1,4 @@
-"""What the accepted motions of a drive so far say of the next one: the prior of two-view estimation."""
+"""History of the accepted motions of a drive, and the motion prior of two-view estimation from it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class MotionHistory:
         Args:
             measured: by corners alone, with its ``covariance`` ``(6, 6)``.
             covariance: rotation then direction, radians.
-            fused: the same joined with the heading prior.
+            fused: the same after fusion with the heading prior.
             depth_relative_error: of learned depth on this step; NaN where unknown.
         """
         return replace(
@@ -60,7 +60,7 @@ class MotionHistory:
         )
 
     def prior(self, depth_relative_error: float, least_axis_sigma: float) -> MotionPrior:
-        """The prior of the next motion; without a direction while too few steps are known."""
+        """The prior of the next motion; without a direction after too few steps."""
         if len(self.directions) < _LEAST_STEPS:
             return MotionPrior(depth_relative_error, np.zeros(3), np.inf)
         directions = np.array(self.directions)

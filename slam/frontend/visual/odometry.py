@@ -42,13 +42,13 @@ _MIN_RATIOS = 8
 _PNP_ITERATIONS = 200
 _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
-# least rotation sigma of a camera that stands still, or whose motion points alone determine
+# least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 
 
 @dataclass(frozen=True)
 class OdometryState:
-    """What visual odometry goes on from; ``last`` is the motion that led to the last frame, where one was measured."""
+    """State of visual odometry; ``last`` is the motion to the last frame, where one was measured."""
 
     tracker: TrackerState
     dynamic_mask: DynamicMask
@@ -68,7 +68,7 @@ class VisualOdometry:
         seed: int = 0,
         state: OdometryState | None = None,
     ) -> None:
-        """Prepare for the first frames, or go on from a ``state``; other seeds draw other RANSAC samples."""
+        """Prepare for the first frames, or resume from a ``state``; ``seed`` is that of RANSAC."""
         self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
@@ -81,7 +81,7 @@ class VisualOdometry:
         )
 
     def state(self) -> OdometryState:
-        """What the odometry goes on from."""
+        """The state to resume from."""
         return replace(self._state, tracker=self._tracker.state())
 
     def measure(
@@ -91,7 +91,7 @@ class VisualOdometry:
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
     ) -> Motion | MeasurementFailure:
-        """Measure the motion between two frames; of several that lead to a frame, the first is learned from.
+        """Measure the motion between two frames; of several to one frame, only the first updates the state.
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
@@ -122,16 +122,16 @@ class VisualOdometry:
     def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
     ) -> Callable[[], RelativeRotation | None]:
-        """How to measure the rotation between frames some steps apart, both measured already.
+        """Prepare to measure the rotation between two frames some steps apart.
 
         Args:
             first: the earlier frame.
             last: the later frame.
             depth_first_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
-            T_first_last: the motion as its steps were measured, unscaled.
+            T_first_last: the chained motion of the steps, unscaled.
 
         Returns:
-            A function that measures it by what is known now, for any thread; None where it has too few corners.
+            A function that measures it from the present state, in any thread; its result is None with too few corners.
         """
         known = _unit_pose_and_length(T_first_last)
         if known is None:
@@ -154,7 +154,7 @@ class VisualOdometry:
         return measure
 
     def _predicted_flow(self, previous: Frame, current: Frame, depth_previous: DepthMap) -> PredictedFlow | None:
-        """By the constant-velocity model, where the last motion ended at the earlier frame and took as many frames."""
+        """By the constant-velocity model, if the last motion ended at the earlier frame and spans as many frames."""
         last = self._state.last
         if not self._config.predicted_flow or last is None or last.ends[1] != previous.index:
             return None
@@ -188,9 +188,9 @@ class VisualOdometry:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, learned, self._state.dynamic_mask)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
-        # the essential matrix of a pure rotation invents a translation: use one only where parallax needs it
-        turned = rotation_between(rays_previous, rays_current)
-        unexplained = parallax_px(rays_previous, rays_current, turned, self._intrinsics)
+        # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
+        R_current_previous = rotation_between(rays_previous, rays_current)
+        unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
         if np.median(unexplained) < self._config.min_parallax_px:
             return None
         estimated = self._two_views.estimate(matches, self._state.history)
@@ -206,7 +206,7 @@ class VisualOdometry:
     def _triangulated(
         self, ends: Ends, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
     ) -> Motion | None:
-        """The motion with its length by learned depth, None where too few points measure that."""
+        """The motion with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
         parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
@@ -247,7 +247,7 @@ class VisualOdometry:
             return MeasurementFailure(f"little parallax, and only {count} corners agree with the learned depth")
         resection = refine(points_previous, pixels, K, found)
         length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
-        # corners err together, and so does learned depth
+        # errors of corners are correlated, and so are those of learned depth
         floors = np.repeat([_LEAST_ROTATION_SIGMA, _LEARNED_RELATIVE_SIGMA * length], 3)
         sigmas = np.hypot(CORNER_CORRELATION * resection.sigmas, floors)
         return Motion(RelativePose(*ends, invert(resection.T_camera_points), sigmas, PNP_SOURCE))
@@ -275,11 +275,11 @@ def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
 def _length(ratios: FloatArray, triangulation_relative_sigma: FloatArray) -> tuple[float, float]:
     """Weighted median of learned over triangulated depth, and its relative sigma.
 
-    A point weighs by the relative variance of both depths; the median withstands moving cars.
+    A point weighs by the relative variance of both depths; the median is robust to moving cars.
     """
     logarithms = np.log(ratios)
     weights = 1.0 / (_LEARNED_RELATIVE_SIGMA**2 + triangulation_relative_sigma**2)
     centre = weighted_median(logarithms, weights)
     deviation = mad_sigma(logarithms - centre)
-    # learned depth errs in patches, not pixels: count one independent measurement in ten
+    # errors of learned depth are correlated in patches: one in ten counts as independent
     return float(np.exp(centre)), CORNER_CORRELATION * deviation / float(np.sqrt(max(len(ratios) / 10.0, 1.0)))

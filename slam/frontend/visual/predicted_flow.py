@@ -1,8 +1,8 @@
-"""Optical flow predicted by learned depth and the constant-velocity model, to track corners through it.
+"""Optical flow predicted by learned depth and the constant-velocity model, a start for tracking corners.
 
 From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
 Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
-single corners err by half a pixel, and those on the road all upwards, which looks like a camera that pitches
+single corners have errors of half a pixel, and those on the road all upwards, which resembles a pitching camera
 (``docs/design/visual-front-end.md``). Warping the later image back by the predicted flow removes the stretch.
 """
 
@@ -26,9 +26,9 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class PredictedFlow:
-    """Where the pixels of an image go under a motion (``unit_pose``, ``length``) of a static scene.
+    """Flow of the pixels of an image under a motion (``unit_pose``, ``length``) in a static scene.
 
-    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; where there is no depth, the scene is taken to be far.
+    ``length`` and ``depth_previous`` ``(H, W)`` are in one unit; pixels without depth are taken as infinitely far.
     """
 
     unit_pose: UnitRelativePose
@@ -43,7 +43,7 @@ class PredictedFlow:
         return self.unit_pose.R_current_previous, moved, self.depth_previous, repr(self.intrinsics)
 
     def warp_back(self, current: Grey) -> Grey:
-        """The later image ``(H, W)`` warped back: where the flow is predicted right, pixels stand where they stood."""
+        """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""
         return np.asarray(cv2.remap(current, self._current, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
     def in_current(self, pixels: Pixels) -> Pixels:

@@ -1,4 +1,4 @@
-"""How far corners lie from where a motion puts them, across and along their epipolar lines, and by what slopes."""
+"""Residuals of corners under a motion, across and along their epipolar lines, with their derivatives."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ _HATS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0
 
 
 class Residuals:
-    """Of ``M`` corners in two images, in pixels.
+    """Residuals of ``M`` corners in two images, in pixels.
 
-    Slopes ``(5, M)`` are by rotation, in the current camera, and by the direction along both axes of its ``tangent``
-    ``(3, 2)``; a sixth is by the length. Whole coordinates lie together: arithmetic on them is several times faster.
+    Derivatives ``(5, M)`` are by rotation, in the current camera, and by the direction along both axes of its
+    ``tangent`` ``(3, 2)``; a sixth is by the length. Arrays are coordinate-major, which is several times faster.
     """
 
     def __init__(
         self, rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, focal_px: float
     ) -> None:
-        """Of rays ``(M, 3)`` with z = 1, and learned depths ``(M,)`` in the earlier camera or NaN."""
+        """From rays ``(M, 3)`` with z = 1, and learned depths ``(M,)`` in the earlier camera or NaN."""
         self._previous = np.ascontiguousarray(rays_previous.T)
         self._current = np.ascontiguousarray(rays_current.T)
-        # all that is bilinear in them is a matrix times one of these
+        # every bilinear form of the rays is a matrix times one of these
         self._both = _products(self._current, self._previous)
         self._previous_twice = _products(self._previous, self._previous)
         self._current_twice = _products(self._current, self._current)
@@ -34,14 +34,14 @@ class Residuals:
         self._focal_px = focal_px
 
     def across(self, unit_pose: UnitRelativePose, tangent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sampson distances ``(M,)`` and their slopes ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
+        """Sampson distances ``(M,)`` and their derivatives ``(5, M)`` (Hartley and Zisserman 2004, Eq. 11.9).
 
         The gradient's norm changes with the motion too. Held fixed, as reweighted least squares do, it biases the
         motion by the square of the corners' noise.
         """
         essential = _essential(unit_pose, tangent)
         algebraic = essential.reshape(6, 9) @ self._both
-        # squared lengths of E x and E^T x' but for their last coefficients, and half the slopes of these
+        # squared lengths of E x and E^T x' without their last coefficients, and half their derivatives
         lines_current = essential[:, :2].swapaxes(1, 2) @ essential[0, :2]
         lines_previous = essential[:, :, :2] @ essential[0, :, :2].T
         squares = lines_current.reshape(6, 9) @ self._previous_twice
@@ -54,33 +54,33 @@ class Residuals:
     def along(
         self, unit_pose: UnitRelativePose, length: float, tangent: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How far corners lie along their lines from where learned depth puts them ``(M,)``.
+        """Distances ``(M,)`` along the epipolar lines from the points predicted by learned depth.
 
-        Also the slopes ``(6, M)``, and the shift along the line that learned depth expects ``(M,)``.
+        Also their derivatives ``(6, M)``, and the shift along the line predicted by learned depth ``(M,)``.
         """
-        turned = unit_pose.R_current_previous @ self._previous
-        points = turned + (length * unit_pose.direction)[:, None] * self._inverse_depth  # over depth
+        rotated = unit_pose.R_current_previous @ self._previous
+        points = rotated + (length * unit_pose.direction)[:, None] * self._inverse_depth  # over depth
         ahead = np.maximum(points[2], 1e-6)
         expected = points[:2] / ahead
-        line = expected - turned[:2] / np.maximum(turned[2], 1e-6)
+        line = expected - rotated[:2] / np.maximum(rotated[2], 1e-6)
         shift = np.sqrt((line**2).sum(axis=0))
         line /= np.maximum(shift, 1e-9)
         distance = ((expected - self._current[:2]) * line).sum(axis=0)
         by_point = np.concatenate([line, -(line * expected).sum(axis=0)[None]]) / ahead
         slopes = np.empty((6, len(distance)))
-        slopes[:3] = cross(turned, by_point)
+        slopes[:3] = cross(rotated, by_point)
         slopes[3:5] = tangent.T @ by_point * (length * self._inverse_depth)
         slopes[5] = unit_pose.direction @ by_point * self._inverse_depth
         return distance * self._focal_px, slopes * self._focal_px, shift * self._focal_px
 
 
 def _products(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``(9, M)`` of ``(3, M)`` each: every coordinate of one times every one of the other."""
+    """Outer products ``(9, M)`` of vectors ``(3, M)``."""
     return (a[:, None] * b).reshape(9, -1)
 
 
 def tangent_of(direction: FloatArray) -> FloatArray:
-    """Two axes ``(3, 2)`` of unit length across a ``direction`` ``(3,)`` and each other (Duff et al. 2017)."""
+    """Two unit axes ``(3, 2)`` orthogonal to a ``direction`` ``(3,)`` and each other (Duff et al. 2017)."""
     x, y, z = direction.tolist()
     sign = math.copysign(1.0, z)
     a = -1.0 / (sign + z)
@@ -89,7 +89,7 @@ def tangent_of(direction: FloatArray) -> FloatArray:
 
 
 def _essential(unit_pose: UnitRelativePose, tangent: FloatArray) -> FloatArray:
-    """``E = hat(t) R`` and its five slopes, ``(6, 3, 3)``."""
+    """``E = hat(t) R`` and its five derivatives, ``(6, 3, 3)``."""
     essential = np.empty((6, 3, 3))
     essential[0] = across = (unit_pose.direction @ _HATS).reshape(3, 3)
     essential[1:4] = across @ _HATS.reshape(3, 3, 3)

@@ -1,8 +1,8 @@
-"""Noise of the steps of a drive beside the corners' own covariance, estimated from the drive itself without truth.
+"""Noise of the steps of a drive besides the covariance of corners, estimated from the drive without ground truth.
 
-The covariance of corners holds for an ideal pinhole. On the road there is more: time stamps, the mount, lens errors. It
-grows with the camera's rotation jitter, with its rotation, and with how far a step lies from its neighbours. So the
-sigmas of each step are inflated by ratios of what of these the corners' own noise does not explain. The ratios in
+The covariance of corners holds for an ideal pinhole. Time stamps, the mount and the lens add errors, which grow with
+the camera's rotation jitter, its rotation, and the residual of a step to its neighbours. So the sigmas of each step
+are inflated by ratios of the part of these that the noise of corners does not explain. The ratios in
 ``GeometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
 """
 
@@ -21,7 +21,7 @@ from slam.se3 import FloatArray, invert
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
 _THIRD_DIFFERENCE = np.sqrt(20.0)
-# white noise makes a step differ from the prediction by its neighbours by so many of its sigmas
+# residual to the prediction by neighbours under white noise, sigmas
 _NEIGHBOUR_RESIDUAL_OF_NOISE = 1.5
 
 
@@ -39,11 +39,11 @@ class StepNoise:
 def inflate_step_sigmas(
     T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: GeometryConfig
 ) -> dict[int, StepNoise]:
-    """The noise of each step of a drive beside the corners' own.
+    """The noise of each step of a drive besides that of the corners.
 
     Args:
-        T_previous_current: steps by their place in the drive, neighbours one apart; lengths are not used.
-        own: the sigmas by the corners' own covariance.
+        T_previous_current: steps by their order in the drive, neighbours one apart; lengths are not used.
+        own: the sigmas by the covariance of corners.
         config: the ratios.
     """
     if not T_previous_current:
@@ -72,7 +72,7 @@ def inflate_step_sigmas(
 def rotation_jitter(rotations: Mapping[int, FloatArray]) -> FloatArray:
     """Sigmas ``(3,)``, radians, of the part of the steps' rotation vectors that no smooth motion explains.
 
-    Third differences remove any rotation that changes evenly; their median withstands single jumps. Zero with few
+    Third differences remove any rotation that changes evenly; their median is robust to single jumps. Zero with few
     steps.
     """
     steps = sorted(k for k in rotations if all(k + n in rotations for n in range(1, 4)))
@@ -83,10 +83,10 @@ def rotation_jitter(rotations: Mapping[int, FloatArray]) -> FloatArray:
 
 
 def neighbour_residual(values: Mapping[int, FloatArray], step: int) -> FloatArray:
-    """How far a step's value ``(3,)`` lies from the prediction by its neighbours, 0 where there are none.
+    """Absolute residual ``(3,)`` of a step's value to the prediction by its neighbours, 0 without neighbours.
 
-    Predicted by the two steps before, by the two after, and by one on each side; the median of these withstands one
-    bad neighbour.
+    Predicted by the two steps before, by the two after, and by one on each side; the median of these is robust
+    to one bad neighbour.
     """
     lines = [((-1, 0.5), (1, 0.5)), ((-1, 2.0), (-2, -1.0)), ((1, 2.0), (2, -1.0))]
     predicted = [

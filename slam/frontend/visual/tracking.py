@@ -1,7 +1,7 @@
 """Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade, forward-backward check.
 
-Where learned depth and the motion so far predict the flow, corners are tracked twice: in the image as it is, and in the
-image warped back by the predicted flow. The result whose windows correlate better is taken.
+With a flow predicted from learned depth and the last motion, corners are tracked twice: in the image as it is, and in
+the image warped back by the predicted flow. The result with the smaller difference of windows is taken.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from slam.frontend.visual.predicted_flow import Pixels, PredictedFlow
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
-# predicted flow leaves small displacements to find
+# displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
@@ -56,7 +56,7 @@ class TrackerState:
 
 
 class CornerTracker:
-    """Tracks corners through one sequence: those that arrive in a frame stay, new ones fill the gaps."""
+    """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
     def __init__(
         self,
@@ -70,24 +70,24 @@ class CornerTracker:
         self._frames_kept = max(*config.steps, config.rotation_baseline_steps) + 2
 
     def state(self) -> TrackerState:
-        """What the tracker goes on from."""
+        """The state to resume from."""
         return self._state
 
     def track(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow | None = None) -> Tracks:
-        """Corners of ``previous`` found again in ``current``, with the flow predicted between them, if any."""
+        """Corners of ``previous`` tracked to ``current``, with the flow predicted between them, if any."""
         corners = self._state.corners.get(previous.index)
         if corners is None:
             corners = self._filled(previous, _no_corners())
-        forward, kept = self._found_again(previous, current, corners.pixels, predicted_flow)
+        forward, kept = self._tracked(previous, current, corners.pixels, predicted_flow)
         track_ids = corners.track_ids[kept]
         if current.index not in self._state.corners:
             self._filled(current, Corners(forward[kept], track_ids))
         return Tracks(corners.pixels[kept].astype(np.float64), forward[kept].astype(np.float64), track_ids)
 
     def track_across(self, previous: Frame, current: Frame, predicted_flow: PredictedFlow) -> Callable[[], Tracks]:
-        """How to find corners of ``previous`` that were tracked on in a later frame some steps away.
+        """Prepare to track corners of ``previous`` to a frame some steps later.
 
-        The function returned finds them; any thread may call it.
+        The function returned does it, in any thread.
         """
         corners = self._state.corners.get(previous.index)
         following = min((index for index in self._state.corners if index > previous.index), default=None)
@@ -97,8 +97,8 @@ class CornerTracker:
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
         def flow() -> Answer:
-            way = _warped(current.grey, self._config.window_px, predicted_flow)
-            found = self._best_flow(previous.grey, current.grey, points, [way])
+            target = _warped(current.grey, self._config.window_px, predicted_flow)
+            found = self._best_flow(previous.grey, current.grey, points, [target])
             return found.pixels, found.kept
 
         def find() -> Tracks:
@@ -109,18 +109,18 @@ class CornerTracker:
 
         return find
 
-    def _found_again(
+    def _tracked(
         self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
-        """Where points ``(M, 2)`` went and which are reliable; searched in wider windows where these are few."""
+        """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
         config = self._config
 
         def flow() -> Answer:
             found = self._flow(first.grey, second.grey, points, config.window_px, predicted_flow)
             if found.kept.sum() < config.few_corners:
-                exposed = _exposed_like(second.grey, first.grey)
+                exposed = _histogram_matched(second.grey, first.grey)
                 wider = self._flow(first.grey, exposed, points, config.wide_window_px, predicted_flow)
-                found = max(found, wider, key=lambda way: way.kept.sum())
+                found = max(found, wider, key=lambda tracked: tracked.kept.sum())
             return found.pixels, found.kept
 
         windows = config.window_px, config.wide_window_px, config.few_corners
@@ -131,7 +131,7 @@ class CornerTracker:
         return pixels, kept
 
     def _filled(self, frame: Frame, arrived: Corners) -> Corners:
-        """Remember for a frame the corners that arrived, and new ones where there is room."""
+        """Keep the corners tracked to a frame, and new ones up to the largest number."""
         config, next_id = self._config, self._state.next_track_id
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
@@ -150,7 +150,7 @@ class CornerTracker:
         return corners
 
     def _detected(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
-        """At most ``room`` corners ``(M, 2)`` away from those known."""
+        """At most ``room`` corners ``(M, 2)`` away from those tracked."""
         config = self._config
         free = _away_from(pixels, int(config.corner_spacing_px), grey.shape)
         corners = cv2.goodFeaturesToTrack(
@@ -160,36 +160,36 @@ class CornerTracker:
 
     def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
-    ) -> _Found:
-        """Where points ``(M, 2)`` went, directly or through the predicted flow, and which are reliable."""
-        ways = [_Way(second, side, self._config.pyramid_levels)]
+    ) -> _Tracked:
+        """Points ``(M, 2)`` tracked directly or through the predicted flow, and which are reliable."""
+        targets = [_Target(second, side, self._config.pyramid_levels)]
         if predicted_flow is not None:
-            ways.append(_warped(second, side, predicted_flow))
-        return self._best_flow(first, second, points, ways)
+            targets.append(_warped(second, side, predicted_flow))
+        return self._best_flow(first, second, points, targets)
 
-    def _best_flow(self, first: Grey, second: Grey, points: Pixels, ways: Sequence[_Way]) -> _Found:
-        """Points ``(M, 2)`` by the way whose windows differ least, of those that pass the forward-backward check."""
+    def _best_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _Tracked:
+        """Points ``(M, 2)`` by the target with the least window difference that passes the forward-backward check."""
         pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
         if len(points) == 0:
-            return _Found(pixels, kept)
-        arrived = [_lucas_kanade(first, way.image, points, way) for way in ways]
+            return _Tracked(pixels, kept)
+        arrived = [_lucas_kanade(first, target.image, points, target) for target in targets]
         difference = np.stack([np.where(found, difference, np.inf) for _, found, difference in arrived])
         for choice in np.argsort(difference, axis=0, kind="stable"):
-            for n, (way, (forward, found, _)) in enumerate(zip(ways, arrived, strict=True)):
+            for n, (target, (forward, found, _)) in enumerate(zip(targets, arrived, strict=True)):
                 tried = np.flatnonzero(~kept & (choice == n) & found)
                 if len(tried) == 0:
                     continue
-                backward, found_back, _ = _lucas_kanade(way.image, first, forward[tried], way)
+                backward, found_back, _ = _lucas_kanade(target.image, first, forward[tried], target)
                 error = np.abs(backward - points[tried]).max(axis=1)
                 returned = tried[found_back & (error < self._config.forward_backward_px)]
-                pixels[returned], kept[returned] = way.in_current(forward[returned]), True
+                pixels[returned], kept[returned] = target.in_current(forward[returned]), True
         height, width = second.shape
         inside = (pixels >= 0).all(axis=1) & (pixels <= [width - 1, height - 1]).all(axis=1)
-        return _Found(pixels, kept & inside)
+        return _Tracked(pixels, kept & inside)
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Target:
     """An image in which points are searched with windows of ``side`` over ``levels`` of its pyramid.
 
     ``in_current`` takes pixels of that image to the later one.
@@ -201,37 +201,37 @@ class _Way:
     in_current: Callable[[Pixels], Pixels] = lambda pixels: pixels
 
 
-def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Way:
-    """Through the later image warped back by the predicted flow."""
-    return _Way(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
+def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
+    """The later image warped back by the predicted flow."""
+    return _Target(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
 def _lucas_kanade(
-    start: Grey, end: Grey, pixels: Pixels, way: _Way
+    start: Grey, end: Grey, pixels: Pixels, target: _Target
 ) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
-    """Where pixels ``(M, 2)`` went, which of them were found, and how far their windows differ ``(M,)``."""
+    """Tracked pixels ``(M, 2)``, which of them were found, and the difference of their windows ``(M,)``."""
     moved, status, difference = cv2.calcOpticalFlowPyrLK(
         start,
         end,
         pixels.reshape(-1, 1, 2),
         None,
-        winSize=(way.side, way.side),
-        maxLevel=way.levels,
+        winSize=(target.side, target.side),
+        maxLevel=target.levels,
         criteria=_CRITERIA,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool), difference.ravel()
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Where points went ``(M, 2)``, and which of them are reliable ``(M,)``."""
+class _Tracked:
+    """Tracked points ``(M, 2)``, and which of them are reliable ``(M,)``."""
 
     pixels: Pixels
     kept: NDArray[np.bool_]
 
 
 def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it, all of them drawn at once."""
+    """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it."""
     height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
     disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
     rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
@@ -241,8 +241,8 @@ def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[n
     return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
 
 
-def _exposed_like(grey: Grey, other: Grey) -> Grey:
-    """An image ``(H, W)`` with the grey levels of another: each level takes that of the same rank."""
+def _histogram_matched(grey: Grey, other: Grey) -> Grey:
+    """An image ``(H, W)`` with its histogram matched to that of another."""
     ranks, ranks_other = (np.cumsum(np.bincount(image.ravel(), minlength=256)) / image.size for image in (grey, other))
     levels = np.interp(ranks, ranks_other, np.arange(256.0))
     return np.asarray(cv2.LUT(grey, np.rint(levels).astype(np.uint8)))

@@ -1,9 +1,9 @@
-"""The motion between two views that corners, learned depth and the drive so far agree on.
+"""The motion between two views from corners, learned depth and the motion prior of the drive.
 
-Corners alone can mislead: where most of them lie on a car that turns with the camera, its corners and distant ones lie
-on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further measurements tell
-the motions apart. A motion predicts how far each corner shifts along its epipolar line, and so does learned depth; and
-a vehicle moves in the direction in which it has moved.
+Corners alone are ambiguous: where most of them lie on a car that turns with the camera, its corners and distant ones
+lie on the epipolar lines of a motion that neither made (``docs/design/visual-front-end.md``). Two further
+measurements resolve this: the shift of each corner along its epipolar line, which learned depth predicts too; and the
+usual direction of motion.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 _ITERATIONS = 10
-# reweighting alone closes half of the distance in an iteration: a step goes further by this
+# over-relaxation: reweighting alone converges by half of the distance an iteration
 _OVERSTEP = 1.4
 _CONVERGED = 1e-5
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0
-# along its line a corner is an inlier within this many sigmas
+# inlier bound along the epipolar line, sigmas
 _ALONG_SIGMAS = 2.5
 # an outlier costs as much as this half-squared residual
 _OUTLIER_COST = 3.0
-# learned depth errs in patches: its sigma is widened by this where it need not choose between motions
+# errors of learned depth are correlated in patches: its sigma is widened by this near a known motion
 _PATCH_WIDENING = 3.0
-# neighbouring corners err together: beside other evidence, sigmas of independent ones are widened by this
+# errors of neighbouring corners are correlated: sigmas of independent ones are widened by this
 CORNER_CORRELATION = 2.0
 
 
@@ -49,7 +49,7 @@ CORNER_CORRELATION = 2.0
 class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
-    ``weights`` ``(M,)`` in (0, 1] are lower where objects move by themselves.
+    ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects.
     """
 
     rays_previous: FloatArray
@@ -72,7 +72,7 @@ class TwoViewEstimate:
 
 
 class TwoViewEstimator:
-    """Estimates the motions of one drive; what it has learned so far is given to it."""
+    """Estimates the motions of one drive; stateless, the history is an argument."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class TwoViewEstimator:
         self._seed = seed
 
     def estimate(self, matches: Matches, history: MotionHistory) -> tuple[TwoViewEstimate, MotionHistory] | None:
-        """Rotation and direction of the next motion, and the history with it; None where corners agree on none."""
+        """Rotation and direction of the next motion, and the history with it; None without a consensus."""
         reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         proposed = self._by_essential(first, second)
@@ -107,10 +107,9 @@ class TwoViewEstimator:
         return estimate, history.with_step(best.unit_pose, widened, fused, error)
 
     def refined(self, matches: Matches, start: UnitRelativePose, depth_relative_error: float) -> TwoViewEstimate | None:
-        """The motion that corners agree on near one that is well known.
+        """The motion refined from a well-known ``start``.
 
-        Learned depth is needed to choose between motions. Near a known motion there is nothing to choose, so its weight
-        is small.
+        Learned depth has a small weight: it is needed only to choose between motions.
         """
         sigma = float(np.deg2rad(self._config.direction_prior_sigma_deg))
         return self._refined(
@@ -142,7 +141,7 @@ class TwoViewEstimator:
         return UnitRelativePose(*known) if known else None
 
     def _prior(self, matches: Matches, proposed: UnitRelativePose | None, history: MotionHistory) -> MotionPrior:
-        """Until the drive has shown how learned depth errs, the proposed motion does."""
+        """The prior from the history; without one, the error of learned depth is that under the proposed motion."""
         errors = history.depth_relative_errors
         if not errors and proposed is not None:
             errors = (self._depth_relative_error(matches, proposed),)
@@ -157,11 +156,11 @@ class TwoViewEstimator:
         return mad_sigma(ratios - np.median(ratios))
 
     def _ratios(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> FloatArray:
-        """Logarithms of learned over triangulated depth, of corners near their lines that shift along them."""
+        """Logarithms of learned over triangulated depth, of corners near their epipolar lines with parallax."""
         distance, _ = residuals.across(unit_pose, tangent_of(unit_pose.direction))
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
-        turned = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
-        shift_px = np.hypot(*(matches.rays_current.T[:2] - turned)) * self._focal_px
+        rotated = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
+        shift_px = np.hypot(*(matches.rays_current.T[:2] - rotated)) * self._focal_px
         usable = (np.abs(distance) < self._config.inlier_px) & (depth > 0) & (shift_px > 1.0)
         usable &= np.isfinite(matches.depth_previous)
         return np.asarray(np.log(matches.depth_previous[usable] / depth[usable]))
@@ -221,9 +220,9 @@ class TwoViewEstimator:
             normal[:5, :5] += (weights * by_motion) @ by_motion.T
             gradient = by_all @ (weights_along * along)
             gradient[:5] += by_motion @ (weights * across)
-            astray = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
+            deviation = unit_pose.direction - np.copysign(1.0, prior.axis @ unit_pose.direction) * prior.axis
             normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
-            gradient[3:5] += tangent.T @ astray / prior.axis_sigma**2
+            gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
             step = -_OVERSTEP * np.linalg.solve(normal, gradient)
             if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
                 break
@@ -237,17 +236,17 @@ class TwoViewEstimator:
 
 
 def _support(candidate: TwoViewEstimate, prior: MotionPrior) -> float:
-    """Inliers, less what a motion off the usual axis costs; forwards and backwards are alike."""
+    """Number of inliers, less the cost of a deviation from the usual axis, forwards or backwards."""
     cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
-    astray = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
-    return float(candidate.inliers.sum()) - 0.5 * astray**2 / _OUTLIER_COST
+    deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
+    return float(candidate.inliers.sum()) - 0.5 * deviation**2 / _OUTLIER_COST
 
 
 def _image(points: FloatArray) -> FloatArray:
-    """Where points ``(3, M)`` fall in the plane z = 1, ``(2, M)``."""
+    """Points ``(3, M)`` projected to the plane z = 1, ``(2, M)``."""
     return np.asarray(points[:2] / _ahead(points))
 
 
 def _ahead(points: FloatArray) -> FloatArray:
-    """z of points ``(3, M)``, kept off zero."""
+    """z of points ``(3, M)``, kept positive."""
     return np.asarray(np.maximum(points[2], 1e-6))

@@ -1,1 +1,1 @@
-"""KITTI's own layouts: odometry roots, raw drives, calibration and GPS/INS."""
+"""KITTI's layouts: odometry roots, raw drives, calibration and GPS/INS."""

@@ -1,4 +1,4 @@
-"""Poses of one sensor of KITTI's car from those of another; the files stand in `erfsfm.readers.kitti_calibration`."""
+"""Poses of one sensor of KITTI's car from those of another; files are read by `erfsfm.readers.kitti_calibration`."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from slam.trajectory import read_trajectory
 def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None) -> RecordedSequence:
     """Open one sequence of an odometry root.
 
-    ``camera``, where given, takes the place of the root's calibration and of its camera height.
+    ``camera``, where given, replaces the root's calibration and camera height.
 
     Raises:
         SequenceError, DataError: if images, ``calib.txt``, ``times.txt`` or the poses are missing or do not match.

@@ -23,7 +23,7 @@ def T_world_imu(packets: FloatArray, ages_s: FloatArray) -> FloatArray:
     Args:
         packets: rows of OXTS, ``(N, 30)``.
         ages_s: how long before its image each packet was taken, seconds, ``(N,)``, negative for one taken
-            after it; the pose is carried to the image with the packet's own velocity and angular rate.
+            after it; the pose is extrapolated to the image with the packet's velocity and angular rate.
             Packets and images differ by up to 14 ms, which at 40 km/h is 15 cm.
     """
     latitude, longitude, altitude = np.deg2rad(packets[:, 0]), np.deg2rad(packets[:, 1]), packets[:, 2]

@@ -41,7 +41,7 @@ _EPOCH = np.datetime64("2011-01-01", "ns")
 def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
     """Open one synced and rectified drive.
 
-    The calibration is scaled to the images' true size. ``camera``, where given, takes its place.
+    The calibration is scaled to the images' true size. ``camera``, where given, replaces it.
 
     Raises:
         SequenceError, DataError: if images, calibration or stamps are missing or do not match.
@@ -101,7 +101,7 @@ def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> Float
     """LiDAR to the rectified camera; None where ``calib_velo_to_cam.txt`` is missing."""
     path = drive.parent / VELO_TO_CAM
     if not path.is_file():
-        logger.warning("no %s: neither LiDAR nor GPS/INS can be related to the camera", path)
+        logger.warning("no %s: neither LiDAR nor GPS/INS has extrinsics to the camera", path)
         return None
     T_rect0_cam0 = se3.make(cameras.matrix("R_rect_00", (3, 3)), np.zeros(3))
     T_cam0_lidar = CalibrationFile(path).transform("R", "T")
@@ -146,6 +146,6 @@ def _reference(
 
 
 def _camera_height(drive: Path, camera: CameraFile | None) -> float | None:
-    """1.65 m unless a camera file, given or in the drive, its date or the root, says otherwise."""
+    """By a camera file, given or in the drive, its date or the root; 1.65 m by default."""
     camera = camera or beside(drive, drive.parent, drive.parent.parent)
     return CAMERA_HEIGHT_M if camera is None else camera.height_or(CAMERA_HEIGHT_M)

@@ -39,8 +39,7 @@ class Material(IntEnum):
 class Mesh:
     """A finished mesh in the street frame (x east, y north, z up, metres).
 
-    Triangles and instances are the last axis of the tables that pixels look up: gathering is several times
-    faster so.
+    Triangles and instances are the last axis of the lookup tables, for which gathering is several times faster.
 
     Attributes:
         vertices: ``(V, 3)``.

@@ -60,9 +60,9 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
     turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
     if np.array_equal(here, T_street_camera[high]):
         return np.repeat(here[None], BLUR_SAMPLES, axis=0)
-    share = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
-    share *= SHUTTER / (high - low)
-    T_here_shutter = se3.from_rotation_vector(share[:, None] * turn, share[:, None] * T_low_high[:3, 3])
+    fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
+    fraction *= SHUTTER / (high - low)
+    T_here_shutter = se3.from_rotation_vector(fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3])
     return np.asarray(here @ T_here_shutter)
 
 

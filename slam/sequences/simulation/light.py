@@ -60,9 +60,9 @@ def sky(weather: Weather, directions: Float32Array) -> Float32Array:
     size = 0.006 / (up + 0.12)
     texels = Texels(plane[0], plane[1], size, size, still, still)
     cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
-    share = np.clip(1.6 * cover, 0.0, 0.85)
+    fraction = np.clip(1.6 * cover, 0.0, 0.85)
     white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
-    return np.asarray(rgb + share * (white - rgb), dtype=np.float32)
+    return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
 
 
 def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:

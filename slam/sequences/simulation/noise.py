@@ -16,7 +16,7 @@ _SIZE = 256  # lattice cells before the noise repeats
 
 @dataclass(frozen=True)
 class Texels:
-    """Where the pixels of one material look into its texture; every field is ``(N,)``, metres.
+    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres.
 
     Attributes:
         u: along the surface.
@@ -72,7 +72,7 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
     """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
 
     Args:
-        texels: where to look.
+        texels: texture coordinates.
         octaves: wavelength along u, wavelength along v (metres), amplitude.
     """
     total = np.zeros_like(texels.u)
@@ -95,7 +95,7 @@ def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Arra
 
 
 def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float) -> Float32Array:
-    """Share of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
+    """Fraction of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
     half = 0.5 * np.maximum(size, 1e-4)
 
     def integral(at: Lengths) -> Lengths:
@@ -106,6 +106,6 @@ def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths |
 
 
 def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float) -> Float32Array:
-    """Share of each pixel covered by the one stripe [low, high]."""
+    """Fraction of each pixel covered by the one stripe [low, high]."""
     inverse = 1.0 / np.maximum(size, 1e-4)
     return np.asarray(np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1))

@@ -21,7 +21,7 @@ from slam.sequences.simulation.streets import (
 RouteKind = Literal["loop", "grid", "straight"]
 
 STEP = 0.25  # between samples of a path in the plan, metres
-OVERLAP = 67.0  # how far a loop drives its own start again, metres
+OVERLAP = 67.0  # length of the start that a loop drives again, metres
 START = 25.0  # of a lone road, so that there is something behind the camera, metres
 CRUISE = 1.1  # metres per frame
 SLOWEST = 0.5  # metres per frame, except around a stop
@@ -57,7 +57,7 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) 
     """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:
-        route: ``loop`` drives its own start again, ``grid`` drives streets again both ways (given about
+        route: ``loop`` drives its start again, ``grid`` repeats streets in both directions (with about
             250 frames), ``straight`` never comes back.
         frames: how many poses.
         seed: decides everything.
@@ -123,7 +123,7 @@ def _lane_offset(plan: StreetPlan, seed: int) -> float:
 
 
 def _loop_lane(plan: StreetPlan, seed: int) -> FloatArray:
-    """Lane around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is met again."""
+    """Lane around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is revisited."""
     first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
     lane = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
     away = np.linalg.norm(lane - lane[0], axis=1)
@@ -217,14 +217,14 @@ def _poses(
     right -= (right * forward).sum(axis=1, keepdims=True) * forward
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
-    shake = _shake(rng, len(at))
-    shake[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
-    position = bend(at) - (camera_height_m + shake[:, 3:]) * down
+    suspension = _suspension(rng, len(at))
+    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
+    position = bend(at) - (camera_height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
-    return T_street_level @ se3.from_rotation_vector(shake[:, :3], np.zeros((len(at), 3)))
+    return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))
 
 
-def _shake(rng: np.random.Generator, frames: int) -> FloatArray:
+def _suspension(rng: np.random.Generator, frames: int) -> FloatArray:
     """Suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, ``(N, 4)``."""
     white = rng.standard_normal((frames + 60, 4))
     slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))

@@ -50,7 +50,7 @@ class SimulatedSequence:
         return None
 
     def provenance(self) -> tuple[str, ...]:
-        """The simulated world by its seed; any two excerpts of it share their streets."""
+        """The simulated world by its seed; all excerpts of it are of the same streets."""
         return labels(self.sources, len(self))
 
     def _render(self, index: int) -> Image:

@@ -36,14 +36,14 @@ from slam.sequences.simulation.painter import Hits, facing_normals, paint
 from slam.sequences.simulation.route import RouteKind, plan_route
 from slam.sequences.simulation.town import build_town
 
-VERSION = 1  # of the world: the same options give the same bytes as long as it stays
+VERSION = 1  # of the world: the same options give the same bytes within a version
 FPS = 10.0
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate; ``seed`` decides everything that the other options leave open."""
+    """What to simulate; ``seed`` determines everything else."""
 
     route: RouteKind = "loop"
     frames: int = 300
@@ -107,7 +107,7 @@ class _Surface:
 
 
 class SimulatedStreet:
-    """A street world and a drive through it; frames are rendered when asked for.
+    """A street world and a drive through it; frames are rendered on demand.
 
     Attributes:
         options: what is simulated.
@@ -259,7 +259,7 @@ def write_kitti_root(
         output: a folder that does not exist yet or is empty.
         depth: whether to write depth maps (16 bit, metres x 256, 0 where nothing was hit).
         lidar: whether to write scans.
-        progress: told the number of frames written so far.
+        progress: called with the number of frames written so far.
 
     Raises:
         SequenceError: if ``output`` holds something already, or cannot be written.

@@ -1,4 +1,4 @@
-"""The street plan: which edges of an irregular grid are streets, and which way the camera drives over them."""
+"""The street plan: which edges of an irregular grid are streets, and the camera's route over them."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -48,14 +48,14 @@ class StreetPlan:
 
 
 def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
-    """Outline of a random simply connected set of cells, with corners both ways.
+    """Outline of a random simply connected set of cells, with left and right corners.
 
     Args:
         rng: decides the shape.
         edges: length of the outline, even and at least 8.
 
     Returns:
-        The nodes of the outline in order, in either sense of turning; the smallest coordinates are zero.
+        The nodes of the outline in order, clockwise or counter-clockwise; the smallest coordinates are zero.
     """
     while True:
         cells = {(0, 0)}
@@ -72,10 +72,10 @@ def loop_cycle(rng: np.random.Generator, edges: int) -> list[Node]:
 
 
 def grid_walk(rng: np.random.Generator, side: int, edges: int, spare: int) -> list[Node]:
-    """A walk on ``side`` x ``side`` nodes without U-turns that drives streets again, also the other way.
+    """A walk on ``side`` x ``side`` nodes without U-turns that repeats streets, also in the opposite direction.
 
     Args:
-        rng: decides the way.
+        rng: decides the route.
         side: nodes along each side.
         edges: within which the streets are driven again.
         spare: further edges, in case the drive comes so far.

@@ -26,15 +26,15 @@ def shade(material: Material, texels: Texels, colours: Float32Array, parameters:
     return _SHADERS[material](texels, colours, parameters)
 
 
-def _mix(a: Lengths, b: Lengths, share: Lengths) -> Float32Array:
+def _mix(a: Lengths, b: Lengths, fraction: Lengths) -> Float32Array:
     """Blend colours ``(3, N)`` by a weight ``(N,)``."""
-    return np.asarray(a + share * (b - a), dtype=np.float32)
+    return np.asarray(a + fraction * (b - a), dtype=np.float32)
 
 
 def _asphalt(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
     rgb = _junction(texels, colours, parameters)
-    half, dash, share = parameters[0, 0], parameters[1, 0], parameters[2, 0]
-    lengthways = stripes(texels.u, texels.u_size, float(2.0 * dash), float(2.0 * dash * share))
+    half, dash, fraction = parameters[0, 0], parameters[1, 0], parameters[2, 0]
+    lengthways = stripes(texels.u, texels.u_size, float(2.0 * dash), float(2.0 * dash * fraction))
     paint = lengthways * band(texels.v, texels.v_size, -0.07, 0.07)
     if parameters[3, 0] > 0.5:
         paint += band(np.abs(texels.v), texels.v_size, half - 2.15, half - 2.03)
@@ -73,8 +73,8 @@ def _mottled(*octaves: tuple[float, float, float]) -> Shader:
     """Two colours blended by noise."""
 
     def shader(texels: Texels, colours: Float32Array, parameters: Float32Array) -> Float32Array:
-        share = np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
-        return _mix(colours[0], colours[1], share)
+        fraction = np.clip(0.45 + fractal(texels, *octaves), -0.3, 1.2)
+        return _mix(colours[0], colours[1], fraction)
 
     return shader
 

@@ -36,8 +36,8 @@ class _Town:
         stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
         turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
         paint = np.array([0.80, 0.80, 0.76])
-        dash, share, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
-        lines = (plan.half_width, float(dash), float(share), float(edged))
+        dash, fraction, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
+        lines = (plan.half_width, float(dash), float(fraction), float(edged))
         soup = self.soup
         self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
         self.junction = soup.instance(Material.JUNCTION, grey, paint)

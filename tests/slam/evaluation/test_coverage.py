@@ -1,4 +1,4 @@
-"""Shares of factors within their own bounds, for noise that is known."""
+"""Ratios of factors within their bounds, for known noise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def truth() -> FloatArray:
 
 
 def factors(student_t_dof: float) -> list[RelativePose]:
-    """One step after the other, with errors by Student's t whose standard deviations are ``SIGMAS``."""
+    """Consecutive steps, with errors by Student's t whose standard deviations are ``SIGMAS``."""
     rng, T = np.random.default_rng(0), truth()
     errors = SIGMAS * rng.normal(size=(COUNT - 1, 6))
     if not math.isinf(student_t_dof):
@@ -37,20 +37,20 @@ def factors(student_t_dof: float) -> list[RelativePose]:
 
 
 @pytest.mark.parametrize("student_t_dof", [math.inf, 12.0, 4.0])
-def test_noise_that_is_as_it_says_is_covered(student_t_dof: float) -> None:
-    shares = coverage(factors(student_t_dof), truth(), 1.0).overall
-    assert shares == {
+def test_noise_with_the_stated_sigmas_is_covered(student_t_dof: float) -> None:
+    ratios = coverage(factors(student_t_dof), truth(), 1.0).overall
+    assert ratios == {
         "50": pytest.approx(0.5, abs=0.03),
         "90": pytest.approx(0.9, abs=0.02),
         "95": pytest.approx(0.95, abs=0.02),
     }
 
 
-def test_heavy_tails_that_are_not_told_are_seen() -> None:
-    shares = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0).overall
-    assert shares["50"] > 0.65 and shares["95"] < 0.94
-    shares = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0).overall
-    assert shares["50"] < 0.3
+def test_unstated_heavy_tails_change_the_coverage() -> None:
+    ratios = coverage([replace(f, student_t_dof=math.inf) for f in factors(4.0)], truth(), 1.0).overall
+    assert ratios["50"] > 0.65 and ratios["95"] < 0.94
+    ratios = coverage([replace(f, student_t_dof=4.0) for f in factors(math.inf)], truth(), 1.0).overall
+    assert ratios["50"] < 0.3
 
 
 def test_bounds_by_hand() -> None:
@@ -62,16 +62,16 @@ def test_bounds_by_hand() -> None:
 
 def test_the_scale_is_known() -> None:
     edges, metric = factors(math.inf), truth()
-    shares = coverage(edges, metric, 1.0)
+    ratios = coverage(edges, metric, 1.0)
     metric[:, :3, 3] *= 4.0
-    assert coverage(edges, metric, 0.25) == shares
+    assert coverage(edges, metric, 0.25) == ratios
     assert coverage(edges, metric, 1.0).overall["95"] < 0.1
     for bad in (([], 1.0), (edges, 0.0)):
         with pytest.raises(SlamError):
             coverage(bad[0], metric, bad[1])
 
 
-def test_the_kind_of_factor_that_is_not_honest_is_told() -> None:
+def test_overconfident_factors_are_found_by_source() -> None:
     honest = factors(math.inf)
     boasting = [replace(f, sigmas=f.sigmas / 10, source=LOOP_SOURCE) for f in honest[:100]]
     kinds = coverage(honest + boasting, truth(), 1.0).by_source
@@ -80,7 +80,7 @@ def test_the_kind_of_factor_that_is_not_honest_is_told() -> None:
     assert kinds["network"] == {"factors": len(honest), **coverage(honest, truth(), 1.0).overall}
 
 
-def test_each_factor_is_judged_by_its_own_law() -> None:
+def test_each_factor_has_the_bound_of_its_own_distribution() -> None:
     normal, heavy = factors(math.inf), [replace(f, source="essential") for f in factors(4.0)]
     covered = coverage(normal + heavy, truth(), 1.0)
     for level, ratio in covered.overall.items():

@@ -16,7 +16,7 @@ def test_accuracy_is_the_median_distance() -> None:
     assert accuracy_median_m(np.empty((0, 3)), lambda p: p[:, 1]) is None
 
 
-def test_completeness_is_the_share_within_30_cm() -> None:
+def test_completeness_is_the_ratio_within_30_cm() -> None:
     surface = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
     found = np.array([[0.0, 0.29, 0.0], [1.0, 0.31, 0.0], [3.0, 0.0, 0.1], [9.0, 9.0, 9.0]])
     assert completeness(surface, found) == pytest.approx(0.5)
@@ -52,12 +52,12 @@ def test_similarity_undoes_one() -> None:
 
 
 def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
-    """Positions on a line cannot tell it; the orientations can."""
+    """Positions on a line do not determine it; orientations do."""
     rng = np.random.default_rng(0)
     truth = np.tile(np.eye(4), (50, 1, 1))
     truth[:, 2, 3] = np.arange(50)
-    shaken = truth @ se3.from_rotation_vector(0.005 * rng.normal(size=(50, 3)), 0.05 * rng.normal(size=(50, 3)))
-    roll = se3.rotation_angle(pose_similarity(truth, shaken).R_a_b)
+    noisy = truth @ se3.from_rotation_vector(0.005 * rng.normal(size=(50, 3)), 0.05 * rng.normal(size=(50, 3)))
+    roll = se3.rotation_angle(pose_similarity(truth, noisy).R_a_b)
     assert roll < np.deg2rad(0.3)
 
 

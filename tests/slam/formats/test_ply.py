@@ -51,7 +51,7 @@ def test_what_is_no_ply_is_one_error(tmp_path: Path, content: bytes) -> None:
         read_ply_points(tmp_path / "c.ply")
 
 
-def test_a_cloud_that_breaks_off_is_one_error(tmp_path: Path) -> None:
+def test_a_truncated_cloud_is_one_error(tmp_path: Path) -> None:
     header = "ply\nformat binary_little_endian 1.0\nelement vertex 5\n"
     header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
     (tmp_path / "c.ply").write_bytes(header.encode() + POINTS.tobytes())
@@ -80,13 +80,13 @@ def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles
         np.testing.assert_array_equal(np.asarray(o3d.io.read_triangle_mesh(str(path)).triangles), triangles)
 
 
-def test_turning_turns_points_and_normals_and_keeps_the_rest() -> None:
+def test_rotation_applies_to_points_and_normals_alone() -> None:
     R = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     ply = coloured_ply(POINTS, NORMALS, COLOURS / 255, TRIANGLES)
-    turned = rotated(ply, R)
-    np.testing.assert_allclose(turned.columns(("x", "y", "z")), POINTS @ R.T)
-    np.testing.assert_allclose(turned.columns(("nx", "ny", "nz")), NORMALS @ R.T)
-    assert turned.triangles is TRIANGLES and (turned.vertices["green"] == ply.vertices["green"]).all()
+    result = rotated(ply, R)
+    np.testing.assert_allclose(result.columns(("x", "y", "z")), POINTS @ R.T)
+    np.testing.assert_allclose(result.columns(("nx", "ny", "nz")), NORMALS @ R.T)
+    assert result.triangles is TRIANGLES and (result.vertices["green"] == ply.vertices["green"]).all()
     np.testing.assert_array_equal(ply.columns(("x", "y", "z")), POINTS)
 
 
@@ -100,7 +100,7 @@ def test_no_shorter_and_no_longer_file_is_whole(tmp_path: Path, triangles: np.nd
         with pytest.raises(RunError, match="no PLY that can be read"):
             read_ply(path)
     path.write_bytes(whole + b"1")
-    with pytest.raises(RunError, match="more in it than its header says"):
+    with pytest.raises(RunError, match="longer than its header states"):
         read_ply(path)
 
 

@@ -1,4 +1,4 @@
-"""Factors in one unit from everything measured, and the odometry that they chain to; steps may skip frames."""
+"""Factors in one unit from all measurements, and the odometry chained from them; steps may skip frames."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def factors(
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]
 
 
-def test_everything_measured_becomes_a_factor_in_the_unit_of_the_scale() -> None:
+def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
     small = drive(1.0 / METRES)
     interpolated = [pose(7, 8, "interpolated", small)]
     lidar = (pose(3, 4, "lidar"),)  # in metres already
@@ -104,26 +104,26 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
 
 
 @pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None)])
-def test_the_network_serves_where_no_path_of_steps_leads(use: str, noise: PoseNoise | None) -> None:
+def test_network_factors_are_used_where_no_path_of_steps_exists(use: str, noise: PoseNoise | None) -> None:
     found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale(), use=use, noise=noise)
     pairs = {tuple(sorted(f.ends)) for f in found if f.source == NETWORK_SOURCE}
     assert {(2, 3), (3, 4), (4, 5), (2, 4), (3, 5), (7, 8), (7, 9), (6, 8)} <= pairs
     assert not pairs & {(0, 1), (1, 2), (0, 2), (5, 6), (6, 7), (5, 7), (8, 9)}
 
 
-def test_noise_measured_beside_the_weights_keeps_every_pair() -> None:
+def test_with_calibrated_noise_every_pair_has_a_factor() -> None:
     found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale())
     assert {(5, 6), (6, 7), (7, 8)} <= {f.ends for f in found if f.source == NETWORK_SOURCE}
 
 
 def network_trajectory() -> FloatArray:
-    """Unscaled, and turned the wrong way, so that its steps can be recognised."""
+    """Unscaled, and with the opposite rotation, so that its steps can be recognised."""
     turns = np.tile([0.0, -0.1, 0.0], (FRAMES - 1, 1))
     return chain(from_rotation_vector(turns, np.tile([0.0, 0.0, 0.5], (FRAMES - 1, 1))))
 
 
 def test_odometry_chains_steps_that_skip_frames() -> None:
-    """Frames 3 and 4 lie inside of a step and hang on the network; frame 5 hangs on frame 2, not on these."""
+    """Frames 3 and 4 lie inside of a step and are chained by the network; frame 5 is chained to frame 2."""
     T = chain_odometry([pose(*ends) for ends in STEPS], network_trajectory(), scale())
     for k in (0, 1, 2, 5, 6, 7):
         np.testing.assert_allclose(T[k], TRUE[k], atol=1e-9)

@@ -106,7 +106,7 @@ def drifting() -> FloatArray:
 
 
 def repeating(frozen: bool) -> tuple[InterpolatedGaps, FloatArray]:
-    """Ten repeated images: the camera drove on, or stood."""
+    """Ten repeated images: the camera moved, or stood."""
     T_steps = np.tile(STEP, (COUNT - 1, 1, 1))
     if not frozen:
         T_steps[14:24] = np.eye(4)

@@ -1,4 +1,4 @@
-"""Images of a street pass whatever their light; blank, noisy, frozen and upside-down ones are detected."""
+"""Images of a street are usable in any light; blank, noisy, frozen and upside-down ones are detected."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
-UNLIKE = "the image is unlike those before it"
+UNCORRELATED = "the image does not correlate with those before it"
 UPSIDE_DOWN = "the image is upside down"
 QUALITIES = range(60, 90, 3)
 
@@ -39,7 +39,7 @@ def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
 
 
 def jpeg(image: Image, quality: int) -> Image:
-    """Encoded and decoded again."""
+    """Re-encoded as JPEG."""
     _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
 
@@ -58,7 +58,7 @@ def wide() -> Image:
 
 
 def panned(positions_px: np.ndarray) -> list[Image]:
-    """What a camera sees that moves along the wide image."""
+    """Images of a camera that moves along the wide image."""
     shifts = [np.float32([[1, 0, -position], [0, 1, 0]]) for position in positions_px]
     return [cv2.warpAffine(wide(), shift, (208, 64), flags=cv2.INTER_LINEAR) for shift in shifts]
 
@@ -80,10 +80,10 @@ def test_noise_is_refused_also_where_it_repeats() -> None:
     assert found == ["new"] * 2 + ["the image is noise"] * 3 + ["new"] * 3
 
 
-def test_an_unlike_image_is_damage_once_and_a_new_scene_twice() -> None:
+def test_an_uncorrelated_image_is_unusable_and_two_in_a_row_are_a_new_scene() -> None:
     other = panned(10.0 * np.arange(3))
-    assert verdicts([*street()[:3], other[0], *street()[4:6]]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
-    assert verdicts([*street()[:3], *other]) == [*["new"] * 3, UNLIKE, *["new"] * 2]
+    assert verdicts([*street()[:3], other[0], *street()[4:6]]) == [*["new"] * 3, UNCORRELATED, *["new"] * 2]
+    assert verdicts([*street()[:3], *other]) == [*["new"] * 3, UNCORRELATED, *["new"] * 2]
 
 
 def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
@@ -97,7 +97,7 @@ def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
 
 @pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
 @pytest.mark.parametrize("first", [3, 9, 15])
-def test_ten_copies_encoded_again_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
+def test_ten_re_encoded_copies_are_repetitions_and_the_drive_goes_on(hazards: tuple[str, ...], first: int) -> None:
     images = street(hazards)
     copies = [jpeg(images[first], quality) for quality in QUALITIES]
     assert len(copies) == 10 and not any(np.array_equal(copy, images[first]) for copy in copies)
@@ -121,7 +121,7 @@ def test_a_freeze_of_a_slow_camera_is_detected() -> None:
 
 @pytest.mark.parametrize("braking_px", [0.2, 0.4])
 def test_a_camera_that_slows_down_and_stops_is_not_frozen(braking_px: float) -> None:
-    """Compressed anew in every frame, so that no two images of the standing camera have the same bytes."""
+    """Every frame is compressed separately, so that no two images of the standing camera have the same bytes."""
     speeds = np.concatenate([np.full(8, 4.0), np.arange(4.0, 0.0, -braking_px), np.zeros(12), np.arange(0.0, 4.0, 0.5)])
     images = panned(np.cumsum(speeds))
     rng = np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_ten_upside_down_images_are_refused_and_the_drive_goes_on(hazards: tuple
     assert found == ["new"] * 10 + [UPSIDE_DOWN] * 10 + ["new"] * 10
 
 
-def test_a_gate_goes_on_from_its_state() -> None:
+def test_a_gate_resumes_from_its_state() -> None:
     images = [*street()[:8], *(jpeg(street()[7], quality) for quality in QUALITIES), *street()[18:]]
     images[20:24] = map(upside_down, images[20:24])
     whole = verdicts(images)

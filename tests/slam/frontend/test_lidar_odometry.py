@@ -15,7 +15,7 @@ FRAMES = 15
 
 @dataclass
 class Scanned:
-    """As much of a sequence as the LiDAR odometry looks at."""
+    """The part of a sequence that LiDAR odometry uses."""
 
     T_camera_lidar: np.ndarray | None
     paths: dict[int, Path] = field(default_factory=dict)
@@ -60,7 +60,7 @@ def test_steps_are_those_between_neighbouring_scanned_frames():
     np.testing.assert_array_equal(steps[0].sigmas[3:], 0.02)
 
 
-def test_scans_serve_where_neighbours_have_them_and_the_lidar_s_place_is_known():
+def test_scans_are_used_where_neighbours_have_them_and_the_extrinsics_are_known():
     files = {k: Path(f"{k}.bin") for k in (2, 3)}
     assert has_scans(Scanned(np.eye(4), files))
     assert not has_scans(Scanned(None, files))

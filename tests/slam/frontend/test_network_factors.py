@@ -1,4 +1,4 @@
-"""The pose network's snippets as factors with measured noise, and as the raw trajectory."""
+"""The pose network's snippets as factors with their noise, and as the raw trajectory."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def geometry_of(T) -> list[RelativePose]:
     return [RelativePose(k, k + 1, T_k_next, np.full(6, 1e-3), "essential") for k, T_k_next in steps]
 
 
-def test_noise_is_measured_where_geometry_saw_the_same_steps():
+def test_noise_is_estimated_where_geometry_measured_the_same_steps():
     T, sigma_deg = drive(300), 2.0
     rng = np.random.default_rng(1)
     snippets = snippets_of(T)
@@ -122,13 +122,13 @@ def test_noise_is_measured_where_geometry_saw_the_same_steps():
     assert measured.translation_relative_sigma == CONFIG.translation_relative_sigma
 
 
-def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_saw_little():
+def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_measured_little():
     T = drive(60)
     assert measured_noise(snippets_of(T), geometry_of(T), CONFIG) == CONFIG
     assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3], CONFIG) == CONFIG
 
 
-def test_the_network_serves_where_geometry_did_not_measure():
+def test_network_factors_are_used_where_geometry_did_not_measure():
     T = drive(20)
     factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
     assert without_measured(factors, geometric) == []
@@ -166,20 +166,20 @@ NOISE = PoseNoise(
 )
 
 
-def test_measured_noise_gives_each_pair_one_factor_whatever_the_overlap():
+def test_calibrated_noise_gives_each_pair_one_factor_with_any_overlap():
     T = drive(10)
     factors = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets_of(T), [], NOISE, CONFIG)}
     # targets 2 to 7: pairs of neighbours from (1, 2) to (7, 8), pairs over two from (0, 2) to (7, 9)
     assert factors.keys() == {(k, k + 1) for k in range(1, 8)} | {(k, k + 2) for k in range(8)}
     for (first, last), factor in factors.items():
         np.testing.assert_allclose(factor.T_from_to, se3.invert(T[first]) @ T[last], atol=1e-9)
-    np.testing.assert_allclose(factors[1, 2].sigmas, 0.01)  # seen by the snippet of 2 alone
+    np.testing.assert_allclose(factors[1, 2].sigmas, 0.01)  # measured by the snippet of 2 alone
     np.testing.assert_allclose(factors[4, 5].sigmas, 0.01 * np.sqrt(0.75))
     np.testing.assert_allclose(factors[4, 6].sigmas, 0.02 * np.sqrt(0.75))
 
 
 def wobbling(T: np.ndarray, sigma: np.ndarray) -> list[SnippetPoses]:
-    """Snippets whose pitch errs by ``sigma`` of each target ``(N,)``, radians, twice of every pair, independently."""
+    """Snippets with pitch errors of ``sigma`` by target ``(N,)``, radians, two independent ones for every pair."""
     rng, snippets = np.random.default_rng(1), snippets_of(T)
     for snippet in snippets:
         for pose in snippet.T_source_target:
@@ -196,15 +196,15 @@ def exact_geometry(T: np.ndarray) -> list[RelativePose]:
     return [replace(g, sigmas=np.full(6, 1e-6)) for g in geometry_of(T)]
 
 
-def test_a_drive_scales_measured_noise_both_ways():
+def test_a_drive_scales_calibrated_noise_up_and_down():
     T = drive(300)
     snippets, promised = wobbling(T, np.full(300, 0.05)), 0.01 * np.sqrt(0.75)
     scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
     assert scaled[50, 51][0] == pytest.approx(0.05 / np.sqrt(2), rel=0.25)
-    assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # no further, however well both agree
+    assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # the lower limit, however well both agree
     few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG)
     np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
-    assert {f.student_t_dof for f in few} == {np.inf}  # as it lies beside the weights
+    assert {f.student_t_dof for f in few} == {np.inf}  # as calibrated
 
 
 def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
@@ -224,7 +224,7 @@ def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
 
 
 def test_turns_are_scaled_apart_from_straights():
-    """A drive that turns from the middle on, where the network errs ten times as much."""
+    """A drive that turns from the middle on, where errors of the network are ten times as large."""
     turns = np.where(np.arange(299) < 150, 0.0, 0.03) + 1e-4 * np.sin(np.arange(299))
     steps = se3.from_rotation_vector(np.column_stack([0 * turns, turns, 0 * turns]), np.tile([0.0, 0.0, 1.0], (299, 1)))
     T = se3.chain(steps)
@@ -244,14 +244,14 @@ def test_noise_of_geometry_is_added_to_that_of_the_network():
     np.testing.assert_allclose(without_one[50, 51], 0.4, rtol=1e-2)
 
 
-def test_turns_that_are_all_alike_share_one_scaling():
+def test_equal_turn_rates_have_one_scaling():
     T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
     factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE, CONFIG))
     np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)
 
 
 def test_correlated_errors_get_larger_sigmas_in_the_graph():
-    """The pitch of each step errs anew, its roll always to the same side; both by about as much."""
+    """Errors of pitch are independent, those of roll are a bias of about the same size."""
     rng, count = np.random.default_rng(2), 400
     ahead = np.tile([0.0, 0.0, 1.0], (count - 1, 1))
     T, wrong = se3.chain(se3.from_rotation_vector(0 * ahead, ahead)), 0.01 * rng.normal(size=(count - 1, 3))

@@ -62,7 +62,7 @@ def error_deg(table: StepTable, truth: list[FloatArray]) -> float:
 def drive(
     bias: FloatArray, baseline_noise: float, seed: int = 0
 ) -> tuple[StepTable, list[RelativeRotation], list[FloatArray]]:
-    """Steps whose rotations err by ``bias`` each, and rotations across two steps that err by no more than that."""
+    """Steps with a rotation error of ``bias`` each, and rotations across two steps with the same error."""
     rng = np.random.default_rng(seed)
     truth, off = true_rotations(rng), Rotation.from_rotvec(bias).as_matrix()
     sigmas = np.full(3, SIGMA)

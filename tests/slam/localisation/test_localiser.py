@@ -178,7 +178,7 @@ def test_missing_parts_are_named(run: RunFolder, album: Path, tmp_path: Path) ->
     with pytest.raises(SequenceError, match="nowhere: no such file or folder"):
         list(localise(tmp_path / "nowhere", run))
     run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
-    with pytest.raises(RunError, match=r"keeps no places: it ran with loops\.enabled=false"):
+    with pytest.raises(RunError, match=r"has no places: it ran with loops\.enabled=false"):
         list(localise(album, run))
     (run.path / PLACES).unlink()
     with pytest.raises(RunError, match=r"has no places\.npz"):

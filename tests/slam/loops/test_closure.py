@@ -73,7 +73,7 @@ def test_a_straight_drive_has_no_loop() -> None:
     assert result.loops.accepted == () and result.loops.candidates > 0
 
 
-def test_switched_off_the_summary_says_why_there_are_none() -> None:
+def test_switched_off_the_summary_has_the_reason() -> None:
     result = run(drive("straight", 20, 620), "loops.enabled=false")
     summary = result.loops.summary()
     assert summary["candidates"] is None and "loops.enabled" in summary["candidates_reason"]

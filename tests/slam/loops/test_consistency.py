@@ -23,7 +23,7 @@ def loop(earlier: int, later: int, T: FloatArray, shift: float = 0.0, inliers: i
     return Loop(RelativePose(earlier, later, T_from_to, SIGMAS, LOOP_SOURCE), inliers, 0.5)
 
 
-def test_loops_of_one_stretch_support_each_other_through_drift() -> None:
+def test_loops_of_one_stretch_support_each_other_despite_drift() -> None:
     true = [loop(k, 200 + k, ring()) for k in range(0, 40, 4)]
     kept, refused = agreeing(true, ring(yaw_error=0.0005), CONFIG)
     assert len(kept) == 10 and refused == []
@@ -40,7 +40,7 @@ def test_a_loop_without_support_needs_many_inliers() -> None:
     for inliers, expected in ((40, 0), (300, 1)):
         kept, refused = agreeing([loop(5, 205, ring(), inliers=inliers)], ring(), CONFIG)
         assert len(kept) == expected and len(kept) + len(refused) == 1
-    assert "stands alone" in agreeing([loop(5, 205, ring())], ring(), CONFIG)[1][0].reason
+    assert "lacks support" in agreeing([loop(5, 205, ring())], ring(), CONFIG)[1][0].reason
 
 
 def test_loops_that_move_the_trajectory_too_far_are_refused() -> None:

@@ -26,7 +26,7 @@ def view(index: int, descriptors: np.ndarray) -> View:
 
 
 def drive(places: int, again: int) -> list[View]:
-    """Each place is seen in two frames; after ``places`` new ones the first ``again`` come back."""
+    """Each place has two frames; after ``places`` new ones the first ``again`` are revisited."""
     rng = np.random.default_rng(0)
     known = [place(rng) for _ in range(places)]
     order = [*range(places), *range(again)]
@@ -50,7 +50,7 @@ def test_descriptors_keep_their_word_through_flipped_bits() -> None:
     assert same.mean() > 0.8
 
 
-def test_places_are_found_again() -> None:
+def test_revisited_places_are_found() -> None:
     views = drive(20, 5)
     found = find_candidates(views, np.arange(50.0), CONFIG)
     best = {}

@@ -195,7 +195,7 @@ def threads() -> set[str]:
     return {thread.name for thread in threading.enumerate() if thread.name.startswith(prefixes)}
 
 
-def test_a_result_that_is_kept_keeps_neither_threads_nor_networks(tiny_weights: Path) -> None:
+def test_a_result_holds_neither_threads_nor_networks(tiny_weights: Path) -> None:
     street = SimulatedSequence(SimulationOptions("straight", 9, 1002, 208, 64))
     networks = DepthPosePredictor.from_weights(tiny_weights)
     predictor = NetworkPredictor(networks, street.intrinsics)
@@ -248,12 +248,12 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
     result = run(still, *options, noise=noise)
     assert {factor.source for factor in result.observations.steps.relative_poses} == {STILL_SOURCE}
-    turned = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
-    assert turned[1] < 0.3 * turned[0]
+    rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
+    assert rotation[1] < 0.3 * rotation[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
 
 
-def test_images_without_corners_leave_the_pose_network_alone() -> None:
+def test_images_without_corners_leave_only_network_factors() -> None:
     result = run(LevelRoad(turning(20)), "geometry.enabled=true", "geometry.steps=[1,3]")
     assert len(result.observations.steps) == 0
     pairs = [(first, second) for first, second, _ in result.observations.failures]
@@ -282,7 +282,7 @@ def drive_street(
     return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
 
 
-def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
+def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
     """Corner detection, RANSAC and the threads of GTSAM and Open3D must not change the result."""
     for name in ("first", "second"):
         result = drive_street(street)
@@ -300,9 +300,9 @@ def test_two_runs_leave_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
 
 
 def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
-    told: list[tuple[str, int, int]] = []
-    result = drive_street(street, lambda *words: told.append(words))
-    assert told == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
+    calls: list[tuple[str, int, int]] = []
+    result = drive_street(street, lambda *words: calls.append(words))
+    assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
     seen = result.observations
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     measured = {first for first, _ in seen.steps.motions}

@@ -122,7 +122,7 @@ def test_without_kept_keyframes_the_map_begins_at_the_checkpoint(
     assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
-def test_graph_mapping_and_output_may_be_configured_anew(go_on: Callable[..., RunFolder]) -> None:
+def test_graph_mapping_and_output_may_be_changed(go_on: Callable[..., RunFolder]) -> None:
     continued = go_on(overrides=["pose_graph.kernel=none", "mapping.enabled=false", "output.keep=nothing"])
     config = load_config(continued.path / "config.yaml")
     assert (config.pose_graph.kernel, config.output.keep) == ("none", "nothing")
@@ -133,7 +133,7 @@ def test_graph_mapping_and_output_may_be_configured_anew(go_on: Callable[..., Ru
     "options, message",
     [
         ({"config": "default"}, "leave out --config"),
-        ({"overrides": ["geometry.inlier_px=3"]}, "geometry is settled by the frames of .*: leave out --set geometry"),
+        ({"overrides": ["geometry.inlier_px=3"]}, "geometry cannot be changed for .*: leave out --set geometry"),
     ],
     ids=["configuration", "geometry"],
 )
@@ -238,7 +238,7 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
     first = live(kitti_root)
     feed(first, kitti_root, range(6))
     first.save(tmp_path / "drive.zip")
-    with pytest.raises(SlamError, match="before the first frame; 6 came already"):
+    with pytest.raises(SlamError, match="before the first frame; there are 6 already"):
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")

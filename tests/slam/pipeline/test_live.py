@@ -52,7 +52,7 @@ def feed(slam: Slam, first: int, stop: int) -> None:
 
 
 def test_incremental_and_batch_agree_after_the_same_loops() -> None:
-    """To 0.1 % of the path, whatever the graph held on the way."""
+    """To 0.1 % of the path, whatever the graph held in between."""
     config = load_config(None, SETTINGS)
     slam = started(config, update_frames=25, sweep_frames=125)
     feed(slam, 0, FRAMES)
@@ -76,8 +76,8 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         feed(slam, len(slam), count)
         T_world_camera = slam.trajectory().T_world_camera
         assert T_world_camera.shape == (count, 4, 4)
-        way = np.linalg.norm(T_world_camera[-1, :3, 3])
-        assert way == 0.0 if count < 5 else 0.5 * count < way < 1.5 * count
+        distance = np.linalg.norm(T_world_camera[-1, :3, 3])
+        assert distance == 0.0 if count < 5 else 0.5 * count < distance < 1.5 * count
 
 
 def test_blank_frames_are_interpolated() -> None:
@@ -102,11 +102,11 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
             slam.add_frame(image, stamp)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
-    with pytest.raises(SlamError, match="reference wants a whole sequence"):
+    with pytest.raises(SlamError, match="reference needs a whole sequence"):
         started(load_config(None, ["scale.mode=reference"]))
-    with pytest.raises(SlamError, match=r"lidar\.factors=true wants a whole sequence"):
+    with pytest.raises(SlamError, match=r"lidar\.factors=true needs a whole sequence"):
         started(load_config(None, ["lidar.factors=true"]))
-    with pytest.raises(SlamError, match="wants camera_height_m"):
+    with pytest.raises(SlamError, match="needs camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
 
 
@@ -181,7 +181,7 @@ def test_a_failure_at_the_last_frame_is_raised_once() -> None:
         assert len(slam.trajectory()) == len(slam) == 9
 
 
-def test_a_closed_session_has_no_threads_and_still_answers(tmp_path: Path) -> None:
+def test_a_closed_session_has_no_threads_and_keeps_its_results(tmp_path: Path) -> None:
     before = set(threading.enumerate())
     config = load_config(None, [*SETTINGS, "geometry.enabled=true"])
     with started(config) as slam, started(config) as other:

@@ -150,7 +150,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
     seen = result.observations
     assert set(seen.interpolated) == set(BAD)
-    assert warnings.count("bridged by interpolation") == warnings.count("frames 25 to 34 bridged by interpolation") == 1
+    assert warnings.count("are interpolated") == warnings.count("frames 25 to 34 are interpolated") == 1
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
     assert [factor.from_index for factor in interpolated] == list(range(24, 35))
     assert min(factor.sigmas[0] for factor in interpolated) > 5 * np.deg2rad(0.3)
@@ -161,11 +161,11 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
 
 
 @pytest.mark.parametrize("damage", [repeated_as_jpeg, upside_down], ids=lambda damage: damage.__name__)
-def test_misleading_frames_cost_no_more_than_black_ones(damage: Damage) -> None:
+def test_frozen_and_flipped_frames_cost_no_more_than_black_ones(damage: Damage) -> None:
     assert ate(run_on(damage)[0]) < 2 * ate(run_on(black)[0])
 
 
-def test_a_drive_in_order_is_left_alone() -> None:
+def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
     assert run(bad=range(0)).observations.interpolated == {}
 
 
@@ -203,7 +203,7 @@ def test_a_missing_image_is_an_error_where_gaps_are_switched_off() -> None:
         observe(20, None, missing, range(8, 10), "gaps.enabled=false")
 
 
-def test_too_many_unreadable_images_are_the_error_they_are() -> None:
+def test_too_many_unreadable_images_raise_their_error() -> None:
     with pytest.raises(SequenceError, match=r"image 28\.png is truncated"):
         run(unreadable, BAD, "gaps.max_unread_frames=3")
     with pytest.raises(SequenceError, match=r"image 25\.png is truncated"):

@@ -36,7 +36,7 @@ def again(asked: Sequence[Frame]) -> list[Frame]:
     return [Frame(frame.index, frame.stamp, frame.image.copy()) for frame in asked]
 
 
-def test_answers_by_frame_what_the_networks_answer_by_image(direct: DepthPosePredictor) -> None:
+def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePredictor) -> None:
     predictor: Predictor = NetworkPredictor(direct, CAMERA)
     snippet = frames(10)
     depth = predictor.depth(snippet[0])
@@ -76,7 +76,7 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
     assert poses.residuals is not None and poses.residuals.shape == (4,) and (poses.residuals > 0).all()
 
 
-def test_two_predictors_do_not_share_what_a_frame_keeps_for_each() -> None:
+def test_two_predictors_have_separate_outputs_cached_in_a_frame() -> None:
     one, other = (NetworkPredictor(Counting(gain), CAMERA) for gain in (1, 2))
     (frame,) = frames(0, 1)
     np.testing.assert_allclose(one.depth(frame), 2 * other.depth(frame), rtol=1e-6)
@@ -96,7 +96,7 @@ class Answered(NamedTuple):
 
 
 class Counting:
-    """Networks whose answers follow from the images by a formula; they count how often they are asked."""
+    """Networks whose outputs are a formula of the images; they count their calls."""
 
     sources = 4
 
@@ -130,7 +130,7 @@ def entries(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def test_a_second_run_reads_every_answer_and_gets_the_same(tmp_path: Path) -> None:
+def test_a_second_run_reads_every_output_from_the_cache(tmp_path: Path) -> None:
     networks, snippet = Counting(), frames(0)
     first, namespace = cached(networks, tmp_path)
     depth, poses = first.depth(snippet[0]), first.snippet(snippet)  # the latter wants the target's disparity too
@@ -148,7 +148,7 @@ def test_a_second_run_reads_every_answer_and_gets_the_same(tmp_path: Path) -> No
     assert networks.prepared == 0, "images whose answers are known need not be prepared"
 
 
-def test_every_difference_is_another_entry(tmp_path: Path) -> None:
+def test_any_different_input_is_another_entry(tmp_path: Path) -> None:
     networks, snippet = Counting(), frames(0)
     predictor, _ = cached(networks, tmp_path)
     predictor.depth(snippet[2])
@@ -204,5 +204,5 @@ def test_a_full_disk_ends_the_caching_and_not_the_run(
     monkeypatch.setattr(Path, "write_bytes", full)
     for frame in frames(0):
         predictor.depth(frame)
-    assert networks.asked == 5 and caplog.text.count("keeps nothing more") == 1
+    assert networks.asked == 5 and caplog.text.count("is not written any more") == 1
     assert entries(tmp_path) == []

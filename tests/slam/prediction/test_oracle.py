@@ -1,4 +1,4 @@
-"""The oracle answers with true depth and poses, and errs by the amount asked for."""
+"""The oracle gives true depth and poses with errors of the given size."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def depth_of(index: int) -> np.ndarray:
     return np.full((40, 60), 10.0 + index, np.float32)
 
 
-def test_without_noise_answers_are_true_in_the_unscaled_unit():
+def test_without_noise_outputs_are_true_in_the_unscaled_unit():
     oracle: Predictor = OraclePredictor(truth(), depth_of, unscaled_factor=0.5)
     assert oracle.sources == 4
     snippet = oracle.snippet(frames(3))
@@ -51,7 +51,7 @@ def test_noise_depends_on_seed_and_frame_but_not_on_the_order_of_calls():
     assert not np.array_equal(changed.snippet(frames(0)).T_source_target, forward[0])
 
 
-def test_noise_has_the_size_asked_for():
+def test_noise_has_the_given_size():
     oracle = OraclePredictor(truth(400), depth_of, OracleNoise(0.01, 0.1, depth_relative_sigma=0.05))
     T = truth(400)
     rotations, translations, depths = [], [], []
@@ -67,7 +67,7 @@ def test_noise_has_the_size_asked_for():
     assert 0.02 < np.std(depths) < 0.06
 
 
-def test_scale_drift_is_shared_by_depth_and_motion():
+def test_scale_drift_is_common_to_depth_and_motion():
     oracle = OraclePredictor(truth(), depth_of, OracleNoise(scale_drift_sigma=0.05))
     ratios = [
         float(oracle.depth(frames(k)[2])[0, 0] / depth_of(k + 2)[0, 0])

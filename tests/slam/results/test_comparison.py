@@ -1,4 +1,4 @@
-"""Tables of several runs say what is missing and why."""
+"""Tables of several runs, with the reasons of missing numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def printed(runs: list[RunFolder], width: int = 140) -> str:
     return capture.get()
 
 
-def test_runs_stand_side_by_side_with_their_numbers(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_runs_are_shown_side_by_side_with_their_numbers(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
     text = printed([make_run("first"), make_run("second", make_metrics(mode="none"))])
     assert "first" in text
     assert "second" in text
@@ -33,14 +33,14 @@ def test_runs_stand_side_by_side_with_their_numbers(make_run: MakeRun, make_metr
     assert "LEAK" not in text
 
 
-def test_a_leak_and_missing_numbers_are_said(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_a_leak_and_missing_numbers_are_noted(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
     text = printed([make_run("seen", make_metrics(leak=True))])
     assert "LEAK" in text
     assert "lidar: the sequence has no LiDAR scans" in text
     assert "odometry: no segment of 100 m was left" in text
 
 
-def test_a_failed_run_keeps_its_place(make_run: MakeRun) -> None:
+def test_a_failed_run_has_its_row(make_run: MakeRun) -> None:
     failed = {"schema": 1, "status": "failed", "reason": "no motion [bold]between[/bold] frames", "provenance": None}
     text = printed([make_run("good"), make_run("bad", failed)])
     assert "bad failed: no motion [bold]between[/bold] frames" in text
@@ -69,7 +69,7 @@ def test_no_run_is_an_error() -> None:
         comparison_table([])
 
 
-def test_runs_of_one_name_are_told_apart(make_run: MakeRun) -> None:
+def test_runs_of_one_name_are_distinguished_by_their_paths(make_run: MakeRun) -> None:
     runs = [make_run("a/run"), make_run("b/run"), make_run("c")]
     assert run_names(runs) == [str(runs[0].path), str(runs[1].path), "c"]
 

@@ -1,4 +1,4 @@
-"""Exports are whole files in the axes asked for."""
+"""Exports are whole files in the given axes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> Non
 
 
 @pytest.mark.parametrize("what", ["mesh", "cloud"])
-def test_ply_is_copied_or_turned_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
+def test_ply_is_copied_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path: Path, what: str) -> None:
     folder = make_run()
     source = folder.path / f"map_{what}.ply"
     copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
@@ -50,7 +50,7 @@ def test_trajectory_format_follows_the_name(make_run: MakeRun, tmp_path: Path, n
     assert read.timed == (format == "tum")
 
 
-def test_trajectory_with_z_up_turns_the_world_only(make_run: MakeRun, tmp_path: Path) -> None:
+def test_trajectory_with_z_up_rotates_the_world_only(make_run: MakeRun, tmp_path: Path) -> None:
     folder = make_run()
     down = read_trajectory(export(folder, "trajectory", tmp_path / "a.tum", "y-down"))
     up = read_trajectory(export(folder, "trajectory", tmp_path / "b.tum", "z"))

@@ -25,7 +25,7 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
 
 
 def begin(output: Path) -> RunFolder:
-    """A new run into ``output``, as far as it goes before it has a trajectory."""
+    """A new run into ``output``, before it has a trajectory."""
     folder = RunFolder.create(output, output.parent, "sim")
     folder.write_metrics({"schema": 1, "status": "running", "provenance": {}})
     return folder
@@ -35,7 +35,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def test_an_earlier_run_stays_until_the_new_one_takes_its_place(make_run: MakeRun) -> None:
+def test_an_earlier_run_stays_until_the_new_one_replaces_it(make_run: MakeRun) -> None:
     old = make_run("mine").path
     (old / "notes.txt").write_text("what I saw")
     before = contents(old)
@@ -59,7 +59,7 @@ def test_a_run_without_trajectories_is_replaced_at_once_with_what_was_half_writt
     assert [path.name for path in new.path.iterdir()] == [".12.34.partial.thesis.tex"]
 
 
-def test_an_unfinished_run_goes_with_the_run_beside_it(make_run: MakeRun) -> None:
+def test_an_unfinished_run_is_removed_with_the_run_beside_it(make_run: MakeRun) -> None:
     old = make_run("mine").path
     assert begin(old).path == begin(old).path == old / "unfinished"
     for path in old.glob("trajectory_*"):
@@ -116,7 +116,7 @@ def test_output_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("name", "why"), [("nowhere", "no such folder"), (".", "no metrics.json")])
-def test_open_says_what_is_wrong(tmp_path: Path, name: str, why: str) -> None:
+def test_open_names_what_is_wrong(tmp_path: Path, name: str, why: str) -> None:
     with pytest.raises(RunError, match=why):
         RunFolder.open(tmp_path / name)
 

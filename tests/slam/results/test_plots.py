@@ -1,4 +1,4 @@
-"""Figures show what they say and are written whole."""
+"""Figures have the right content and are written whole."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_trajectory_figure_names_the_alignment_and_keeps_proportions(make_run: M
     assert labels == ["Ground truth", "Network, chained", "Odometry", "Optimised", "Start"]
 
 
-def test_without_a_reference_nothing_is_aligned_and_the_unit_is_said(make_run: MakeRun) -> None:
+def test_without_a_reference_nothing_is_aligned_and_the_unit_is_shown(make_run: MakeRun) -> None:
     trajectories = trajectories_of(make_run(reference=False))
     (axes,) = trajectory_figure(trajectories, unit="camera heights").axes
     assert "camera heights" in axes.get_xlabel()
@@ -77,7 +77,7 @@ def test_without_a_reference_nothing_is_aligned_and_the_unit_is_said(make_run: M
     np.testing.assert_allclose(optimised.get_ydata(), trajectories["optimised"].positions[:, 2])
 
 
-def test_alignment_takes_out_a_similarity_and_drift_is_then_nothing(make_run: MakeRun) -> None:
+def test_alignment_removes_a_similarity_and_drift_is_then_zero(make_run: MakeRun) -> None:
     reference = trajectories_of(make_run())["reference"]
     fitted = aligned({"reference": reference, "optimised": moved(reference, 0.2)})["optimised"]
     np.testing.assert_allclose(fitted.positions, reference.positions, atol=1e-5)
@@ -87,7 +87,7 @@ def test_alignment_takes_out_a_similarity_and_drift_is_then_nothing(make_run: Ma
     assert max(drift.rotation for drift in drifts) < 1e-5
 
 
-def test_drift_of_a_known_scale_and_turn_has_its_hand_value() -> None:
+def test_drift_of_a_known_scale_and_rotation_has_its_hand_value() -> None:
     frames = 121
     T_true = np.tile(np.eye(4), (frames, 1, 1))
     T_true[:, 2, 3] = np.arange(frames)
@@ -109,7 +109,7 @@ def test_errors_need_a_reference(make_run: MakeRun, tmp_path: Path) -> None:
     plot_runs([run], ["trajectory"], tmp_path / "a.png")
 
 
-def test_a_path_too_short_for_segments_says_so() -> None:
+def test_a_path_too_short_for_segments_is_noted() -> None:
     stamps = np.arange(5.0)
     still = Trajectory(stamps, np.tile(np.eye(4), (5, 1, 1)))
     figure = drift_figure({"reference": still, "optimised": still})

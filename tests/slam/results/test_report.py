@@ -1,4 +1,4 @@
-"""The report is one valid page that says everything and needs nothing."""
+"""The report is one valid, complete and self-contained page."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_its_pictures_are_whole_and_not_blank(full: RunFolder) -> None:
         assert imread(io.BytesIO(base64.b64decode(data)))[..., :3].std() > 0.02
 
 
-def test_it_says_what_ran_and_escapes_it(full: RunFolder) -> None:
+def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
     html, balance = parsed(full)
     words = " ".join(balance.words)
     for said in ("sim/loop <42>", "MIT: trained on our own", "erfsfm-slam run --sequence '<b>09</b>' & more"):
@@ -129,7 +129,7 @@ def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None
     assert '<div class="stamp" role="alert"><b>LEAK</b>' in html
 
 
-def test_without_reference_and_map_the_report_says_so(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+def test_without_reference_and_map_the_report_has_the_reasons(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
     metrics = make_metrics(reference=False, mode="none")
     metrics |= {"map": None, "map_reason": "fusion is switched off"}
     metrics["loops"] = {"candidates": None, "candidates_reason": "this part is not built yet", "rejected": []}
@@ -144,7 +144,7 @@ def test_without_reference_and_map_the_report_says_so(make_run: MakeRun, make_me
     assert html.count("<img") == 1
 
 
-def test_a_failed_run_says_why(make_run: MakeRun) -> None:
+def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:
     metrics = {"schema": 1, "status": "failed", "reason": "frame 7 <is> broken", "provenance": None}
     folder = make_run(metrics=metrics, reference=False)
     for path in folder.path.glob("trajectory_*"):
@@ -156,14 +156,14 @@ def test_a_failed_run_says_why(make_run: MakeRun) -> None:
     assert "FAILED" in html
 
 
-def test_a_damaged_loops_file_costs_nothing_else(make_run: MakeRun) -> None:
+def test_a_damaged_loops_file_leaves_the_rest_of_the_report(make_run: MakeRun) -> None:
     folder = make_run()
     folder.write_text("loops.json", "{")
     write_report(folder, [], None, None)
     assert "12 candidates" in parsed(folder)[0]
 
 
-def test_trajectories_without_a_common_time_cost_nothing_else(make_run: MakeRun) -> None:
+def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:
     folder = make_run()
     late = folder.trajectory("odometry")
     assert late is not None

@@ -1,4 +1,4 @@
-"""A recording for the viewer where rerun is installed; else one line that says how to install it."""
+"""A recording for the viewer where rerun is installed; else one line with how to install it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_without_rerun_the_run_does_not_begin(
 
 
 class Recorder:
-    """Stands for the SDK: remembers what is logged where."""
+    """In place of the SDK: records what is logged where."""
 
     def __init__(self) -> None:
         self.logged: list[tuple[str, str, int | None]] = []

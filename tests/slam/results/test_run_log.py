@@ -1,4 +1,4 @@
-"""The log of a run is whole from its first line, and never ends the run."""
+"""The log of a run is complete from its first line, and its errors never end the run."""
 
 from __future__ import annotations
 

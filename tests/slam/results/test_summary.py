@@ -1,4 +1,4 @@
-"""Every missing number has its reason beside it."""
+"""Every missing number has a reason."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_sequence_in_numbers() -> None:
     }
 
 
-def test_sequence_without_truth_or_time_says_why() -> None:
+def test_sequence_without_truth_or_time_has_the_reasons() -> None:
     summary = describe_sequence(sequence_of([0.0]), None)
     assert summary["length_m"] is None and "true poses" in summary["length_m_reason"]
     assert summary["fps"] is None and summary["fps_reason"]

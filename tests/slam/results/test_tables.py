@@ -1,4 +1,4 @@
-"""The table of a run's errors: every number of the terminal, and why the others are missing."""
+"""The table of a run's errors: all numbers, and the reasons of missing ones."""
 
 import io
 from typing import Any

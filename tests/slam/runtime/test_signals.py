@@ -1,4 +1,4 @@
-"""A process that is told to end raises, once, and only where nobody else listens."""
+"""Signals to terminate raise once, unless they are handled or ignored."""
 
 from __future__ import annotations
 

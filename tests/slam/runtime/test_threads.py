@@ -30,7 +30,7 @@ def test_nothing_and_one_are_read_too() -> None:
     assert list(read_ahead(str, range(3, 4))) == ["3"]
 
 
-def test_what_cannot_be_read_is_heard_of_in_its_turn() -> None:
+def test_an_error_of_reading_is_raised_in_order() -> None:
     def read(number: int) -> int:
         return 1 // (2 - number)
 

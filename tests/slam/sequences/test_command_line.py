@@ -1,4 +1,4 @@
-"""Recordings as users have them, through ``erfsfm-slam run``: gaps, damage, odd names, and drives that go on."""
+"""Recordings through ``erfsfm-slam run``: gaps, damage, odd names, and continued drives."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_folder_with_brackets_in_its_name(
         assert code == 0 and metrics(tmp_path / f"leak-{leak}")["provenance"]["leak"] is leak, err
 
 
-def test_half_a_jpeg_is_bridged_and_named(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+def test_half_a_jpeg_is_interpolated_and_named(tmp_path: Path, kitti_root: Path, run: Call) -> None:
     image = write_folder(tmp_path / "drive", kitti_root, ".jpg") / "000006.jpg"
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
     code, err = run("--dataset", "drive", "--output", "out")

@@ -1,4 +1,4 @@
-"""Frames of before and those that follow, as one sequence."""
+"""Earlier frames and those that follow, as one sequence."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def test_two_ranges_are_the_whole(whole: Sequence, parts: tuple[Sequence, Sequen
     assert joined.scan_path(11) is None and set(joined.provenance()) == set(whole.provenance())
 
 
-def test_frames_of_before_are_gone(parts: tuple[Sequence, Sequence]) -> None:
+def test_earlier_frames_are_not_kept(parts: tuple[Sequence, Sequence]) -> None:
     joined = continued(*parts)
-    with pytest.raises(SequenceError, match="frame 8 of sim was looked at before and is not kept"):
+    with pytest.raises(SequenceError, match="frame 8 of sim is of an earlier run"):
         joined.frame(8)
     with pytest.raises(SequenceError, match="14"):
         joined.frame(14)
@@ -62,7 +62,7 @@ def test_no_truth_where_one_part_has_none(parts: tuple[Sequence, Sequence]) -> N
     assert continued(before, following).reference is None
 
 
-def test_stamps_that_begin_anew_come_after(parts: tuple[Sequence, Sequence]) -> None:
+def test_stamps_that_restart_are_shifted(parts: tuple[Sequence, Sequence]) -> None:
     before, following = parts
     following.stamps = following.stamps - following.stamps[0]
     joined = continued(before, following)
@@ -107,7 +107,7 @@ def test_a_gap_becomes_missing_frames(
     assert joined.reference is not None and whole.reference is not None
     np.testing.assert_allclose(joined.reference, whole.reference, atol=1e-12)
     for index in range(9, first):
-        with pytest.raises(MissingFrameError, match=f"frame {index} of 00 lies between two runs"):
+        with pytest.raises(MissingFrameError, match=f"frame {index} of 00 is missing between two runs"):
             joined.frame(index)
     np.testing.assert_array_equal(joined.frame(12).image, whole.frame(12).image)
     assert joined.provenance() == ("kitti_odometry/00[0:9]", f"kitti_odometry/00[{first}:14]")
@@ -131,20 +131,20 @@ def test_another_recording_is_refused(tmp_path: Path, kitti_root: Path) -> None:
         continued(before, open_sequence(kitti_root, "sim", frames="9:"))
 
 
-def test_frames_of_before_are_refused(tmp_path: Path, kitti_root: Path) -> None:
+def test_frames_before_the_last_are_refused(tmp_path: Path, kitti_root: Path) -> None:
     root = write_drive(tmp_path, "00", kitti_root)
     with pytest.raises(SequenceError, match=r"00\[2:4\] does not come after kitti_odometry/00\[5:9\]"):
         continued(open_sequence(root, frames="5:9"), open_sequence(root, frames="2:4"))
 
 
-def test_an_own_folder_is_taken_to_follow(
+def test_a_folder_is_assumed_to_follow(
     tmp_path: Path, kitti_root: Path, parts: tuple[Sequence, Sequence], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its name does not say where it belongs: a camera may write a new folder for each part of a drive."""
+    """Its name has no frame numbers: a camera may write a new folder for each part of a drive."""
     shutil.copytree(kitti_root / "sequences/sim/image_2", tmp_path / "part2")
     shutil.copy(kitti_root / "camera.yaml", tmp_path / "part2")
     assert len(continued(parts[0], open_sequence(tmp_path / "part2"))) == 9 + 14
-    assert "folder/part2[0:14] is taken to follow right on simulated/1001" in caplog.text
+    assert "folder/part2[0:14] is assumed to follow simulated/1001" in caplog.text
 
 
 @pytest.mark.parametrize(

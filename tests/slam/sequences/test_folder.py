@@ -79,7 +79,7 @@ def test_brackets_in_a_name(tmp_path: Path, images, camera_yaml: str) -> None:
     assert open_sequence(folder).provenance() == ("folder/br[ack]ets[0:2]",)
 
 
-def test_an_unreadable_image_is_heard_as_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
+def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)
     (tmp_path / "1.png").write_bytes(b"no image")

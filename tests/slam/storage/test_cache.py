@@ -1,4 +1,4 @@
-"""Answers are read where everything they depend on is the same, and computed where anything is not."""
+"""Results are read where all inputs are the same, and computed where any differs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_arrays_of_any_kind_come_back_as_they_were(tmp_path: Path) -> None:
         assert before.dtype == after.dtype and before.shape == after.shape
 
 
-def test_no_answer_is_an_answer(tmp_path: Path) -> None:
+def test_an_empty_result_is_cached(tmp_path: Path) -> None:
     known = CacheNamespace(DiskCache(tmp_path), "code")
     assert known.get_or_compute("question", (), tuple) == ()
     assert known.get_or_compute("question", (), never) == ()

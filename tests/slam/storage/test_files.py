@@ -30,7 +30,7 @@ def test_the_writer_sees_the_suffix_beside_the_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RunError("empty"), KeyboardInterrupt()])
-def test_whatever_stops_the_writer_the_old_file_stays_and_no_rest(tmp_path: Path, failure: BaseException) -> None:
+def test_after_any_failure_the_old_file_stays_and_no_partial_file(tmp_path: Path, failure: BaseException) -> None:
     path = tmp_path / "run.log"
     path.write_text("old")
 
@@ -45,7 +45,7 @@ def test_whatever_stops_the_writer_the_old_file_stays_and_no_rest(tmp_path: Path
     assert [p.name for p in tmp_path.iterdir()] == ["run.log"]
 
 
-def test_the_error_is_of_the_kind_asked_for_and_names_file_and_cause(tmp_path: Path) -> None:
+def test_the_error_is_of_the_given_kind_and_names_file_and_cause(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r"file/x\.txt: cannot be written \(.+\)"):
         write_atomically(tmp_path / "file" / "x.txt", lambda partial: partial.write_text("x"), RunError)

@@ -1,4 +1,4 @@
-"""Cached answers of other code are not read."""
+"""The fingerprint changes with the code behind cached results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from slam.storage.fingerprint import code_fingerprint, fingerprint
 
 PACKAGES = [Path(package.__file__ or "").parent for package in (erfsfm, slam)]
 ABOVE = {"slam/results", "slam/localisation", "erfsfm/training"}
-ROOMS = sorted(
+SUBPACKAGES = sorted(
     {path.parent.relative_to(folder.parent).as_posix() for folder in PACKAGES for path in folder.rglob("*.py")}
 )
 
@@ -39,9 +39,9 @@ def changed(copies: list[Path], path: Path) -> bool:
         path.write_bytes(content)
 
 
-@pytest.mark.parametrize("room", [room for room in ROOMS if room not in ABOVE])
-def test_a_byte_in_any_room_that_computes_answers_is_another_fingerprint(copies: list[Path], room: str) -> None:
-    folder = copies[0].parent / room
+@pytest.mark.parametrize("package", [package for package in SUBPACKAGES if package not in ABOVE])
+def test_a_byte_in_any_package_behind_cached_results_changes_the_fingerprint(copies: list[Path], package: str) -> None:
+    folder = copies[0].parent / package
     above = {"cli.py", "__main__.py", "doctor.py", "run.py"} if folder in copies else set()
     sources = [path for path in folder.glob("*.py") if path.name not in above]
     assert sources and all(changed(copies, path) for path in sources)

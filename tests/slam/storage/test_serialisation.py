@@ -77,7 +77,7 @@ def test_arrays_that_are_not_contiguous(tmp_path: Path) -> None:
     assert np.array_equal(back(tmp_path / "r", array), array)
 
 
-def test_one_array_in_two_places_is_one_array_again(tmp_path: Path) -> None:
+def test_an_array_referenced_twice_is_read_as_one(tmp_path: Path) -> None:
     array = np.arange(3)
     SERIALISER.write(tmp_path / "r", {"first": [array, np.arange(3)], "second": Pebble(1.0, array)})
     read = SERIALISER.read(tmp_path / "r")

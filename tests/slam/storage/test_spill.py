@@ -1,4 +1,4 @@
-"""What waits on disk comes back as it was, and a full disk says what to do."""
+"""Spilled arrays are read back unchanged, and a full disk is one clear error."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def test_what_is_no_road_is_refused_with_a_reason(texture):
     rng = np.random.default_rng(0)
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
     failure = RoadHomography(CONFIG, CAMERA).measure(*noise, step)
-    assert isinstance(failure, MeasurementFailure) and "looks different" in failure.reason
+    assert isinstance(failure, MeasurementFailure) and "do not correlate" in failure.reason
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
     failure = RoadHomography(CONFIG, sky).measure(*noise, step)
     assert isinstance(failure, MeasurementFailure) and "too little of the road" in failure.reason

@@ -61,7 +61,7 @@ def test_too_few_frames_give_no_scale():
     assert isinstance(scale_from_road([MeasurementFailure("dark")] * 30, 1.65, CONFIG), MeasurementFailure)
 
 
-def test_the_track_follows_a_drifting_unit_and_spans_frames_without_a_plane():
+def test_the_scale_track_follows_a_drifting_unit_across_frames_without_a_plane():
     heights = np.where(np.arange(200) < 100, 0.50, 0.52)
     roads = planes_of(heights)
     roads[10:40] = [MeasurementFailure("no road")] * 30

@@ -33,7 +33,7 @@ def noisy(sigma: float, seed: int = 1) -> np.ndarray:
     return np.log(TRUE) + sigma * np.random.default_rng(seed).normal(size=STEPS)
 
 
-def test_triangulation_carries_rare_road_lengths_through_the_drive():
+def test_triangulation_propagates_rare_road_lengths_through_the_drive():
     """Where the road is seen in one step of forty and learned depth is twice too long, lengths are still right."""
     road = np.where(np.arange(STEPS) % 40 == 20, np.log(TRUE), np.nan)
     measured = evidence(
@@ -69,7 +69,7 @@ def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
 
 
-def test_learned_depth_spans_a_gap_in_the_unit_measured_around_it():
+def test_learned_depth_bridges_a_gap_in_the_unit_measured_around_it():
     """Steps 80 to 119 have neither road nor ratio, and learned lengths are 30 % short all along."""
     gap = (np.arange(STEPS) >= 80) & (np.arange(STEPS) < 120)
     tied = ratios()
@@ -163,17 +163,17 @@ def test_sigmas_are_those_of_the_whole_system() -> None:
     information = A.T @ A
     left = np.linalg.inv(information)[:steps, :steps]
     expected = np.sqrt(np.diag(left))
-    alike = np.clip(np.diag(left, 1) / (expected[1:] * expected[:-1]), 0.0, 1.0)
+    correlations = np.clip(np.diag(left, 1) / (expected[1:] * expected[:-1]), 0.0, 1.0)
     banded = np.abs(np.subtract.outer(np.arange(2 * steps), np.arange(2 * steps)))
     assert (information[(banded != 0) & (banded != 1) & (banded != steps)] == 0).all()
     sigmas, with_neighbours = marginals(csc_array(information), steps)
     np.testing.assert_allclose(sigmas, expected, rtol=1e-9)
-    both_sides = 0.5 * (np.append(alike[0], alike) + np.append(alike, alike[-1]))
+    both_sides = 0.5 * (np.append(correlations[0], correlations) + np.append(correlations, correlations[-1]))
     np.testing.assert_allclose(with_neighbours, both_sides, atol=1e-9)
 
 
-def test_correlated_sigmas_are_how_far_sums_of_lengths_err() -> None:
-    """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up to what the lengths' errors do."""
+def test_correlated_sigmas_are_those_of_sums_of_lengths() -> None:
+    """Over 40 steps, independent errors of ``relative_correlated_sigma`` add up as the errors of the lengths do."""
     middle = slice(80, 120)
     alone, together = [], []
     for seed in range(60):
@@ -194,8 +194,8 @@ def test_correlated_sigmas_are_how_far_sums_of_lengths_err() -> None:
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
 
-def test_sigmas_are_how_far_lengths_err() -> None:
-    """Also in the middle of a gap of the road, where only triangulation and learned depth go on."""
+def test_sigmas_are_those_of_the_errors_of_lengths() -> None:
+    """Also in the middle of a gap of the road, where there are only triangulation and learned depth."""
     errors, sigmas = [], []
     for seed in range(20):
         road = noisy(0.06, seed=100 + seed)

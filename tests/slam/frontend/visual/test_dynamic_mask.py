@@ -1,4 +1,4 @@
-"""Corners are weighted down where many were outliers lately."""
+"""Corners are weighted down where many were outliers recently."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def test_corners_on_a_moving_car_are_weighted_down() -> None:
     dynamic_mask, static = mask_with_car(8)
     assert dynamic_mask.weights(CAR[None]) < 0.05
     assert np.median(dynamic_mask.weights(static)) > 0.8
-    assert dynamic_mask.weights(np.array([[400.0, 10.0]])) > 0.8  # no corner was seen there
+    assert dynamic_mask.weights(np.array([[400.0, 10.0]])) > 0.8  # no corner was there
 
 
-def test_outliers_are_forgotten_after_the_car_has_left() -> None:
+def test_outliers_decay_after_the_car_has_left() -> None:
     dynamic_mask, static = mask_with_car(8)
     for _ in range(40):
         pixels = np.concatenate([static, np.tile(CAR, (3, 1))])
@@ -42,12 +42,12 @@ def test_outliers_are_forgotten_after_the_car_has_left() -> None:
     assert dynamic_mask.weights(CAR[None]) > 0.8
 
 
-def test_without_sharpness_all_corners_weigh_alike() -> None:
+def test_without_sharpness_all_weights_are_equal() -> None:
     dynamic_mask, static = mask_with_car(8, sharpness=0.0)
     np.testing.assert_array_equal(dynamic_mask.weights(np.concatenate([static, CAR[None]])), np.ones(151))
 
 
-def test_corners_beyond_the_edge_belong_to_the_edge() -> None:
+def test_corners_beyond_the_edge_belong_to_the_nearest_cell() -> None:
     empty = DynamicMask.empty(416, 128, 4.0)
     dynamic_mask = empty.updated(np.array([[416.0, 128.0], [-0.4, -0.4]]), np.array([True, False]))
     assert np.isfinite(dynamic_mask.weights(np.array([[416.0, 128.0], [-0.4, 0.0]]))).all()

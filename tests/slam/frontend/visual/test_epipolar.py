@@ -87,22 +87,22 @@ def test_depths_are_triangulated_in_both_cameras() -> None:
     assert (triangulated_depth(previous, current, backwards) < 0).all()
 
 
-def test_parallax_is_what_the_rotation_leaves() -> None:
+def test_parallax_is_the_flow_without_that_of_the_rotation() -> None:
     camera = Intrinsics(416, 128, FOCAL_PX, FOCAL_PX, 208.0, 64.0)
     previous, _, _ = matched_rays()
-    turned = previous @ UNIT_POSE.R_current_previous.T
-    turned /= turned[:, 2:]
-    assert parallax_px(previous, turned, UNIT_POSE.R_current_previous, camera).max() < 1e-9
-    shifted = turned + np.array([3.0, 4.0, 0.0]) / FOCAL_PX
+    rotated = previous @ UNIT_POSE.R_current_previous.T
+    rotated /= rotated[:, 2:]
+    assert parallax_px(previous, rotated, UNIT_POSE.R_current_previous, camera).max() < 1e-9
+    shifted = rotated + np.array([3.0, 4.0, 0.0]) / FOCAL_PX
     np.testing.assert_allclose(parallax_px(previous, shifted, UNIT_POSE.R_current_previous, camera), 5.0)
 
 
 def test_a_pure_rotation_is_found_with_a_fifth_of_outliers() -> None:
     previous, _, _ = matched_rays()
-    turned = previous @ UNIT_POSE.R_current_previous.T
-    turned /= turned[:, 2:]
-    turned[:24, :2] += 0.05
-    found = rotation_between(previous, turned)
+    rotated = previous @ UNIT_POSE.R_current_previous.T
+    rotated /= rotated[:, 2:]
+    rotated[:24, :2] += 0.05
+    found = rotation_between(previous, rotated)
     assert np.rad2deg(se3.rotation_angle(found.T @ UNIT_POSE.R_current_previous)) < 1e-6
 
 

@@ -11,7 +11,7 @@ from slam.frontend.visual.heading_prior import HeadingPrior
 
 LEAST = np.deg2rad(0.35)
 STEPS = 150
-# sigmas of yaw and of the sideways direction, and the correlation that corners give their errors
+# sigmas of yaw and of the lateral direction, and the correlation of their errors
 YAW, ASIDE, CORRELATION = np.deg2rad(0.05), np.deg2rad(1.5), -0.8
 
 
@@ -32,7 +32,7 @@ def after_straight_steps(steps: int, covariance: np.ndarray) -> HeadingPrior:
 def yaw_errors(seed: int, slope: float, spread: float) -> tuple[np.ndarray, np.ndarray]:
     """Errors of yaw ``(STEPS,)`` before and after fusion on a drive.
 
-    The sideways direction is ``slope`` times the yaw, with a standard deviation ``spread``, radians.
+    The lateral direction is ``slope`` times the yaw, with a standard deviation ``spread``, radians.
     """
     rng = np.random.default_rng(seed)
     prior = HeadingPrior(LEAST)
@@ -65,13 +65,13 @@ def rms(values: np.ndarray) -> float:
 
 
 def test_on_a_vehicle_the_prior_makes_yaw_more_accurate() -> None:
-    """A direction wholly known would leave ``sqrt(1 - 0.8 ** 2)`` of the error of yaw; it varies by 0.3 degrees."""
+    """An exact direction would leave ``sqrt(1 - 0.8 ** 2)`` of the error of yaw; it varies by 0.3 degrees."""
     for seed in range(3):
         before, after = yaw_errors(seed, slope=-0.5, spread=np.deg2rad(0.3))
         assert rms(after[50:]) < 0.75 * rms(before[50:])
 
 
-def test_on_a_camera_that_moves_freely_the_prior_changes_nothing() -> None:
+def test_on_a_freely_moving_camera_the_prior_has_no_effect() -> None:
     for seed in range(3):
         before, after = yaw_errors(seed, slope=0.0, spread=0.3)
         assert rms(after[50:]) == pytest.approx(rms(before[50:]), rel=0.03)
@@ -83,22 +83,22 @@ def test_the_first_steps_are_as_measured() -> None:
     assert (np.abs(after[20:] - before[20:]) > 1e-9).all()
 
 
-def test_a_reversing_vehicle_is_left_as_measured() -> None:
+def test_on_a_reversing_vehicle_the_prior_has_no_effect() -> None:
     backwards = UnitRelativePose(rotation_of(0.01), -heading(0.02))
     fused, remaining = after_straight_steps(40, covariance()).fuse(backwards, covariance())
     np.testing.assert_array_equal(fused.direction, backwards.direction)
     np.testing.assert_array_equal(remaining, covariance())
 
 
-def test_a_slide_that_is_measured_well_outweighs_the_prior() -> None:
-    """A direction 20 degrees off with small sigmas is not drawn to the usual one."""
+def test_a_well_measured_lateral_motion_outweighs_the_prior() -> None:
+    """A direction 20 degrees off with small sigmas is not pulled to the usual one."""
     small = covariance() / 25.0
     slide = UnitRelativePose(rotation_of(0.0), heading(np.deg2rad(20.0)))
     fused, _ = after_straight_steps(40, small).fuse(slide, small)
     assert np.rad2deg(np.arcsin(fused.direction[0])) > 19.0
 
 
-def test_a_prior_learns_only_where_it_is_told_of_a_step() -> None:
+def test_a_prior_changes_only_by_an_added_step() -> None:
     prior = after_straight_steps(40, covariance())
     slide = UnitRelativePose(rotation_of(0.0), heading(np.deg2rad(1.0)))
     first, _ = prior.fuse(slide, covariance())

@@ -1,4 +1,4 @@
-"""A motion keeps its rotation and direction when its length or its rotation comes from elsewhere."""
+"""A motion keeps its rotation and direction when its length is replaced, and its translation when the rotation is."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_another_length_keeps_rotation_and_direction() -> None:
     np.testing.assert_array_equal(motion.relative_pose.T_from_to, T_PREVIOUS_CURRENT)
 
 
-def test_a_motion_without_a_direction_of_its_own_takes_no_other_length() -> None:
-    with pytest.raises(ValueError, match="by pnp has no direction"):
+def test_a_motion_without_separate_direction_noise_accepts_no_other_length() -> None:
+    with pytest.raises(ValueError, match="by pnp has no separate noise"):
         motion_by_points().with_length(1.0, 0.03, 0.09, NO_NOISE)
 
 
@@ -62,7 +62,7 @@ def test_further_noise_adds_in_squares_to_that_of_the_corners() -> None:
     assert noisier[5] == pytest.approx(own[5], rel=0.02)
 
 
-def test_another_rotation_keeps_the_translation_as_the_current_camera_sees_it() -> None:
+def test_another_rotation_keeps_the_translation_in_the_current_camera() -> None:
     R = se3.from_rotation_vector(np.array([0.02, -0.01, 0.03]), np.zeros(3))[:3, :3]
     rotated = triangulated_motion().with_rotation(R)
     T_current_previous = se3.invert(rotated.relative_pose.T_from_to)

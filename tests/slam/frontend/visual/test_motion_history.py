@@ -1,4 +1,4 @@
-"""What accepted motions say of the next one."""
+"""The motion prior from accepted motions."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_sigmas_are_tight_in_rotation_and_direction_and_loose_in_length(texture)
     assert 0.05 <= z < 0.15
 
 
-def test_length_withstands_wrong_depth_and_a_driving_car(texture):
+def test_length_is_robust_to_wrong_depth_and_a_moving_car(texture):
     truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
 
     def spoil(depth):
@@ -154,7 +154,7 @@ def test_far_depth_is_not_trusted(texture):
     assert isinstance(failure, MeasurementFailure)
 
 
-def test_the_answer_is_the_same_every_time(texture):
+def test_measurements_are_reproducible(texture):
     truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     one, other = pose_of(measure(truth, texture)), pose_of(measure(truth, texture))
     np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
@@ -196,7 +196,7 @@ def test_a_rotation_across_two_steps_is_measured_in_its_two_images(texture):
     assert odometry.relative_rotation(first[0], last[0], first[1], np.eye(4))() is None  # a camera that stood
 
 
-def test_track_ids_tie_the_lengths_of_neighbouring_steps(texture):
+def test_track_ids_link_the_lengths_of_neighbouring_steps(texture):
     """Learned depth that changes its unit between frames does not enter the ratio of lengths."""
     steps = (1.0, 1.4, 0.7, 0.7)
     frames, _ = drive(texture, (0.0, 1.0, 0.0), steps)
@@ -212,7 +212,7 @@ def test_track_ids_tie_the_lengths_of_neighbouring_steps(texture):
         assert 0 < ratio[1] < 0.01
 
 
-def test_a_length_from_elsewhere_makes_the_motion_true(texture):
+def test_the_true_length_makes_the_motion_true(texture):
     truth = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 1.0]))
     motion = measure(truth, texture, lambda depth: 2.0 * depth)
     assert isinstance(motion, Motion)
@@ -228,7 +228,7 @@ def test_a_length_from_elsewhere_makes_the_motion_true(texture):
         still.with_length(1.0, 0.03, 0.09, NO_NOISE)
 
 
-def test_a_motion_that_is_refused_teaches_neither_history_nor_dynamic_mask(texture):
+def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):
     """Corners agree on a motion, but too few of them have a depth near enough to be trusted for its length."""
     frames, _ = drive(texture)
     odometry = VisualOdometry(CONFIG, CAMERA)
@@ -247,7 +247,7 @@ def test_a_motion_that_is_refused_teaches_neither_history_nor_dynamic_mask(textu
     assert accepted.state().dynamic_mask.corners.sum() > before.dynamic_mask.corners.sum()
 
 
-def test_only_the_first_motion_to_a_frame_is_learned_from(texture):
+def test_only_the_first_motion_to_a_frame_updates_the_state(texture):
     frames, _ = drive(texture)
     odometry = VisualOdometry(CONFIG, CAMERA)
     for k in (1, 2):
@@ -295,7 +295,7 @@ def test_a_step_that_failed_predicts_no_flow(texture):
     assert predictions(texture, steps, failing={(2, 3)}) == expected
 
 
-def test_odometry_goes_on_from_its_state_as_if_there_had_been_no_pause(texture):
+def test_odometry_resumes_from_its_state_without_a_difference(texture):
     frames, _ = drive(texture, (0.0, 1.0, 0.0))
     steps = [(a[0], b[0], a[1]) for a, b in itertools.pairwise(frames)]
     whole = VisualOdometry(CONFIG, CAMERA)

@@ -33,7 +33,7 @@ def moved(pixels: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    """A road with texture as fine near as far, seen from two places; it is the plane that both images show."""
+    """A road with texture as fine near as far, seen from two positions."""
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.integers(0, 255, (1024, 1024)).astype(np.float32), (0, 0), 1.2)
     depth = np.nan_to_num(road_depth(), nan=1e6)
@@ -56,7 +56,7 @@ def predicted_flow(length: float = LENGTH) -> PredictedFlow:
     return PredictedFlow(FORWARDS, length, road_depth(), CAMERA)
 
 
-def test_an_image_warped_back_by_the_right_flow_looks_like_the_earlier_one(frames):
+def test_an_image_warped_back_by_the_right_flow_correlates_with_the_earlier_one(frames):
     first, second = (frame.grey for frame in frames)
     near = np.s_[60:95, 80:240]
     warped = predicted_flow().warp_back(second)
@@ -97,8 +97,8 @@ def test_corners_on_the_road_are_tracked_through_the_predicted_flow(frames):
     assert abs(np.median(predicted[:, 1])) < 0.15
 
 
-def test_a_wrong_prediction_does_no_harm(frames):
-    """A flow predicted for a camera that in truth stands loses against the windows as they are."""
+def test_a_wrong_prediction_is_not_used(frames):
+    """Of a standing camera, windows of the image as it is have a smaller difference than warped ones."""
     config = GeometryConfig()
     still = [frames[0], Frame(1, 0.1, frames[0].image)]
     tracks = CornerTracker(config).track(*still, predicted_flow())

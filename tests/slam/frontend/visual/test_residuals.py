@@ -1,4 +1,4 @@
-"""Residuals across and along epipolar lines, and their slopes by finite differences."""
+"""Residuals across and along epipolar lines, and their derivatives by finite differences."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_across_is_the_sampson_distance_of_the_essential_matrix(unit_pose: UnitR
     assert len(set(np.sign(across) * np.sign(expected))) == 1
 
 
-def test_along_is_how_far_a_corner_lies_behind_where_its_depth_puts_it(unit_pose: UnitRelativePose):
+def test_along_is_the_distance_to_the_point_predicted_by_depth(unit_pose: UnitRelativePose):
     """Corners moved along their lines by what is then found; across them nothing counts."""
     previous, _, depth = rays()
     points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
@@ -63,7 +63,7 @@ def test_along_is_how_far_a_corner_lies_behind_where_its_depth_puts_it(unit_pose
     np.testing.assert_allclose(shift_px[1:], expected[1:], rtol=1e-9)
 
 
-def test_slopes_across_are_those_that_differences_show(unit_pose: UnitRelativePose):
+def test_derivatives_across_are_those_of_finite_differences(unit_pose: UnitRelativePose):
     """With corners far off their lines, where the change of the gradient's norm counts."""
     residuals, tangent = Residuals(*rays(), FOCAL_PX), tangent_of(unit_pose.direction)
     _, slopes = residuals.across(unit_pose, tangent)
@@ -73,8 +73,8 @@ def test_slopes_across_are_those_that_differences_show(unit_pose: UnitRelativePo
         np.testing.assert_allclose((ahead - behind) / 2e-6, slopes[k], atol=1e-8 * FOCAL_PX)
 
 
-def test_slopes_along_are_those_that_differences_show(unit_pose: UnitRelativePose):
-    """Of corners on their lines, where the line's own turning does not count; a corner of unknown depth is left out."""
+def test_derivatives_along_are_those_of_finite_differences(unit_pose: UnitRelativePose):
+    """Corners on their lines, where the rotation of the line has no effect; a corner of unknown depth is left out."""
     previous, _, depth = rays()
     points = se3.apply(se3.make(unit_pose.R_current_previous, LENGTH * unit_pose.direction), previous * depth[:, None])
     residuals, tangent = Residuals(previous, points / points[:, 2:], depth, FOCAL_PX), tangent_of(unit_pose.direction)

@@ -30,7 +30,7 @@ def rotations(jitter_rad: np.ndarray, count: int = 400) -> dict[int, np.ndarray]
     return dict(enumerate(turns(jitter_rad, count)))
 
 
-def test_jitter_is_what_a_smooth_motion_does_not_explain():
+def test_jitter_is_the_residual_to_a_smooth_motion():
     jitter_rad = np.array([1e-3, 2e-4, 5e-4])
     np.testing.assert_allclose(rotation_jitter(rotations(jitter_rad)), jitter_rad, rtol=0.2)
     assert rotation_jitter(rotations(np.zeros(3))).max() < 1e-5
@@ -75,13 +75,13 @@ def test_sharp_turns_and_jumps_widen_their_own_steps():
     smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
     jumping = smooth.copy()
     jumping[30, 0] += np.deg2rad(1.0)
-    before, after = (inflate_step_sigmas(steps(turned), own(60), CONFIG) for turned in (smooth, jumping))
+    before, after = (inflate_step_sigmas(steps(drive), own(60), CONFIG) for drive in (smooth, jumping))
     assert before[16].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[16, 1], rel=0.1)
     assert after[30].rotation[0] == pytest.approx(CONFIG.neighbour_rotation_ratio * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
 
 
-def test_noise_that_corners_explain_is_not_counted_twice():
+def test_noise_explained_by_corners_is_not_counted_twice():
     jittery = steps(turns(np.full(3, 1e-3)))
     alone, known = (inflate_step_sigmas(jittery, own(400, sigma), CONFIG) for sigma in (0.0, 1.5e-3))
     pitch = [step.rotation[0] for step in known.values()]

@@ -80,7 +80,7 @@ def test_corners_are_tracked_across_two_frames_through_the_predicted_flow(frames
     assert np.median(error) < 0.02 and error.max() < 0.5
 
 
-def test_corners_that_were_not_tracked_on_are_not_tracked_across(frames):
+def test_lost_corners_are_not_tracked_across(frames):
     camera = Intrinsics(200, 120, 100.0, 100.0, 100.0, 60.0)
     nothing = PredictedFlow(
         UnitRelativePose(np.eye(3), np.array([0.0, 0.0, -1.0])), 0.0, np.ones((120, 200), np.float32), camera
@@ -88,7 +88,7 @@ def test_corners_that_were_not_tracked_on_are_not_tracked_across(frames):
     assert len(CornerTracker(CONFIG).track_across(frames[0], frames[2], nothing)().track_ids) == 0
 
 
-def test_a_tracker_goes_on_from_its_state(frames):
+def test_a_tracker_resumes_from_its_state(frames):
     whole, first = CornerTracker(CONFIG), CornerTracker(CONFIG)
     for k in range(3):
         whole.track(frames[k], frames[k + 1])

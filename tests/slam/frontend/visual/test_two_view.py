@@ -1,4 +1,4 @@
-"""The motion that corners, learned depth and the drive so far agree on."""
+"""The motion between two views from corners, learned depth and the motion prior."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def angle_deg(R_a: np.ndarray, R_b: np.ndarray) -> float:
 
 
 def test_a_car_that_turns_with_the_camera_is_no_part_of_the_static_scene():
-    """Of one step without history: consensus alone is wrong nearly always, the estimator one time in four."""
+    """One step without history: RANSAC alone is wrong nearly always, the estimator in one of four cases."""
     by_essential, errors_deg, of_car, of_scene = [], [], [], []
     for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
@@ -85,7 +85,7 @@ def test_a_wrong_unit_and_unknown_depths_do_not_matter():
 
 
 def test_corners_of_low_weight_do_not_change_the_motion():
-    """Most depths are unknown here, so that only their weights tell the car's corners from the scene's."""
+    """Most depths are unknown here, so that only weights separate the car's corners from the scene's."""
     for seed in range(6):
         matches, T_current_previous = corner_with_a_car(seed)
         weights = np.where(np.arange(len(matches.weights)) < CAR, 0.001, 1.0)
@@ -106,7 +106,7 @@ def test_a_known_motion_is_refined():
     assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
 
 
-def test_the_estimator_learns_nothing_by_itself():
+def test_the_estimator_has_no_state():
     """A step whose history is not kept changes no later one."""
     estimator = TwoViewEstimator(CONFIG, FOCAL_PX)
     first, second = (corner_with_a_car(seed)[0] for seed in (0, 1))
@@ -137,8 +137,8 @@ def test_the_history_of_a_drive_chooses_between_motions():
     assert (with_history < 0.3).sum() > (without < 0.3).sum() and (with_history < 0.3).mean() > 0.9
 
 
-def test_a_step_is_learned_as_measured_and_returned_as_fused():
-    """The heading prior must not learn from its own predictions."""
+def test_a_step_enters_the_history_as_measured_and_is_returned_as_fused():
+    """The heading prior must not be fitted to its own predictions."""
     history = NO_HISTORY
     for k in range(30):
         ahead = UnitRelativePose(np.eye(3), np.array([0.07 + 0.01 * (-1) ** k, 0.0, -1.0]) / np.hypot(0.07, 1.0))
@@ -152,7 +152,7 @@ def test_a_step_is_learned_as_measured_and_returned_as_fused():
 
 
 def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
-    """In both consensus methods; a seed is part of what their cached answers depend on."""
+    """In both RANSAC methods; the seed is part of their cache keys."""
     matches, _ = corner_with_a_car(3)
 
     def drawn(seed: int) -> dict[str, tuple[bytes, str]]:
@@ -174,7 +174,7 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
         assert len(set(poses)) > 1 and len(set(settings)) == 4
 
 
-def test_nothing_in_common_is_no_motion():
+def test_without_common_points_there_is_no_motion():
     rng = np.random.default_rng(0)
     rays = [np.column_stack([rng.uniform(-0.8, 0.8, (12, 2)), np.ones(12)]) for _ in range(2)]
     matches = Matches(*rays, np.full(12, np.nan), np.ones(12))

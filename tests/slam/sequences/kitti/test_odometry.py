@@ -152,7 +152,7 @@ def test_broken_sequences(tmp_path: Path, odometry, what: str, message: str) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_damage_further_on_is_heard_when_read(tmp_path: Path, odometry) -> None:
+def test_later_damage_is_an_error_when_read(tmp_path: Path, odometry) -> None:
     folder = odometry(tmp_path)
     path = folder / "image_2/000004.png"
     path.write_bytes(path.read_bytes()[:40])

@@ -34,7 +34,7 @@ def test_a_step_north_and_east_in_metres() -> None:
     assert t[2] - t[0] == pytest.approx([6378137 * np.deg2rad(step) * np.cos(np.deg2rad(49)), 0, 0], abs=1e-5)
 
 
-def test_packets_are_carried_to_their_image() -> None:
+def test_packets_are_extrapolated_to_their_image() -> None:
     moving = packet(vn=1.0, ve=2.0, vu=3.0, wz=0.5)[None]
     T = oxts.T_world_imu(np.concatenate([moving, moving]), np.array([0.0, 0.01]))
     assert T[1, :3, 3] - T[0, :3, 3] == pytest.approx([0.02, 0.01, 0.03])

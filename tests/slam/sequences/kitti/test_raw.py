@@ -40,9 +40,9 @@ def write_drive(root: Path, late_s: float = 0.0, name: str = NAME) -> Path:
     lat0, speed = 49.0, 10 / np.sqrt(2)
     for k in range(FRAMES):
         cv2.imwrite(str(drive / f"image_02/data/{k:010d}.png"), np.full((24, 40, 3), k, np.uint8))
-        way = speed * (0.1 * k + late_s)
+        distance = speed * (0.1 * k + late_s)
         row = np.zeros(30)
-        row[:3] = lat0 + way / metres, 8.0 + way / metres / np.cos(np.deg2rad(lat0)), 100
+        row[:3] = lat0 + distance / metres, 8.0 + distance / metres / np.cos(np.deg2rad(lat0)), 100
         row[5:8] = np.pi / 4, speed, speed
         (drive / f"oxts/data/{k:010d}.txt").write_text(" ".join(f"{x:.14g}" for x in row))
     (drive / "velodyne_points/data/0000000002.bin").write_bytes(b"")

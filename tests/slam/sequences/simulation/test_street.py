@@ -32,7 +32,7 @@ def path_of(street: SimulatedStreet) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def revisited(street: SimulatedStreet, within_m: float = 3.0) -> tuple[float, float]:
-    """Metres driven where the camera has been before, the same way and the other way round."""
+    """Metres driven again, in the same and in the opposite direction."""
     ground, travelled, heading = path_of(street)
     same = opposite = 0.0
     for k in range(1, len(ground)):
@@ -46,7 +46,7 @@ def revisited(street: SimulatedStreet, within_m: float = 3.0) -> tuple[float, fl
 
 
 def warp_error(street: SimulatedStreet, target: int, source: int) -> tuple[float, float]:
-    """Median photometric error of the source warped onto the target by truth, and of no warp at all."""
+    """Median photometric error of the source warped to the target by ground truth, and without a warp."""
     a, b = street.render(target), street.render(source)
     height, width = a.depth.shape
     v, u = np.mgrid[0:height, 0:width]
@@ -79,7 +79,7 @@ def test_poses_are_rigid_and_start_at_the_world(route: str) -> None:
 
 @pytest.mark.parametrize("frames", [250, 300, 800])
 @pytest.mark.parametrize("seed", [703, 704])
-def test_loop_meets_its_start_and_turns_both_ways(frames: int, seed: int) -> None:
+def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int) -> None:
     street = SimulatedStreet(SimulationOptions("loop", frames, seed))
     assert revisited(street)[0] >= 60.0
     ground, travelled, heading = path_of(street)
@@ -88,7 +88,7 @@ def test_loop_meets_its_start_and_turns_both_ways(frames: int, seed: int) -> Non
     assert np.linalg.norm(ground - ground[0], axis=1)[travelled > 60].min() < 1.0
 
 
-def test_grid_is_driven_again_both_ways() -> None:
+def test_grid_is_revisited_in_both_directions() -> None:
     again = np.array([revisited(SimulatedStreet(SimulationOptions("grid", 800, s)), 5.5) for s in (705, 706)])
     assert (again[:, 0] > 20.0).all() and (again[:, 1] > 20.0).all()
 
@@ -200,9 +200,9 @@ def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
 
 def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
     street = SimulatedStreet(SimulationOptions("straight", 3, 712, **SMALL))
-    root, told = tmp_path / "deep" / "world", []
-    write_kitti_root(street, root, depth=True, lidar=True, progress=told.append)
-    assert told == [1, 2, 3]
+    root, written = tmp_path / "deep" / "world", []
+    write_kitti_root(street, root, depth=True, lidar=True, progress=written.append)
+    assert written == [1, 2, 3]
     assert sorted(p.name for p in root.iterdir()) == ["camera.yaml", "poses", "sequences", "simulation.json"]
     sequence, frame = root / "sequences" / "sim", street.render(2)
     assert np.array_equal(cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image)
@@ -246,7 +246,7 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
         ({"route": "straight", "frames": 1}, "at least 2"),
     ],
 )
-def test_options_that_mean_nothing_are_refused(change: dict[str, object], says: str) -> None:
+def test_invalid_options_are_refused(change: dict[str, object], says: str) -> None:
     options = {"route": "loop", "frames": 300, "seed": 0, "width": 416, "height": 128, "hazards": ""} | change
     with pytest.raises(SequenceError, match=says):
         SimulatedStreet(parse_options(**options))  # type: ignore[arg-type]

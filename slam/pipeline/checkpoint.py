@@ -1,6 +1,6 @@
 """A checkpoint of a session on disk: all measurements of a drive so far, without its images.
 
-The frames that follow are measured as without an interruption. Lengths, noise, loops and graph are then computed anew
+The frames that follow are measured as without an interruption. Lengths, noise, loops and graph are then computed again
 for the whole drive (``docs/design/storage-and-sessions.md``).
 """
 

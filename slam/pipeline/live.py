@@ -29,7 +29,7 @@ from slam.trajectory import Trajectory
 class Slam:
     """Monocular SLAM frame by frame; it keeps no images and makes no map.
 
-    Measurements are those of the pipeline, causally. Lengths and noise are estimated anew as the drive goes on, so
+    Measurements are those of the pipeline, causally. Lengths and noise are estimated again as the drive goes on, so
     earlier poses move a little with every update.
     """
 
@@ -163,7 +163,7 @@ class Slam:
         write_atomically(Path(path), checkpoint.write)
 
     def resume(self, path: str | Path) -> None:
-        """Continue after the last frame of a file by `save`, as without an interruption; loops are searched anew.
+        """Continue after the last frame of a file by `save`, as without an interruption; loops are searched again.
 
         Raises:
             SlamError: there are frames already, or the file is missing, damaged or of another camera or other weights.

@@ -86,7 +86,7 @@ def test_twelve_bits_in_sixteen(refusal: Refusal, tmp_path: Path, weights: Path)
 
 @pytest.mark.parametrize(
     ("line", "words"),
-    [("fx: 100", "key 'fx' stands twice"), ("camera_height: 1", "key camera_height is unknown")],
+    [("fx: 100", "duplicate key 'fx'"), ("camera_height: 1", "key camera_height is unknown")],
 )
 def test_a_camera_file_with_unknown_or_duplicate_keys(
     refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str

@@ -74,7 +74,7 @@ def test_wrong_override_is_one_clear_line(override, parts):
     [
         ("- 1\n", "sections"),
         ("mapping: {enabled: true\n", "YAML"),
-        ("mapping: {enabled: true, enabled: false}\n", "twice"),
+        ("mapping: {enabled: true, enabled: false}\n", "duplicate key 'enabled'"),
         ("maping: {}\n", "did you mean 'mapping'"),
     ],
 )

@@ -52,7 +52,7 @@ def test_malformed_runs(name: str) -> None:
         ("- a", "all of it: Input should be a valid dictionary"),
         ("test: [", "is not YAML"),
         ("test: " + "[" * 3000, "nested levels"),
-        ("test: [a]\ntest: [b]", "key 'test' stands twice"),
+        ("test: [a]\ntest: [b]", "duplicate key 'test'"),
     ],
 )
 def test_malformed_split_files(tmp_path: Path, text: str, words: str) -> None:

@@ -91,7 +91,7 @@ def test_is_frozen() -> None:
         ("fx: 30", "fx: 3", "fx: 3 is no focal length in pixels of 40x24 images: .* between 4 and 800"),
         ("fy: 30", "fy: 900", "fy: 900 is no focal length in pixels of 40x24 images"),
         ("cy: 12", "cy: 24", r"\(20, 24\) lies outside the 40x24 image"),
-        ("fps: 5", "fps: 5\nfx: 31", "key 'fx' stands twice"),
+        ("fps: 5", "fps: 5\nfx: 31", "duplicate key 'fx'"),
     ],
 )
 def test_impossible_cameras_are_refused_in_one_line(

@@ -105,7 +105,7 @@ def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kit
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("width:", "width: 208\nwidth:", "key 'width' stands twice"),
+        ("width:", "width: 208\nwidth:", "duplicate key 'width'"),
         ("fx: ", "fx: 1 # ", "fx: 1 is no focal length in pixels of 208x64 images"),
         ("width: 208", "width: 416", "are 208x64, but the camera file is for 416x64"),
     ],

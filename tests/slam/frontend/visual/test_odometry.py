@@ -224,7 +224,7 @@ def test_the_true_length_makes_the_motion_true(texture):
     assert 0.03 <= metric.sigmas[5] < 0.035
     still = measure(np.eye(4), texture)
     assert isinstance(still, Motion)
-    with pytest.raises(ValueError, match="by still has no direction"):
+    with pytest.raises(ValueError, match="motion by still has no separate noise of its direction"):
         still.with_length(1.0, 0.03, 0.09, NO_NOISE)
 
 

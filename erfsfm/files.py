@@ -32,6 +32,8 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
         if sync:
             _sync(partial)
         partial.replace(path)
+    except OSError as cause:
+        raise OSError(f"{path}: cannot be written ({cause.strerror or cause})") from cause
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -71,7 +71,8 @@ def read_ply(path: Path) -> Ply:
         _check(ply)
         return ply
     except (OSError, ValueError, KeyError, IndexError, TypeError, StopIteration) as error:
-        raise RunError(f"{path} is no PLY that can be read ({error}): run the sequence again") from error
+        reason = str(error) or "it ends within its header"
+        raise RunError(f"{path} is no PLY that can be read ({reason}): run the sequence again") from error
 
 
 def read_ply_points(path: Path) -> tuple[FloatArray, NDArray[np.uint8]]:

@@ -130,6 +130,7 @@ class SlamPipeline:
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
+        self._warn_of_a_frozen_end(observations, state)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
         graph, T_optimised = self._optimise(measured.factors, loops, measured.T_odometry)
@@ -241,7 +242,35 @@ class SlamPipeline:
                     frame = next(frames)
                 observer.add(index, frame)
                 self._progress("frames", index + 1, total)
-            return observer.closed(), observer.state()
+            closed = observer.closed()
+            if checkpoint is not None:
+                self._warn_of_another_place(closed, first)
+            return closed, observer.state()
+
+    def _warn_of_a_frozen_end(self, seen: ClosedObservations, state: ObserverState) -> None:
+        """No new image shows whether the camera stood or the video froze."""
+        end = len(self._sequence) - 1
+        for first, last in runs(state.seen.repeated):
+            if last == end and end not in seen.interpolated:
+                logger.warning(
+                    "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "
+                    "froze, leave them out with --frames",
+                    first,
+                    last,
+                    first - 1,
+                )
+
+    def _warn_of_another_place(self, seen: ClosedObservations, first: int) -> None:
+        """Copies of other recordings under the same name, and folders, are known by their first image alone."""
+        for start, end, reason in seen.failures:
+            if (start, end) == (first - 1, first) and first not in seen.interpolated:
+                logger.warning(
+                    "frame %d, the first that follows, does not match frame %d (%s): make sure that it was taken "
+                    "right after it on the same drive",
+                    end,
+                    start,
+                    reason,
+                )
 
     def _find_scale(
         self,

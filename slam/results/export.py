@@ -80,7 +80,7 @@ def _export_ply(source: Path, output: Path, up: str) -> None:
 def _export_trajectory(folder: RunFolder, output: Path, up: str) -> None:
     trajectory = _trajectory(folder, up)
     write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
-    write_atomically(output, lambda path: write(path, trajectory), RunError)
+    write(output, trajectory)
 
 
 def _export_colmap(folder: RunFolder, output: Path, up: str) -> None:

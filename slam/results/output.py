@@ -9,12 +9,13 @@ import json
 import logging
 import os
 import re
+import shutil
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from erfsfm.files import unfinished_name
+from erfsfm.files import unfinished_name, write_atomically
 from slam.errors import RunError
 
 logger = logging.getLogger(__name__)
@@ -74,13 +75,14 @@ def claim(output: Path) -> Path:
 def replace_run(output: Path, place: Path) -> None:
     """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
 
-    ``metrics.json`` is removed first, and old files before new ones are moved: no reader sees parts of both as one run.
+    Old files are removed before new ones are moved. Both folders have a ``metrics.json`` until the end, so that the next run knows
+    them as runs and replaces them, wherever this was interrupted.
     """
-    (place / METRICS).replace(output / METRICS)
+    write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
     for path in _files(output):
         if path.name != METRICS:
             path.unlink()
-    for path in _files(place):
+    for path in sorted(_files(place), key=lambda path: path.name == METRICS):
         path.replace(output / path.name)
     with suppress(OSError):  # it holds other files
         place.rmdir()
@@ -91,13 +93,22 @@ def stamped(results: Path, sequence: str) -> Path:
     safe = re.sub(r"[^\w.-]+", "-", sequence)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = results / f"{stamp}_{safe}"
+    results.mkdir(parents=True, exist_ok=True)
     number = 1
-    while path.exists():
+    while not _made(path):
         number += 1
         path = results / f"{stamp}-{number}_{safe}"
-    path.mkdir(parents=True)
     _link(results / "latest", path)
     return path
+
+
+def _made(path: Path) -> bool:
+    """Make a folder, unless it is there: another run may begin in the same second."""
+    try:
+        path.mkdir()
+    except FileExistsError:
+        return False
+    return True
 
 
 def _is_run(metrics: Path) -> bool:
@@ -106,7 +117,10 @@ def _is_run(metrics: Path) -> bool:
         content: Any = json.loads(metrics.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    return isinstance(content, dict) and {"schema", "status", "provenance"} <= set(content)
+    if not isinstance(content, dict) or not {"schema", "status"} <= set(content):
+        return False
+    provenance = content.get("provenance")
+    return isinstance(provenance, dict) and "weights_sha256" in provenance
 
 
 def _is_rest(path: Path) -> bool:

@@ -20,4 +20,4 @@ def write_atomically(
     try:
         files.write_atomically(path, fill, sync)
     except OSError as cause:
-        raise error(f"{path}: cannot be written ({cause.strerror or cause})") from cause
+        raise error(str(cause)) from cause

@@ -200,7 +200,9 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
     run = ("run", "--dataset", quick["dataset"], "--weights", quick["weights"], "--set", "mapping.enabled=false")
     for numbers in ("estimated", "running", "absent"):
         if numbers == "running":
-            (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {}}')
+            (output / "metrics.json").write_text(
+                '{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}'
+            )
         elif numbers == "absent":
             (output / "metrics.json").unlink()
         caplog.clear()
@@ -212,7 +214,7 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
         assert entry["status"] != "ok" and entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
     assert call("localize", images / "000003.png", "--map", output) == 0
     assert call(*run, "--continue", output, "--frames", "8:10", "--output", tmp_path / "on") == 0
-    (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {}}')
+    (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
     assert call(*run, "--frames", "0:8", "--output", output) == 0
     assert RunFolder.open(output).metrics()["status"] == "ok"
 

@@ -44,10 +44,18 @@ def test_text_with_faces_and_no_colours(tmp_path: Path) -> None:
     assert (colours == 128).all()
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"ply\nformat binary_big_endian 1.0\nend_header\n"])
-def test_what_is_no_ply_is_one_error(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"", "it ends within its header"),
+        (b"ply\n", "it ends within its header"),
+        (b"PK\x03\x04", ".+"),
+        (b"ply\nformat binary_big_endian 1.0\nend_header\n", "its format is binary_big_endian"),
+    ],
+)
+def test_what_is_no_ply_is_one_error(tmp_path: Path, content: bytes, why: str) -> None:
     (tmp_path / "c.ply").write_bytes(content)
-    with pytest.raises(RunError, match=r"c\.ply is no PLY that can be read"):
+    with pytest.raises(RunError, match=rf"c\.ply is no PLY that can be read \({why}\)"):
         read_ply_points(tmp_path / "c.ply")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import RunError
+from slam.errors import RunError, TrajectoryError
 from slam.formats.ply import read_ply_points
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
@@ -102,6 +102,7 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
         ("graph", "out.g2o", "z", "leave --up out"),
         ("mesh", "", "y-down", "is a folder"),
         ("graph", "file/out.g2o", "y-down", "cannot be written"),
+        ("trajectory", "file/out.tum", "y-down", r"target/file/out\.tum: cannot be written"),
     ],
 )
 def test_errors_are_clear_and_leave_nothing(
@@ -111,7 +112,7 @@ def test_errors_are_clear_and_leave_nothing(
     target = tmp_path / "target"
     target.mkdir()
     (target / "file").write_text("in the way")
-    with pytest.raises(RunError, match=why):
+    with pytest.raises((RunError, TrajectoryError), match=why):
         export(folder, what, target / name, up)
     assert [path.name for path in target.iterdir()] == ["file"]
 

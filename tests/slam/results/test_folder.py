@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
 def begin(output: Path) -> RunFolder:
     """A new run into ``output``, before it has a trajectory."""
     folder = RunFolder.create(output, output.parent, "sim")
-    folder.write_metrics({"schema": 1, "status": "running", "provenance": {}})
+    folder.write_metrics({"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}})
     return folder
 
 
@@ -77,6 +78,37 @@ def test_something_else_called_unfinished_is_left_alone(make_run: MakeRun) -> No
     assert contents(old) == before and (old / "unfinished" / "thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize("moved", range(4))
+def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
+    make_run: MakeRun, monkeypatch: pytest.MonkeyPatch, moved: int
+) -> None:
+    old = make_run("mine").path
+    new = begin(old)
+    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    replace, calls = Path.replace, iter(range(moved))
+
+    def killed_later(path: Path, target: Path) -> Path:
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return replace(path, target)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "replace", killed_later)
+        new.publish()
+    assert RunFolder.open(old).metrics()["status"] in ("ok", "running")
+    again = begin(old)
+    again.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    again.publish()
+    own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
+    assert {path.name for path in old.iterdir()} == own
+
+
+def test_runs_that_begin_in_the_same_second_get_a_folder_each(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: RunFolder.create(None, tmp_path, "sim").path, range(32)))
+    assert len(set(folders)) == 32 and all(path.is_dir() for path in folders)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -84,6 +116,8 @@ def test_something_else_called_unfinished_is_left_alone(make_run: MakeRun) -> No
         ("metrics.json", '{"accuracy": 0.9}'),
         ("metrics.json", '{"schema": '),
         ("metrics.json", "[1]"),
+        ("metrics.json", '{"schema": 3, "status": "ok", "provenance": "another tool"}'),
+        ("metrics.json", '{"schema": 1, "status": "ok", "provenance": {"tool": "another"}}'),
         ("map_mesh.ply", "ply"),
         ("run.log", "..."),
     ],
@@ -99,7 +133,9 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplo
     folder = make_run()
     RunFolder.open(folder.path)
     assert caplog.records == []
-    folder.write_metrics({"schema": 1, "status": "failed", "reason": "no space", "provenance": {}})
+    folder.write_metrics(
+        {"schema": 1, "status": "failed", "reason": "no space", "provenance": {"weights_sha256": "00"}}
+    )
     RunFolder.open(folder.path)
     assert [record.getMessage() for record in caplog.records] == [
         f"{folder.path}: no space: files that are there are whole"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from slam.cli import main
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 Call = Callable[..., tuple[int, str]]
 SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]
@@ -134,3 +135,24 @@ def test_a_drive_goes_on_after_a_gap_and_not_with_another_one(tmp_path: Path, ki
     found = metrics(tmp_path / "on")["sequence"]
     assert found["frames"] == 14 and [(gap["first"], gap["last"]) for gap in found["bridged"]] == [(6, 7)]
     assert len(np.loadtxt(tmp_path / "on/trajectory_optimised.tum.txt")) == 14
+
+
+def test_a_copy_of_another_drive_under_the_same_name_is_noticed(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+    root = write_kitti(tmp_path / "root", "00", kitti_root)
+    options = SimulationOptions(route="straight", frames=14, seed=1002, width=208, height=64)
+    write_kitti_root(SimulatedStreet(options), tmp_path / "street")
+    other = write_kitti(tmp_path / "other", "00", tmp_path / "street")
+    assert run("--dataset", root, "--sequence", "00", "--frames", "0:6", "--output", "begun")[0] == 0
+    for dataset, lines in ((other, 1), (root, 0)):
+        following = ("--dataset", dataset, "--sequence", "00", "--frames", "6:")
+        code, err = run(*following, "--continue", "begun", "--output", f"on_{dataset.name}")
+        assert code == 0 and err.count("frame 6, the first that follows, does not match frame 5 (") == lines
+
+
+def test_a_recording_that_ends_frozen_is_reported(tmp_path: Path, kitti_root: Path, run: Call) -> None:
+    root = write_kitti(tmp_path / "root", "00", kitti_root)
+    images = root / "sequences/00/image_2"
+    for k in range(10, 14):
+        shutil.copy(images / "000009.png", images / f"{k:06d}.png")
+    code, err = run("--dataset", root, "--sequence", "00", "--output", "out")
+    assert code == 0 and "frames 10 to 13, the last ones, repeat frame 9: the camera is taken to stand" in err

@@ -75,8 +75,8 @@ def claim(output: Path) -> Path:
 def replace_run(output: Path, place: Path) -> None:
     """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
 
-    Old files are removed before new ones are moved. Both folders have a ``metrics.json`` until the end, so that the next run knows
-    them as runs and replaces them, wherever this was interrupted.
+    Old files are removed before new ones are moved. Both folders have a ``metrics.json`` until the end, so that the
+    next run recognises them as runs and replaces them, wherever this was interrupted.
     """
     write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
     for path in _files(output):

@@ -152,6 +152,12 @@ def _trainer(
     if on_cpu and precision == "16-mixed":
         logger.warning("training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU")
         precision = "bf16-mixed"
+    if on_cpu and precision == "bf16-mixed" and max(config.network.height, config.network.width) <= 64:
+        # PyTorch 2.13 leaves gradients of its bfloat16 convolutions uninitialised where the feature map is one pixel
+        raise ConfigError(
+            f"training.precision {training.precision} on a CPU needs images of more than 64 pixels in one direction; "
+            f"got {config.network.height}x{config.network.width}: set training.precision=32-true"
+        )
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     latest = ModelCheckpoint(
         output / "checkpoints",

@@ -31,6 +31,7 @@ from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]
+FOR_BFLOAT16 = {"height": 64, "width": 128}  # feature maps of more than one pixel
 
 
 @pytest.fixture(autouse=True)
@@ -643,8 +644,7 @@ def test_licence_of(seen: list[str], licence: str) -> None:
 
 @pytest.mark.parametrize("precision", ["bf16-mixed"])
 def test_mixed_precision_trains(small: Small, world: Path, held_out: Path, tmp_path: Path, precision: str) -> None:
-    # where a map of features is one pixel, PyTorch 2.13's gradients of its bfloat16 kernels on a CPU are uninitialised
-    small["network"] |= {"height": 64, "width": 128}
+    small["network"] |= FOR_BFLOAT16
     config = configure(small, [world, held_out], training={"precision": precision, "steps": 2})
     output = train(config, tmp_path / "run", device="cpu")
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
@@ -653,11 +653,20 @@ def test_mixed_precision_trains(small: Small, world: Path, held_out: Path, tmp_p
 def test_half_precision_on_a_cpu_is_announced(
     small: Small, world: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    small["network"] |= FOR_BFLOAT16
     with caplog.at_level(logging.WARNING):
         train(configure(small, [world], training={"precision": "16-mixed", "steps": 1}), tmp_path / "run", device="cpu")
     assert [r.message for r in caplog.records if "precision" in r.message] == [
         "training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU"
     ]
+
+
+@pytest.mark.parametrize("precision", ["16-mixed", "bf16-mixed"])
+def test_half_precision_of_tiny_images_on_a_cpu_is_refused(
+    small: Small, world: Path, tmp_path: Path, precision: str
+) -> None:
+    with pytest.raises(ConfigError, match="images of more than 64 pixels in one direction; got 32x64"):
+        train(configure(small, [world], training={"precision": precision, "steps": 1}), tmp_path / "run", device="cpu")
 
 
 @pytest.mark.slow  # each process imports torch and Lightning

@@ -222,7 +222,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         call(f"{train} runs/toy")
         call(f"{train} runs/table1-dfc --set network.sources=4")
         for name in ("KITTI", "KITTI_ODOMETRY", "path/to/kitti"):
-            for sequence in ("05", "09"):
+            for sequence in ("05", "06", "09"):
                 shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")
                 Path(name, "poses").mkdir(exist_ok=True)
                 shutil.copy("world/poses/sim.txt", f"{name}/poses/{sequence}.txt")

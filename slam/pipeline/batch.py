@@ -155,9 +155,10 @@ class SlamPipeline:
         T_network = chain_raw(seen.snippets, len(self._sequence))
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
         lidar = self._register_lidar()
+        by_lidar = [] if lidar is None else lidar_steps(lidar, self._config.lidar)
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated)
-        scale = self._find_scale(mode, seen, unscaled, lidar, T_network)
-        factors = self._factors(unscaled, scale, self._lidar_factors(lidar))
+        scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
+        factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])
         return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))
 
     def close_loops(self, views: Sequence[View], measured: Measurements) -> LoopClosures:
@@ -277,12 +278,11 @@ class SlamPipeline:
         mode: ScaleMode,
         seen: ClosedObservations,
         unscaled: Unscaled,
-        lidar: LidarPath | None,
+        by_lidar: Sequence[RelativePose],
         T_network: FloatArray,
     ) -> Scale:
         """The unit of length by the mode, and the lengths of all steps."""
         config, sequence = self._config, self._sequence
-        by_lidar = [] if lidar is None else lidar_steps(lidar, config.lidar)
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
         with self._watch.stage("scale"):
             scale = find_scale(mode, sequence.camera_height_m, measured, config.scale, config.lengths, config.lidar)
@@ -293,9 +293,6 @@ class SlamPipeline:
 
     def _factors(self, unscaled: Unscaled, scale: Scale, by_lidar: Sequence[RelativePose]) -> list[RelativePose]:
         return make_factors(unscaled, scale, by_lidar, self._noise, self._config.frontend, self._config.geometry)
-
-    def _lidar_factors(self, lidar: LidarPath | None) -> list[RelativePose]:
-        return [] if lidar is None or not self._config.lidar.factors else lidar_steps(lidar, self._config.lidar)
 
     def _optimise(
         self, factors: Sequence[RelativePose], loops: LoopClosures, T_odometry: FloatArray

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.files import write_atomically
+from erfsfm.multiview import rays
 from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
-from erfsfm.teacher.two_view import MotionAndDepth, rays, two_view
+from erfsfm.teacher.two_view import MotionAndDepth, two_view
 
 VERSION = 4
 MIN_SNR = 5.0  # inverse depth over its sigma

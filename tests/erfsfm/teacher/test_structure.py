@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from erfsfm.multiview import rays
 from erfsfm.teacher import structure as module
 from erfsfm.teacher.road import on_road, road_plane, under_road
 from erfsfm.teacher.structure import StructureCache, TeacherStructure, measure_structure
-from erfsfm.teacher.two_view import rays, two_view
+from erfsfm.teacher.two_view import two_view
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 

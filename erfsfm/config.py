@@ -113,8 +113,14 @@ class LossConfig(Section):
 
 
 class TeacherConfig(Section):
-    """Pseudo-labels from classical two-view geometry of the same images; off by default."""
+    """Pseudo-labels from classical geometry of the same images; off by default."""
 
+    views: Literal["two", "many"] = Field(
+        default="two",
+        description="two: each snippet by itself; many: poses by the SLAM system, depth from six neighbours",
+    )
+    stride: int = Field(default=2, ge=1, description="every how many frames a label is measured under many views")
+    slam_weights: str = Field(default="sim", description="weights of the SLAM system that gives the poses")
     rotation_weight: float = Field(
         default=0.0, ge=0, description="weight of the rotation error; measured rotations then also warp the images"
     )
@@ -127,12 +133,17 @@ class TeacherConfig(Section):
         ge=0,
         description="weight of the scale error: the depth's unit in heights of the camera above the road",
     )
+    edge_weight: float = Field(
+        default=0.0, ge=0, description="weight of the error of the inverse depth's steps between pixels"
+    )
     alone_steps: int = Field(
         default=0,
         ge=0,
         description="first steps without photometric error, which needs a good initial guess; 0: none",
     )
-    cache: Path | None = Field(default=None, description="cache folder of the measurements")
+    cache: Path | None = Field(
+        default=None, description="folder that keeps the measurements; many views: else OUTPUT/teacher"
+    )
 
     @property
     def weights(self) -> dict[str, float]:
@@ -142,6 +153,7 @@ class TeacherConfig(Section):
             "translation": self.translation_weight,
             "structure": self.structure_weight,
             "unit": self.unit_weight,
+            "edge": self.edge_weight,
         }
         return {name: weight for name, weight in every.items() if weight > 0}
 
@@ -154,8 +166,11 @@ class TrainingConfig(Section):
     devices: int = Field(
         default=1, ge=1, description="GPUs, or processes on a CPU; batch normalisation is synchronised on GPUs alone"
     )
-    networks: Literal["both", "depth"] = Field(
-        default="both", description="trained networks; depth: the pose network keeps its weights"
+    networks: Literal["both", "depth", "pose"] = Field(
+        default="both", description="trained networks; the other one keeps its weights"
+    )
+    frozen_stages: int = Field(
+        default=0, ge=0, le=7, description="first stages of a lite0 encoder that keep their weights, the stem being one"
     )
     optimiser: Literal["adam", "muon"] = Field(
         default="adam", description="muon: orthogonalised steps for convolution kernels, Adam for the rest"
@@ -191,6 +206,9 @@ class ExperimentConfig(Section):
     loss: LossConfig = Field(default_factory=LossConfig)
     teacher: TeacherConfig = Field(default_factory=TeacherConfig)
     training: TrainingConfig = Field(default_factory=TrainingConfig)
+    pretrained: Literal["imagenet", "none"] = Field(
+        default="imagenet", description="what the encoder of a lite0 network starts from, without initial_weights"
+    )
     initial_weights: str | None = Field(
         default=None, description="weights to start from; presets may differ, and widths by a factor of two"
     )
@@ -199,6 +217,8 @@ class ExperimentConfig(Section):
     def _masks_exist(self) -> Self:
         if self.loss.mask_weight > 0 and not self.network.masks:
             raise ValueError("loss.mask_weight needs network.masks: true")
+        if self.training.networks == "pose" and self.teacher.views != "many":
+            raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
         return self
 
 

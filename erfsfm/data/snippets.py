@@ -20,6 +20,7 @@ from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.augmentation import augment
 from erfsfm.data.discovery import discover
 from erfsfm.data.image_cache import ImageCache
+from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import overlapping
@@ -27,9 +28,13 @@ from erfsfm.data.standstill import moving_parts
 from erfsfm.data.weather import weathered
 from erfsfm.errors import DataError
 from erfsfm.readers.frame_range import FrameRange
-from erfsfm.teacher.structure import StructureCache
+from erfsfm.teacher.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
+
+# An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
+# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
+FOCAL_LENGTH = 1.9
 
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
@@ -46,7 +51,13 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     """Random snippets number ``first_draw`` to ``draws``; whole batches are distributed to devices and workers."""
 
     def __init__(
-        self, recordings: Sequence[Recording], config: ExperimentConfig, draws: int, first_draw: int = 0, rank: int = 0
+        self,
+        recordings: Sequence[Recording],
+        config: ExperimentConfig,
+        draws: int,
+        first_draw: int = 0,
+        rank: int = 0,
+        many_views: ManyViewTeacher | None = None,
     ) -> None:
         self._config = config
         self._draws = draws
@@ -54,6 +65,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._rank = rank
         self._cache = ImageCache(config.data.cache_mb, config.network.height, config.network.width)
         self._structures = StructureCache(config.teacher.cache)
+        self._many_views = many_views
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
         self._probabilities = _probabilities(self.recordings, length, config.data)
@@ -76,22 +88,45 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         rng = np.random.default_rng([self._config.training.seed, number])
         recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
         network = self._config.network
-        first = int(rng.integers(len(recording) - network.sources))
-        snippet = Snippet(recording, first)
+        starts = self._starts(recording)
+        snippet = Snippet(recording, starts[int(rng.integers(len(starts)))])
         images = load_window(self._cache, snippet, network.sources + 1)
         camera = recording.camera.resized(network.width, network.height)
-        seen = self._structures.structure(images, camera.K) if self._config.teacher.weights else None
+        seen = self._structure(snippet, images, camera.K)
         bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
         images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
         sample = as_tensors(images, varied.K)
         if seen is not None:
             T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
+            if self._many_views is not None:
+                nearer = varied.fy / network.height / FOCAL_LENGTH
+                bounds = [values * np.float32(nearer) for values in bounds]
+                T_source_target = T_source_target.copy()
+                T_source_target[:, :3, 3] /= nearer
             sample["T_source_target"] = torch.from_numpy(T_source_target)
             sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
         probability = self._config.data.weather
         if probability > 0:
             sample["shown"] = _stacked(weathered(images, rng) if rng.random() < probability else images)
         return sample
+
+    def _starts(self, recording: Recording) -> range:
+        """First frames of the snippets that may be drawn."""
+        sources = self._config.network.sources
+        if self._many_views is None:
+            return range(len(recording) - sources)
+        targets = self._many_views.drive(recording).targets(sources)
+        return range(targets.start - sources // 2, targets.stop - sources // 2, targets.step)
+
+    def _structure(
+        self, snippet: Snippet, images: list[NDArray[np.uint8]], K: NDArray[np.float32]
+    ) -> TeacherStructure | None:
+        """What the teacher measured, if there is one."""
+        if not self._config.teacher.weights:
+            return None
+        if self._many_views is None:
+            return self._structures.structure(images, K)
+        return self._many_views.drive(snippet.recording).structure(snippet.first, self._config.network.sources)
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 MAX_BOUND_RATIO = 1.5  # most over least
 FARTHEST = 100.0  # camera heights: weights do not grow beyond
+STEPS_PX = (1, 2, 4, 8)
 STILL = 0.01  # network units: added to the length of a step, against division by zero
 
 
@@ -55,6 +56,29 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
     weight = torch.where(has_most | (bounds.least > 0), nearest.rsqrt(), 0)
     distance: Tensor = (weight * (below + above)).sum() / weight.sum().clamp(min=1)
     return distance
+
+
+def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
+    """Mean error of the steps of log disparity between pixels 1, 2, 4 and 8 apart, where both have narrow bounds.
+
+    Depth edges are few pixels of a depth error and most of this one (Ranftl et al. 2020, scale-invariant gradients).
+
+    Args:
+        disparity: inverse depth ``(B, 1, H, W)``, positive, at any scale.
+        bounds: of the same size.
+    """
+    narrow = (bounds.least > 0) & (bounds.most < MAX_BOUND_RATIO * bounds.least)
+    middle = torch.where(narrow, (bounds.least * bounds.most).sqrt(), 1)
+    error = torch.where(narrow, disparity.log() - middle.log(), 0)
+    total = disparity.new_zeros(())
+    for apart in STEPS_PX:
+        for axis in (2, 3):
+            length = error.shape[axis] - apart
+            first, second = (values.narrow(axis, 0, length) for values in (error, narrow))
+            first_on, second_on = (values.narrow(axis, apart, length) for values in (error, narrow))
+            both = second & second_on
+            total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)
+    return total / (2 * len(STEPS_PX))
 
 
 def translation_disagreement(t_predicted: Tensor, t_measured: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ _KERNELS = (7, 5, 3, 3, 3, 3, 3)
 _ENCODER_CHANNELS = (32, 64, 128, 256, 512, 512, 512)
 _DECODER_CHANNELS = (512, 512, 256, 128, 64, 32, 16)  # level 7 to level 1
 _SCALES = 4
-_FIRST_LOGIT = -2.0  # disparity 1.2, where the logarithm of a sigmoid has a large slope
+FIRST_LOGIT = -2.0  # disparity 1.2, where the logarithm of a sigmoid has a large slope
 _DILATED_STAGES = (0, 1)
 _DEFORMABLE_STAGES: dict[Variant, tuple[int, ...]] = {"dfc": (0, 1, 2, 3), "dfcv2": (3, 4, 5, 6)}
 
@@ -77,7 +77,7 @@ class DepthNet(nn.Module):
         initialise(self, fidelity)
         if fidelity == "default":
             for head in self.heads:
-                nn.init.constant_(cast(Tensor, head.bias), _FIRST_LOGIT)
+                nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
 
     @property
     def input_channels(self) -> int:

@@ -100,7 +100,7 @@ class PoseNet(nn.Module):
         Raises:
             ValueError: if there are not N sources.
         """
-        return self._pose(self.encoder(self._stack(target, sources))[-1])
+        return pose_vectors(self.pose_head(self.encoder(stack_images(target, sources, self.sources))[-1]), self.sources)
 
     def forward_with_masks(self, target: Tensor, sources: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Predict motions and the explainability mask of each source (Zhou et al. 2017, Section 3.3).
@@ -117,24 +117,33 @@ class PoseNet(nn.Module):
         """
         if self.mask_decoder is None:
             raise ValueError("this pose network was built without a mask branch (mask_branch=False)")
-        stack = self._stack(target, sources)
+        stack = stack_images(target, sources, self.sources)
         stages = self.encoder(stack)
-        return self._pose(stages[-1]), self.mask_decoder(stages[4], [*reversed(stages[:4]), stack])
+        poses = pose_vectors(self.pose_head(stages[-1]), self.sources)
+        return poses, self.mask_decoder(stages[4], [*reversed(stages[:4]), stack])
 
-    def _stack(self, target: Tensor, sources: Sequence[Tensor]) -> Tensor:
-        if len(sources) != self.sources:
-            raise ValueError(f"this pose network takes {self.sources} sources; got {len(sources)}")
-        for image in (target, *sources):
-            if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
-                raise ValueError(
-                    "target and sources must have one shape (B, 3, H, W); "
-                    f"got {tuple(target.shape)} and {tuple(image.shape)}"
-                )
-        return torch.cat([target, *sources], dim=1)  # (B, 3 * (1 + N), H, W)
 
-    def _pose(self, features: Tensor) -> Tensor:
-        pooled: Tensor = self.pose_head(features).mean(dim=(2, 3))  # (B, 6 * N)
-        return POSE_SCALE * pooled.view(-1, self.sources, 6)
+def stack_images(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
+    """Target and `count` sources ``(B, 3, H, W)`` as one input ``(B, 3 * (1 + count), H, W)``.
+
+    Raises:
+        ValueError: another number of sources, or images of different shapes.
+    """
+    if len(sources) != count:
+        raise ValueError(f"this pose network takes {count} sources; got {len(sources)}")
+    for image in (target, *sources):
+        if image.dim() != 4 or image.shape[1] != 3 or image.shape != target.shape:
+            raise ValueError(
+                "target and sources must have one shape (B, 3, H, W); "
+                f"got {tuple(target.shape)} and {tuple(image.shape)}"
+            )
+    return torch.cat([target, *sources], dim=1)
+
+
+def pose_vectors(features: Tensor, sources: int) -> Tensor:
+    """Mean over the map ``(B, 6 * N, h, w)`` as pose vectors ``(B, N, 6)``."""
+    pooled: Tensor = features.mean(dim=(2, 3))  # (B, 6 * N)
+    return POSE_SCALE * pooled.view(-1, sources, 6)
 
 
 class MaskDecoder(nn.Module):

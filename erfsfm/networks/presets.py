@@ -9,18 +9,21 @@ import torch
 from erfsfm.errors import ConfigError
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
-from erfsfm.networks.pose_net import PoseNet
-from erfsfm.networks.receptive_field import multiply_adds, theoretical
+from erfsfm.networks.lite0_depth import Lite0DepthNet
+from erfsfm.networks.lite0_pose import Lite0PoseNet
+from erfsfm.networks.pose_net import MAX_SOURCES, PoseNet
+from erfsfm.networks.receptive_field import Network, multiply_adds, theoretical
 
 NetworkKind = Literal["depth", "pose"]
 
 
 @dataclass(frozen=True)
 class Preset:
-    """One named network: what it predicts and which convolutions its encoder has."""
+    """One named network: what it predicts, its wide-field convolutions, and whose encoder it has."""
 
     kind: NetworkKind
     variant: Variant
+    encoder: Literal["paper", "lite0"] = "paper"
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,14 @@ PRESETS: dict[str, Preset] = {
     "erf-depthnet-dilated": Preset("depth", "dilated"),
     "erf-depthnet-dfc": Preset("depth", "dfc"),
     "erf-depthnet-dfcv2": Preset("depth", "dfcv2"),
+    "depthnet-lite0": Preset("depth", "plain", "lite0"),
+    "erf-depthnet-lite0": Preset("depth", "dfc", "lite0"),
     "posenet": Preset("pose", "plain"),
     "erf-posenet-dilated": Preset("pose", "dilated"),
     "erf-posenet-dfc": Preset("pose", "dfc"),
     "erf-posenet-dfcv2": Preset("pose", "dfcv2"),
+    "posenet-lite0": Preset("pose", "plain", "lite0"),
+    "erf-posenet-lite0": Preset("pose", "dfc", "lite0"),
 }
 
 
@@ -64,7 +71,7 @@ def build(
     normalisation: Normalisation = "none",
     mask_branch: bool = False,
     activation: Activation = "relu",
-) -> DepthNet | PoseNet:
+) -> Network:
     """Build a network with fresh weights.
 
     Args:
@@ -85,8 +92,10 @@ def build(
     if not 0 < width <= 8:
         raise ConfigError(f"width must be above 0 and at most 8; got {width}")
     _check_choice("activation", activation, get_args(Activation))
-    network: DepthNet | PoseNet
-    if preset.kind == "depth":
+    network: Network
+    if preset.encoder == "lite0":
+        network = _build_lite0(name, preset, fidelity, width, sources, normalisation, mask_branch)
+    elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
         try:
@@ -98,14 +107,36 @@ def build(
     return network
 
 
+def _build_lite0(
+    name: str,
+    preset: Preset,
+    fidelity: Fidelity,
+    width: float,
+    sources: int,
+    normalisation: Normalisation,
+    mask_branch: bool,
+) -> Lite0DepthNet | Lite0PoseNet:
+    if fidelity == "paper":
+        raise ConfigError(f"{name} is not of the paper: set network.fidelity to default")
+    if preset.kind == "depth":
+        return Lite0DepthNet(preset.variant, width, normalisation)
+    if mask_branch:
+        raise ConfigError(f"{name} has no explainability masks: set network.masks to false")
+    if not 1 <= sources <= MAX_SOURCES:
+        raise ConfigError(f"sources must be 1 to {MAX_SOURCES}; got {sources}")
+    return Lite0PoseNet(preset.variant, width, sources, normalisation)
+
+
 def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:
-    """Summaries of all presets; only shapes are computed.
+    """Summaries of all presets of a fidelity; only shapes are computed.
 
     Raises:
         ConfigError: if an option is unknown or out of range.
     """
     summaries = []
     for name, preset in PRESETS.items():
+        if fidelity == "paper" and preset.encoder != "paper":
+            continue
         with torch.device("meta"):
             network = build(name, fidelity, width, sources)
         operations, reason = None, None

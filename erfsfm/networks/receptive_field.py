@@ -15,9 +15,11 @@ from torch import Tensor, nn
 from erfsfm.networks.blocks import Encoder, Layer
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.lite0_depth import Lite0DepthNet
+from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.pose_net import PoseNet
 
-Network = DepthNet | PoseNet
+Network = DepthNet | PoseNet | Lite0DepthNet | Lite0PoseNet
 
 # Gradients below this ratio of the largest are rounding of the sampling positions in float64.
 _ROUNDING = 1e-11
@@ -219,7 +221,7 @@ def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
             module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), weights))
     image = torch.empty(1, 3, height, width, device="meta")
     with torch.no_grad():
-        if isinstance(shadow, PoseNet):
+        if isinstance(shadow, PoseNet | Lite0PoseNet):
             shadow(image, [image] * shadow.sources)
         else:
             shadow(image)

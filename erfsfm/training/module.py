@@ -20,6 +20,7 @@ from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
 from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.lite0 import Lite0Encoder
 from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
 
@@ -39,11 +40,34 @@ class SelfSupervision(lightning.LightningModule):
         geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
-        self.pose_net.requires_grad_(config.training.networks == "both")
+        self._choose_trained()
         self.train()  # Lightning keeps the mode of each module
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
         self._constant_steps = 0
+
+    def _choose_trained(self) -> None:
+        """Exclude the network, and the stages of pretrained encoders, that keep their weights."""
+        training = self.config.training
+        self.depth_net.requires_grad_(training.networks != "pose")
+        self.pose_net.requires_grad_(training.networks != "depth")
+        for network in (self.depth_net, self.pose_net):
+            encoder = getattr(network, "encoder", None)
+            if isinstance(encoder, Lite0Encoder):
+                encoder.freeze(training.frozen_stages)
+                # depthwise convolutions are a quarter faster so
+                network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def take_imagenet(self) -> None:
+        """Start pretrained encoders from ImageNet's weights.
+
+        Raises:
+            ConfigError: they are not installed.
+        """
+        for network in (self.depth_net, self.pose_net):
+            encoder = getattr(network, "encoder", None)
+            if isinstance(encoder, Lite0Encoder):
+                encoder.take_imagenet()
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The loss of one batch; stops the run where it is not finite, or the depth stays a constant.
@@ -62,10 +86,11 @@ class SelfSupervision(lightning.LightningModule):
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
                 "training.gradient_clip, then continue with --resume; the weights so far are in last/"
             )
-        self._refuse_constant(result.disparities[0].detach())
+        if result.disparities:
+            self._refuse_constant(result.disparities[0].detach())
         self.log("loss", result.total.detach(), prog_bar=True)
         self.log_dict({f"loss/{name}": value.detach() for name, value in result.terms.items()})
-        if self.global_step % (20 * self.config.training.log_every) == 0:
+        if result.disparities and self.global_step % (20 * self.config.training.log_every) == 0:
             self._log_pictures(snippets, result.disparities[0], result.warped)
         return result.total
 
@@ -89,8 +114,9 @@ class SelfSupervision(lightning.LightningModule):
     def train(self, mode: bool = True) -> Self:
         """Training mode, except for a network that is not trained: its batch statistics would drift."""
         super().train(mode)
-        if self.config.training.networks == "depth":
-            self.pose_net.eval()
+        kept = {"depth": self.pose_net, "pose": self.depth_net}.get(self.config.training.networks)
+        if kept is not None:
+            kept.eval()
         return self
 
     def configure_optimizers(self) -> Any:
@@ -102,9 +128,10 @@ class SelfSupervision(lightning.LightningModule):
             if isinstance(layer, DeformableConv2d)
             for branch in (layer.offset, layer.modulator)
             for parameter in branch.parameters()
+            if parameter.requires_grad
         ]
         slow = {id(parameter) for parameter in offsets}
-        rest = [p for p in self.parameters() if id(p) not in slow]
+        rest = [p for p in self.parameters() if id(p) not in slow and p.requires_grad]
         slowly: dict[str, Any] = {"params": offsets, "lr": training.learning_rate * training.offset_rate}
         optimiser: torch.optim.Optimizer
         if training.optimiser == "muon":

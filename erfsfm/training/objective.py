@@ -21,7 +21,7 @@ from erfsfm.losses.regularisation import (
     explainability_prior,
     second_order_smoothness,
 )
-from erfsfm.losses.structure import Bounds, outside, translation_disagreement
+from erfsfm.losses.structure import Bounds, outside, step_disagreement, translation_disagreement
 
 HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are then as small as initial outputs
 
@@ -101,23 +101,44 @@ class _Prediction:
 
     @staticmethod
     def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
-        if not depth_net.training:
-            raise ValueError("the objective needs the depth network in training mode")
         precise = batch.target.dtype
         target, sources = batch.seen()
-        disparities = [disparity.to(precise) for disparity in depth_net(target)]
+        disparities: list[Tensor] = []
+        if needs_depth(config):
+            if not depth_net.training:
+                raise ValueError("the objective needs the depth network in training mode")
+            disparities = [disparity.to(precise) for disparity in depth_net(target)]
         masks: list[Tensor] | None = None
         if config.network.masks:
             pose_vectors, masks = pose_net.forward_with_masks(target, sources)  # type: ignore[operator]
             masks = [mask.to(precise) for mask in masks]
             _require_sizes(masks, disparities, config)
-        else:
+        elif needs_poses(config):
             pose_vectors = pose_net(target, sources)
+        else:
+            pose_vectors = target.new_zeros(len(target), len(sources), 6)
         adjacent: tuple[Tensor, ...] = ()
         if config.loss.consistency_weight > 0:
             nearest = [sources[k] for k in _adjacent(len(sources))]
             adjacent = depth_net(torch.cat(nearest))[0].to(precise).chunk(len(nearest))
         return _Prediction(disparities, pose_vectors.to(precise), masks, adjacent)
+
+
+def needs_depth(config: ExperimentConfig) -> bool:
+    """Whether any term of the loss depends on the depth network."""
+    loss, teacher = config.loss, config.teacher
+    by_teacher = teacher.structure_weight + teacher.edge_weight + teacher.unit_weight
+    two_view_lengths = teacher.translation_weight if teacher.views == "two" else 0
+    weights = loss.photometric_weight + loss.smoothness_weight + by_teacher + two_view_lengths
+    return config.training.networks != "pose" and weights > 0
+
+
+def needs_poses(config: ExperimentConfig) -> bool:
+    """Whether any term of the loss depends on the pose network; many views give the motion that warps images."""
+    teacher = config.teacher
+    warps = config.loss.photometric_weight > 0 and teacher.views == "two"
+    by_teacher = teacher.rotation_weight + teacher.translation_weight > 0
+    return warps or (by_teacher and config.training.networks != "depth")
 
 
 def _require_sizes(masks: list[Tensor], disparities: list[Tensor], config: ExperimentConfig) -> None:
@@ -139,11 +160,14 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
     loss = config.loss
     T_warp = T_source_target
-    if config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
+    if config.teacher.views == "many" and batch.T_source_target is not None:
+        T_warp = batch.T_source_target.clone()
+        T_warp[..., :3, 3] /= HEIGHTS
+    elif config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
         T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: tuple[Tensor, Projection] | None = None
-    for level in range(loss.scales):
+    for level in range(loss.scales if prediction.disparities else 0):
         scale = _Level.of(batch, prediction.disparities[level], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
@@ -157,10 +181,10 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         terms["explainability"] = torch.stack([explainability_prior(m) for m in prediction.masks]).sum()
         total = total + loss.mask_weight * terms["explainability"]
     if batch.T_source_target is not None and batch.bounds is not None:
-        teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, loss.scales)
+        teacher_terms = _teacher_terms(prediction, T_source_target, batch.T_source_target, batch.bounds, config)
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
-            total = total + weight * teacher_terms[name]
+            total = total + weight * teacher_terms.get(name, total.new_zeros(()))
     if loss.consistency_weight > 0 and finest is not None:
         terms["consistency"] = _consistency(prediction.adjacent, finest[1], batch.sources.shape[1])
         total = total + loss.consistency_weight * terms["consistency"]
@@ -169,26 +193,30 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
 
 
 def _teacher_terms(
-    prediction: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, scales: int
+    prediction: _Prediction, T_source_target: Tensor, T_measured: Tensor, bounds: Bounds, config: ExperimentConfig
 ) -> dict[str, Tensor]:
     """Loss terms of the teacher's measurements.
 
-    Depth and motion are compared after the teacher's unit, which the road measures only roughly, has been fitted to the
-    depth network's; the unit itself is a separate term.
+    Two views measure the unit, the camera's height over the road, only roughly: depth and motion are compared after it
+    has been fitted to the depth network's, and the unit itself is a separate term. Many views have one scale a drive.
     """
-    finest = prediction.disparities[0]
-    log_scale = bounds.log_scale(finest)
-    unit = log_scale.detach()
-    structure = sum(
-        (outside(prediction.disparities[k], bounds.strided(2**k), unit) for k in range(scales)), unit.new_zeros(())
-    )
-    t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
-    return {
-        "rotation": rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3]),
-        "translation": translation_disagreement(T_source_target[..., :3, 3], t_measured),
-        "structure": structure / scales,
-        "unit": (log_scale - math.log(HEIGHTS)).abs().mean(),
-    }
+    terms: dict[str, Tensor] = {}
+    unit = T_measured.new_full((len(T_measured), 1, 1, 1), math.log(HEIGHTS))
+    disparities = prediction.disparities
+    if disparities:
+        log_scale = bounds.log_scale(disparities[0])
+        terms["unit"] = (log_scale - math.log(HEIGHTS)).abs().mean()
+        unit = unit if config.teacher.views == "many" else log_scale.detach()
+        scales = config.loss.scales
+        structure = [outside(disparities[k], bounds.strided(2**k), unit) for k in range(scales)]
+        terms["structure"] = torch.stack(structure).mean()
+        if config.teacher.edge_weight > 0:
+            terms["edge"] = step_disagreement(disparities[0], bounds)
+    if needs_poses(config):
+        t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
+        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
+        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_measured)
+    return terms
 
 
 @dataclass(frozen=True)

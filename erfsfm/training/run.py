@@ -16,11 +16,14 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
@@ -79,11 +82,14 @@ def train(
     module = SelfSupervision(config)
     batch, workers = config.training.batch, config.data.workers
     together = batch * config.training.devices
-    draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank)
+    many_views = _many_views(training, config, output, quiet or rank > 0) if config.teacher.views == "many" else None
+    draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
     if config.initial_weights and not resume:
         seen = merge([*seen, *_start_from(module, config.initial_weights)])
+    elif config.pretrained == "imagenet" and not resume:
+        module.take_imagenet()
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = DataLoader(
         draws, batch, num_workers=workers, worker_init_fn=_single_threaded_worker, persistent_workers=workers > 0
@@ -96,6 +102,23 @@ def train(
         sys.exit()
     keeper.save(module, trainer.global_step)
     return output
+
+
+def _many_views(recordings: list[Recording], config: ExperimentConfig, output: Path, quiet: bool) -> ManyViewTeacher:
+    """The teacher's measurements of all drives, made where they are not there yet."""
+    folder, size = config.teacher.cache or output / "teacher", (config.network.height, config.network.width)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done)
+
+        teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
+    return teacher
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:

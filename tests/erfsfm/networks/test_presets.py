@@ -4,6 +4,8 @@ from torch import nn
 
 from erfsfm.errors import ConfigError
 from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.lite0_depth import Lite0DepthNet
+from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.presets import PRESETS, build, describe
 
@@ -53,7 +55,8 @@ def test_encoder_block_parameters():
 @pytest.mark.parametrize("name", PRESETS)
 def test_kind(name):
     with torch.device("meta"):
-        assert isinstance(build(name), DepthNet if PRESETS[name].kind == "depth" else PoseNet)
+        depth, pose = (Lite0DepthNet, Lite0PoseNet) if PRESETS[name].encoder == "lite0" else (DepthNet, PoseNet)
+        assert isinstance(build(name), depth if PRESETS[name].kind == "depth" else pose)
 
 
 def test_same_seed_same_weights():
@@ -103,7 +106,8 @@ def test_known_errors(options, message):
 def test_descriptions_in_both_fidelities():
     for fidelity in ("default", "paper"):
         summaries = {summary.name: summary for summary in describe(fidelity)}
-        assert list(summaries) == list(PRESETS)
+        of_paper = [name for name, preset in PRESETS.items() if preset.encoder == "paper"]
+        assert list(summaries) == (of_paper if fidelity == "paper" else list(PRESETS))
         assert summaries["depthnet"].parameters == 31_596_900
         assert summaries["depthnet"].multiply_adds == pytest.approx(3.67e9, rel=2e-3)
         assert summaries["posenet"].multiply_adds == pytest.approx(0.256e9, rel=2e-3)

@@ -1,0 +1,193 @@
+"""The many-view teacher of whole drives: poses by the SLAM system once a drive, then a label for every few frames.
+
+All of it is kept in a folder under a digest of the drive's images and camera, so that it is computed once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.data.recordings import Recording
+from erfsfm.errors import TrainingError
+from erfsfm.files import write_atomically
+from erfsfm.teacher.drive_poses import drive_poses
+from erfsfm.teacher.many_views import NEIGHBOURS, label
+from erfsfm.teacher.structure import TeacherStructure
+
+VERSION = 1
+LARGEST_WIDTH = 832  # pixels of the images that are measured: finer flow is slower and no surer
+_CHUNK = 8  # labels of one task
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class DriveLabels:
+    """Poses and labels of one drive under ``folder``; labels have the networks' ``size`` (height, width)."""
+
+    recording: Recording
+    folder: Path
+    size: tuple[int, int]
+    stride: int
+
+    def targets(self, sources: int) -> range:
+        """Frames with a label that have half of ``sources`` on either side, counted from the recording's first."""
+        half = sources // 2
+        return range(-(-half // self.stride) * self.stride, len(self.recording) - half, self.stride)
+
+    @cached_property
+    def T_world_camera(self) -> NDArray[np.float64]:
+        """Poses ``(N, 4, 4)`` in camera heights."""
+        return np.asarray(np.load(self.poses_file, allow_pickle=False))
+
+    @property
+    def poses_file(self) -> Path:
+        """Poses of all frames."""
+        return self.folder / "poses.npy"
+
+    def label_file(self, target: int) -> Path:
+        """Least and most inverse depth of one frame."""
+        return self.folder / f"{self.size[1]}x{self.size[0]}" / f"{target:06d}.npz"
+
+    def structure(self, first: int, sources: int) -> TeacherStructure:
+        """Of the snippet that begins at a frame."""
+        target = first + sources // 2
+        least, most = self.label(target)
+        others = np.delete(np.arange(first, first + sources + 1), sources // 2)
+        T_source_target = np.linalg.inv(self.T_world_camera[others]) @ self.T_world_camera[target]
+        return TeacherStructure(T_source_target.astype(np.float32), least, most)
+
+    def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
+        """Least and most inverse depth ``(H, W)`` of a frame.
+
+        Raises:
+            TrainingError: the file is missing or damaged.
+        """
+        path = self.label_file(target)
+        try:
+            with np.load(path, allow_pickle=False) as entry:
+                return entry["least"], entry["most"]
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise TrainingError(
+                f"the teacher's label {path} is damaged or missing: delete it and start again ({error})"
+            ) from error
+
+    def measure_poses(self, weights: str) -> None:
+        """Run the SLAM system on the drive and keep its poses."""
+        recording, camera = self.recording, self.recording.camera
+
+        def put_image(index: int, path: Path) -> Path:
+            if recording.video is None:
+                placed = path.with_suffix(recording.images[index].suffix)
+                placed.symlink_to(recording.images[index].resolve())
+                return placed
+            placed = path.with_suffix(".png")
+            image = recording.image(index, camera.height, camera.width)
+            cv2.imwrite(str(placed), image[..., ::-1])
+            return placed
+
+        T_world_camera = drive_poses(recording.frames_name, len(recording), camera, put_image, weights)
+        write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
+
+    def measure_labels(self, targets: Sequence[int]) -> int:
+        """Measure and keep the labels of some frames; returns their number."""
+        cv2.setNumThreads(1)
+        ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
+        camera = self.recording.camera
+        camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
+        for target in targets:
+            frames = [target, *(n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording))]
+            images = [self.recording.image(n, camera.height, camera.width) for n in frames]
+            grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+            T_neighbour_target = np.linalg.inv(self.T_world_camera[frames[1:]]) @ self.T_world_camera[target]
+            bounds = label(grey[0], grey[1:], camera.K.astype(np.float64), T_neighbour_target)
+            least, most = (
+                cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
+                for values in bounds
+            )
+            write_atomically(self.label_file(target), lambda p: _compress(p, least=least, most=most), sync=False)  # noqa: B023
+        return len(targets)
+
+
+class ManyViewTeacher:
+    """Labels of several drives, kept in one folder."""
+
+    def __init__(self, folder: Path, size: tuple[int, int], stride: int) -> None:
+        self._folder = folder
+        self._size = size
+        self._stride = stride
+        self._drives: dict[int, DriveLabels] = {}
+
+    def drive(self, recording: Recording) -> DriveLabels:
+        """Where the labels of a recording are kept."""
+        known = self._drives.get(id(recording))
+        if known is None:
+            folder = self._folder / _digest(recording)
+            known = self._drives[id(recording)] = DriveLabels(recording, folder, self._size, self._stride)
+        return known
+
+    def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
+        """Compute what is not there yet, in as many processes as there are cores.
+
+        Raises:
+            TrainingError: a drive has no trajectory or no scale.
+        """
+        drives = [self.drive(recording) for recording in recordings]
+        without = [drive for drive in drives if not drive.poses_file.is_file()]
+        for done, drive in enumerate(without):
+            progress("teacher: poses", done, len(without))
+            drive.measure_poses(weights)
+        tasks = [(drive, chunk) for drive in drives for chunk in _missing(drive, sources)]
+        total, done = sum(len(chunk) for _, chunk in tasks), 0
+        if not tasks:
+            return
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(os.cpu_count(), context) as pool:
+            running: list[Future[int]] = [pool.submit(drive.measure_labels, chunk) for drive, chunk in tasks]
+            try:
+                for future in as_completed(running):
+                    done += future.result()
+                    progress("teacher: depth", done, total)
+            except BrokenProcessPool as error:
+                raise TrainingError("a process that measures labels was killed: is there enough memory?") from error
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
+    """Frames without a label yet, in portions."""
+    frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
+    for first in range(0, len(frames), _CHUNK):
+        yield frames[first : first + _CHUNK]
+
+
+def _digest(recording: Recording) -> str:
+    """Of the images, the camera, and the version of this file."""
+    digest = hashlib.sha256(f"{VERSION} {recording.camera} {recording.start} {len(recording)}".encode())
+    for path in sorted(set(recording.images)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def _save(path: Path, array: NDArray[Any]) -> None:
+    with path.open("wb") as file:
+        np.save(file, array)
+
+
+def _compress(path: Path, **arrays: NDArray[Any]) -> None:
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

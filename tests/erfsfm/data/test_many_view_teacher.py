@@ -1,0 +1,99 @@
+"""The many-view teacher on a simulated drive: poses by the SLAM system, labels, what is kept."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import SnippetDraws
+from erfsfm.errors import TrainingError
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+
+SIZE = (64, 208)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Recording:
+    root = tmp_path_factory.mktemp("world")
+    write_kitti_root(SimulatedStreet(SimulationOptions(frames=40, seed=704, route="straight")), root / "world")
+    return discover(root / "world")[0]
+
+
+@pytest.fixture(scope="module")
+def teacher(recording, tmp_path_factory) -> ManyViewTeacher:
+    teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=6)
+    told = []
+    teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
+    assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 6, 6)
+    return teacher
+
+
+def test_motion_is_in_camera_heights(recording, teacher):
+    true = recording.true_poses()
+    estimate = teacher.drive(recording).T_world_camera
+    assert estimate.shape == (40, 4, 4)
+    length_m = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
+    length = np.linalg.norm(np.diff(estimate[:, :3, 3], axis=0), axis=1).sum()
+    assert length_m / length == pytest.approx(1.65, rel=0.1)
+
+
+def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
+    drive = teacher.drive(recording)
+    assert list(drive.targets(4)) == [6, 12, 18, 24, 30, 36]
+    seen = drive.structure(first=10, sources=4)
+    assert seen.least.shape == seen.most.shape == SIZE
+    true = recording.true_poses()
+    expected = np.linalg.inv(true[[10, 11, 13, 14]]) @ true[12]
+    got = seen.T_source_target.copy()
+    got[:, :3, 3] *= 1.65
+    np.testing.assert_allclose(got, expected, atol=0.25)
+    narrow = (seen.least > 0) & (seen.most < 1.5 * seen.least)
+    assert narrow.mean() > 0.3
+
+
+def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording, teacher):
+    drive = teacher.drive(recording)
+    kept, lost = drive.label_file(6), drive.label_file(12)
+    before, written = lost.read_bytes(), kept.stat().st_mtime_ns
+    lost.unlink()
+    told = []
+    teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
+    assert told == [("teacher: depth", 1, 1)]
+    assert kept.stat().st_mtime_ns == written and len(lost.read_bytes()) == len(before)
+
+
+def test_only_labelled_frames_are_drawn(recording, teacher):
+    tree = {
+        "network": {"height": SIZE[0], "width": SIZE[1]},
+        "data": {"flip": 1.0, "zoom": 1.0},
+        "teacher": {"views": "many", "structure_weight": 1.0},
+    }
+    draws = SnippetDraws([recording], ExperimentConfig.model_validate(tree), 4, many_views=teacher)
+    camera = recording.camera.resized(SIZE[1], SIZE[0])
+    for number in range(4):
+        sample = draws.draw(number)
+        assert sample["least"].shape == (1, *SIZE) and np.isfinite(sample["T_source_target"]).all()
+        steps = np.linalg.norm(sample["T_source_target"][:, :3, 3], axis=1) * 1.65
+        nearer = camera.fy / SIZE[0] / 1.9  # lengths are those of KITTI's focal length
+        assert steps[1] * nearer == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_damaged_label_is_one_line(recording, teacher):
+    path = teacher.drive(recording).label_file(18)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100])
+    try:
+        with pytest.raises(TrainingError, match="000018.npz is damaged or missing: delete it and start again"):
+            teacher.drive(recording).label(18)
+    finally:
+        path.write_bytes(whole)
+
+
+def test_a_drive_that_the_slam_system_cannot_follow_is_one_line(recording, tmp_path):
+    short = recording.part(0, 3)
+    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:3\] could not be found: .*3 frames"):
+        ManyViewTeacher(Path(tmp_path), SIZE, stride=1).prepare([short], 2, "sim", lambda *_: None)

@@ -75,7 +75,7 @@ class OnnxDepth:
             SlamError: the network fails, or its output is no map.
         """
         resized = resize_image(image, self._height, self._width).astype(np.float32)
-        values = (resized / np.float32(255) - self._mean) / self._std  # (h, w, 3)
+        values = resized / (255 * self._std) - self._mean / self._std  # (h, w, 3)
         tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values
         tensor = np.ascontiguousarray(tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type])
         try:

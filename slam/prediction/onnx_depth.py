@@ -47,9 +47,9 @@ class OnnxDepth:
         self.sha256 = hashlib.sha256(content).hexdigest()
         notes = self._require_whole(onnx, content)
         self._session = self._loaded(runtime, content)
+        self._input, self._shape, self._height, self._width = self._image_input(config)
         own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
         self._kind, self._mean, self._std = self._settings(config, own)
-        self._input, self._shape, self._height, self._width = self._image_input(config)
         self._output = self._depth_output(config)
         numbers = (self._mean.tolist(), self._std.tolist(), self._height, self._width, self._output)
         self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"

@@ -29,12 +29,12 @@ logger = logging.getLogger(__name__)
 
 F = TypeVar("F", np.float32, np.float64)
 DeviceChoice = Literal["auto", "cpu", "cuda"]
-_THREADS = max(torch.get_num_threads() - 1, 1)
+NETWORK_THREADS = max(torch.get_num_threads() - 1, 1)  # one core stays free for other threads
 
 
 def limit_torch_threads() -> None:
     """Let PyTorch in this thread use all cores but one, which stays free for other threads."""
-    torch.set_num_threads(_THREADS)
+    torch.set_num_threads(NETWORK_THREADS)
 
 
 def choose_device(choice: str) -> torch.device:

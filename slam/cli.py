@@ -301,7 +301,8 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
         typer.echo(note)
     for gap in sequence["bridged"]:
         typer.echo(f"INTERPOLATED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
-    typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}")
+    depth = "" if provenance["depth_source"] == "network" else f"; depth {provenance['depth_source']}"
+    typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}{depth}")
     if provenance["leak"]:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
     frames, before = sequence["frames"], sequence.get("continued_at", 0)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from erfsfm.config_tree import Section
 from erfsfm.config_tree import dump_explained as dump_yaml
@@ -26,6 +26,7 @@ from slam.config_frontend import (
 )
 
 __all__ = [
+    "DepthConfig",
     "FrontendConfig",
     "GapsConfig",
     "GeometryConfig",
@@ -42,6 +43,48 @@ __all__ = [
     "dump_yaml",
     "load_config",
 ]
+
+
+DEPTH_SOURCES = ("onnx", "npy", "png")
+
+
+class DepthConfig(Section):
+    """Where depth comes from, see ``docs/depth-models.md``."""
+
+    source: str = Field(
+        default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
+    )
+    kind: Literal["auto", "depth", "disparity"] = Field(
+        default="auto",
+        description="what the source gives; auto: depth in folders, in ONNX files that we exported theirs",
+    )
+    align: Literal["none", "scale", "affine"] = Field(
+        default="none",
+        description="none: one unit in all frames; scale: a unit of its own in each; affine: also a shift of disparity",
+    )
+    mean: tuple[float, float, float] | None = Field(
+        default=None, description="of RGB in [0, 1], subtracted for onnx; null in ONNX files that we exported"
+    )
+    std: tuple[float, float, float] | None = Field(default=None, description="divides RGB less the mean; likewise")
+    height: int = Field(default=0, ge=0, description="input height for onnx; 0 where the file fixes it")
+    width: int = Field(default=0, ge=0, description="input width for onnx; 0 where the file fixes it")
+    output_name: str = Field(default="", description="output for onnx, where the network has several")
+    png_scale: float = Field(default=256.0, gt=0, description="value of 1 m (or other unit) for png; 0 is unknown")
+
+    @field_validator("source")
+    @classmethod
+    def _known_source(cls, source: str) -> str:
+        kind, colon, path = source.partition(":")
+        if source != "network" and not (kind in DEPTH_SOURCES and colon and path):
+            raise ValueError("network, onnx:FILE, npy:FOLDER or png:FOLDER")
+        return source
+
+    @field_validator("std")
+    @classmethod
+    def _positive(cls, std: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if std is not None and min(std) <= 0:
+            raise ValueError("three numbers above 0")
+        return std
 
 
 class LoopsConfig(Section):
@@ -177,6 +220,7 @@ class OutputConfig(Section):
 class SlamConfig(Section):
     """All settings of a run."""
 
+    depth: DepthConfig = DepthConfig()
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
     gaps: GapsConfig = GapsConfig()

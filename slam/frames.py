@@ -138,12 +138,12 @@ class SnippetPoses:
 
 
 class Predictor(Protocol):
-    """Learned depth and snippet poses in one common, unknown scale: the networks, a cache or an oracle."""
+    """Depth and snippet poses in one common, unknown scale: networks, depth from elsewhere, or an oracle."""
 
     sources: int
 
     def depth(self, frame: Frame) -> DepthMap:
-        """Unscaled z-depth ``(H, W)`` of a frame, at the image's size."""
+        """Unscaled z-depth ``(H, W)`` of a frame, at the image's size: positive and finite, or NaN where unknown."""
         ...
 
     def snippet(self, frames: list[Frame]) -> SnippetPoses:

@@ -21,7 +21,9 @@ from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import make_predictor, open_depth
+from slam.prediction.depth_folder import FrameNumbers
+from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
@@ -33,11 +35,10 @@ from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.imports import import_rerun
 from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
-from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
-from slam.storage.fingerprint import code_fingerprint
+from slam.sequences.excerpt import Excerpt
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
-_FIXED_SECTIONS = ("geometry", "gaps", "road", "scale", "loops")
+_FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
 
 
 class RunOptions(TypedDict, total=False):
@@ -146,6 +147,7 @@ class _Job:
     recording: FrameSequence
     pipeline: SlamPipeline
     provenance: Provenance
+    predictors_sha256: str
 
 
 def _prepare(request: RunRequest) -> _Job:
@@ -158,16 +160,25 @@ def _prepare(request: RunRequest) -> _Job:
     dataset = None if request.dataset is None else Path(request.dataset)
     recording = open_sequence(dataset, request.sequence, request.camera, request.frames)
     networks = DepthPosePredictor.from_weights(request.weights, request.device).freeze()
-    checkpoint = None
+    checkpoint, first = None, 0
+    following = recording
     if request.continues is not None:
-        checkpoint = _checkpoint(request.continues, networks.sha256, recording)
-        recording = checkpoint.continued(recording)
-    predictor, get_or_compute = _predictor(networks, recording.intrinsics, request.cache)
+        checkpoint = _checkpoint(request.continues, following)
+        recording = checkpoint.continued(following)
+        first = len(recording) - len(following)
+    source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first))
+    sha256 = mixed_sha256(networks.sha256, source)
+    if checkpoint is not None and checkpoint.weights_sha256 != sha256:
+        raise RunError(
+            f"{request.continues} was run with other weights or another depth source: continue it with the same "
+            "--weights and depth.source"
+        )
+    predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     pipeline = SlamPipeline(
         recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
     )
     pipeline.require_possible()
-    return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording))
+    return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording, source), sha256)
 
 
 def _settings(request: RunRequest) -> SlamConfig:
@@ -184,19 +195,20 @@ def _settings(request: RunRequest) -> SlamConfig:
         )
     own = load_config(RunFolder.open(continues).require("config.yaml"))
     settings = load_config(continues / "config.yaml", request.overrides)
+    # another path may lead to the same source, or to more files of it: its identity is compared later
+    depth = settings.depth.model_copy(update={"source": own.depth.source})
+    compared = settings.model_copy(update={"depth": depth})
     for name in _FIXED_SECTIONS:
-        if getattr(settings, name) != getattr(own, name):
+        if getattr(compared, name) != getattr(own, name):
             raise ConfigError(
                 f"{name} cannot be changed for {continues}: leave out --set {name}..., or run from the first frame"
             )
     return settings
 
 
-def _checkpoint(continues: Path, weights_sha256: str, following: FrameSequence) -> SessionCheckpoint:
-    """The checkpoint of a run to continue, if these networks and frames match it."""
+def _checkpoint(continues: Path, following: FrameSequence) -> SessionCheckpoint:
+    """The checkpoint of a run to continue, if these frames can follow it."""
     checkpoint = SessionCheckpoint.open(continues)
-    if checkpoint.weights_sha256 != weights_sha256:
-        raise RunError(f"{continues} was run with other weights: continue it with the same --weights")
     ranges = [name for name in following.provenance() if name.endswith("]")]  # a simulated world has none
     twice = overlapping(ranges, checkpoint.sources)
     if twice:
@@ -204,21 +216,16 @@ def _checkpoint(continues: Path, weights_sha256: str, following: FrameSequence) 
     return checkpoint
 
 
-def _predictor(
-    networks: DepthPosePredictor, intrinsics: Intrinsics, cache: Path | None
-) -> tuple[NetworkPredictor, GetOrCompute]:
-    """The networks behind the cache, and the cache of image measurements."""
-    if cache is None:
-        return NetworkPredictor(networks, intrinsics), without_cache
-    disk, code = DiskCache(cache), code_fingerprint()
-    # outputs of GPU and CPU differ a little and share no entries
-    identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
-    get_or_compute = CacheNamespace(disk, code).get_or_compute
-    answers = CacheNamespace(disk, identity).get_or_compute
-    return NetworkPredictor(networks, intrinsics, get_or_compute, answers), get_or_compute
+def _frame_numbers(recording: FrameSequence, first: int) -> FrameNumbers:
+    """The frames of this run in their recording, by which files of depth are found."""
+    if isinstance(recording, Excerpt):
+        return FrameNumbers(len(recording), recording.start, len(recording.base), first)
+    return FrameNumbers(len(recording), 0, len(recording), first)
 
 
-def _provenance(request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence) -> Provenance:
+def _provenance(
+    request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence, source: DepthSource | None
+) -> Provenance:
     return Provenance(
         version=__version__,
         commit=commit(),
@@ -230,6 +237,8 @@ def _provenance(request: RunRequest, networks: DepthPosePredictor, recording: Fr
         weights_licence=networks.record.licence,
         trained_on=networks.record.trained_on,
         leak=bool(networks.leaks(recording.provenance())),
+        depth_source="network" if source is None else source.name,
+        depth_sha256=networks.sha256 if source is None else source.sha256,
     )
 
 
@@ -265,7 +274,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
     keep = job.settings.output.keep
     if keep != "nothing":
-        checkpoint = SessionCheckpoint.of(job.recording, result.state, job.provenance.weights_sha256)
+        checkpoint = SessionCheckpoint.of(job.recording, result.state, job.predictors_sha256)
         folder.write(DRIVE, checkpoint.write)
     if keep == "keyframes":
         folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))

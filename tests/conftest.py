@@ -61,7 +61,8 @@ _T = {
     "align": dict.fromkeys(("none", "first", "scale", "6dof", "7dof"), _A),
     "evo": dict.fromkeys(("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference"), float),
 }
-_WORDS = ("version", "commit", "command", "device", "weights", "weights_sha256", "weights_licence")
+_WEIGHTS = ("weights", "weights_sha256", "weights_licence", "depth_source", "depth_sha256")
+_WORDS = ("version", "commit", "command", "device", *_WEIGHTS)
 _PROVENANCE = {**dict.fromkeys(_WORDS, str), "seed": int, "trained_on": list, "leak": bool}
 # metrics.json of a run that ended well: design, section 7
 _METRICS = {

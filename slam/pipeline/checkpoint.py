@@ -43,7 +43,10 @@ DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
 
 @dataclass(frozen=True)
 class SessionCheckpoint:
-    """A drive up to its last frame, measured with the networks ``weights_sha256``; other fields as of a `Sequence`."""
+    """A drive up to its last frame; ``weights_sha256`` is that of the networks and the depth source.
+
+    Other fields are as of a `Sequence`.
+    """
 
     name: str
     sources: tuple[str, ...]

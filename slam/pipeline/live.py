@@ -19,7 +19,8 @@ from slam.pipeline.batch import Measurements, SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.observer import Observer, ObserverState
 from slam.pose_graph import IncrementalPoseGraph
-from slam.prediction.networks import NetworkPredictor
+from slam.prediction.assembly import make_predictor, open_depth
+from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
@@ -48,14 +49,14 @@ class Slam:
         """Prepare for the first frame.
 
         Args:
-            predictor: depth and snippet poses.
+            predictor: depth and snippet poses; ``config.depth`` is read by `from_weights` alone.
             intrinsics: of all images.
             config: None for the defaults.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
             update_frames: the graph is solved after so many frames, and in `trajectory`.
             sweep_frames: loops are searched after so many frames; 0: only in ``close_loops``.
             noise: of the snippet poses; None measures it against image geometry alone.
-            weights_sha256: of the networks, to refuse resuming a session of others.
+            weights_sha256: of the networks and the depth source, to refuse resuming a session of others.
             seed: of all RANSAC draws.
 
         Raises:
@@ -93,15 +94,23 @@ class Slam:
         camera_height_m: float | None = None,
         device: str = "cpu",
     ) -> Slam:
-        """With a shipped model by name or a training output folder; raises as ``DepthPosePredictor``."""
+        """With a shipped model by name or a training output folder; depth is that of ``config.depth``.
+
+        Raises:
+            SlamError: a depth source that cannot be opened, or a folder of files.
+            ErfsfmError: as ``DepthPosePredictor.from_weights``.
+        """
+        depth = (config or SlamConfig()).depth
+        source = open_depth(depth, intrinsics, None)
         networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
+        predictor, _ = make_predictor(networks, source, depth, intrinsics)
         return cls(
-            NetworkPredictor(networks, intrinsics),
+            predictor,
             intrinsics,
             config,
             camera_height_m,
             noise=networks.noise,
-            weights_sha256=networks.sha256,
+            weights_sha256=mixed_sha256(networks.sha256, source),
         )
 
     def __len__(self) -> int:

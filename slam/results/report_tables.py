@@ -101,6 +101,7 @@ def what_ran(metrics: Metrics) -> Table:
         ("Scale", f"mode {text('scale', 'mode')}, value {text('scale', 'value', decimals=4)}"),
         ("Speed", text("timing", "frames_per_second", unit=" frames/s over the whole run")),
         ("Weights", f"{text('provenance', 'weights')}, sha256 {sha256 if MISSING in sha256 else sha256[:16]}"),
+        ("Depth", _depth_source(metrics)),
         ("Licence of the weights", text("provenance", "weights_licence")),
         ("Trained on", _shortened([str(name) for name in seen]) if seen else MISSING),
         ("Leak", {True: "yes: trained on this sequence", False: "none known"}.get(leak, MISSING)),
@@ -284,6 +285,14 @@ def _details(loops_file: Path, verdict: str) -> list[Any]:
         return []
     entries = tree.get(verdict) if isinstance(tree, dict) else None
     return entries if isinstance(entries, list) else []
+
+
+def _depth_source(metrics: Metrics) -> str:
+    name, reason = lookup(metrics, "provenance", "depth_source")
+    sha256, _ = lookup(metrics, "provenance", "depth_sha256")
+    if name is None:
+        return f"{MISSING} ({reason})"
+    return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
 
 
 def _interpolated(metrics: Metrics) -> str:

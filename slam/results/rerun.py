@@ -70,7 +70,9 @@ def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics
     K = intrinsics.resized(width, height).K
     stream.log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
     stream.log("world/camera/image", rr.Image(keyframe.image).compress(jpeg_quality=_JPEG_QUALITY))
-    stream.log("world/camera/image/depth", rr.DepthImage(keyframe.depth_unscaled * np.float32(scale), meter=1.0))
+    stream.log(
+        "world/camera/image/depth", rr.DepthImage(np.nan_to_num(keyframe.depth_unscaled * np.float32(scale)), meter=1.0)
+    )
 
 
 def _log_map(rr: Any, stream: Any, result: SlamResult, voxel_size: float) -> None:

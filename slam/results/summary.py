@@ -16,7 +16,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Provenance:
-    """Version, command, weights and their training data."""
+    """Version, command, weights and their training data, and where depth comes from."""
 
     version: str
     commit: str
@@ -28,6 +28,8 @@ class Provenance:
     weights_licence: str
     trained_on: list[str]
     leak: bool
+    depth_source: str
+    depth_sha256: str
 
 
 def null(name: str, reason: str) -> dict[str, Any]:

@@ -37,6 +37,20 @@ def import_rerun() -> ModuleType:
         raise SlamError(f"--rerun needs rerun ({error}): pip install 'erfsfm-slam[rerun]', or rerun-sdk") from error
 
 
+def import_onnx() -> tuple[ModuleType, ModuleType]:
+    """Import onnx and ONNX Runtime, an optional extra.
+
+    Raises:
+        SlamError: if one is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("onnx"), importlib.import_module("onnxruntime")
+    except (ImportError, OSError) as error:
+        raise SlamError(
+            f"depth.source=onnx needs onnx and onnxruntime ({error}): pip install 'erfsfm-slam[onnx]'"
+        ) from error
+
+
 def import_open3d_beside() -> None:
     """Import Open3D, which takes a second, in another thread; errors are raised by the next `import_open3d`."""
 

@@ -72,6 +72,8 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^pip install ", "it downloads"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
+if importlib.util.find_spec("onnxruntime") is None:
+    NOT_RUN = (*NOT_RUN, (r"onnx", "the extra 'onnx' is not installed"))
 if importlib.util.find_spec("rerun") is None:
     NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
 
@@ -183,6 +185,27 @@ def old_checkpoint(path: Path, preset: str) -> None:
     torch.save({"state_dict": renamed}, path)
 
 
+def relative_network(path: Path) -> None:
+    """A network of any input size whose disparity is an image's mean brightness, shifted to be positive."""
+    if importlib.util.find_spec("onnx") is None:
+        return
+    import onnx
+    from onnx import TensorProto, helper
+
+    nodes = [
+        helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1),
+        helper.make_node("Add", ["mean", "shift"], ["depth"]),
+    ]
+    image, depth = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+        for name, shape in (("image", [1, 3, "height", "width"]), ("depth", None))
+    )
+    graph = helper.make_graph(
+        nodes, "relative", [image], [depth], [helper.make_tensor("shift", TensorProto.FLOAT, [1], [3.0])]
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+
+
 def raw_drive(root: Path, sequence: Path) -> None:
     """A KITTI raw drive of the images and scans of a simulated sequence, at 10 m/s."""
     date = root / "2011_09_26"
@@ -221,6 +244,10 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         train = "erfsfm train --config tiny --dataset world --set training.steps=2 --output"
         call(f"{train} runs/toy")
         call(f"{train} runs/table1-dfc --set network.sources=4")
+        call("erfsfm predict world/sequences/sim/image_2 --weights runs/toy --output depth")
+        if importlib.util.find_spec("onnxruntime") is not None:
+            call("erfsfm export --weights runs/toy --format onnx --output net.onnx")
+            relative_network(Path("relative.onnx"))
         for name in ("KITTI", "KITTI_ODOMETRY", "path/to/kitti"):
             for sequence in ("05", "06", "09"):
                 shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")

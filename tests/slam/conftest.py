@@ -88,6 +88,8 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
             "weights_licence": "MIT: trained on our own simulated streets",
             "trained_on": [f"sim/seed{k}" for k in range(20)],
             "leak": leak,
+            "depth_source": "network",
+            "depth_sha256": "9f" * 32,
         },
         "sequence": {"name": "sim/loop <42>", "frames": 300, "length_m": 299.0, "fps": 10.0}
         if reference

@@ -41,10 +41,10 @@ class GroundPlaneFitter:
         self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)
 
     def fit(self, depth_unscaled: DepthMap) -> GroundPlane | MeasurementFailure:
-        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics."""
+        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics; unknown depth is left out."""
         config = self._config
         inverse_depth = 1.0 / np.maximum(depth_unscaled[self._rows, self._columns].astype(np.float64), 1e-9)
-        usable = np.isfinite(inverse_depth) & (inverse_depth < 1e8)
+        usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
         if usable.sum() < _LEAST_POINTS:
             return MeasurementFailure("the depth in front of the car is not usable")
         rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)

@@ -54,7 +54,9 @@ def test_timing() -> None:
 
 
 def test_a_run_begins_as_running_with_its_provenance() -> None:
-    known = Provenance("1", "abc", "erfsfm-slam run", 0, "cpu", "sim", "9f", "MIT", ["simulated/1"], False)
+    known = Provenance(
+        "1", "abc", "erfsfm-slam run", 0, "cpu", "sim", "9f", "MIT", ["simulated/1"], False, "network", "9f"
+    )
     begun = describe_start(known)
     assert (begun["status"], begun["schema"]) == ("running", 1) and "has not ended" in begun["reason"]
     assert begun["provenance"]["trained_on"] == ["simulated/1"]

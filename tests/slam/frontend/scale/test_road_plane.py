@@ -58,6 +58,18 @@ def test_scale_is_within_one_percent_under_noise_and_outliers():
     assert 0 < estimate.spread < 0.02
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, 0.0, -3.0])
+def test_unknown_depth_is_left_out(unknown):
+    depth = road_depth()
+    depth[:, ::2] = unknown
+    road = fit_ground_plane(depth)
+    assert isinstance(road, GroundPlane) and road.inlier_ratio == 1.0
+    assert road.height_unscaled == pytest.approx(HEIGHT, rel=1e-4)
+    depth[:] = unknown
+    assert isinstance(fit_ground_plane(depth), MeasurementFailure)
+
+
 def test_a_car_ahead_does_not_move_the_road():
     depth = road_depth()
     depth[60:100, 170:245] = 3.0

@@ -1,0 +1,67 @@
+"""The predictor of a run, assembled from networks, cache and the source of depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from erfsfm.inference import DepthPosePredictor
+from slam.config import DepthConfig
+from slam.errors import SlamError
+from slam.frames import Intrinsics, Predictor
+from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+from slam.prediction.depth_source import DepthSource, SourcedPredictor
+from slam.prediction.networks import NetworkPredictor
+from slam.prediction.onnx_depth import OnnxDepth
+from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
+from slam.storage.fingerprint import code_fingerprint
+
+
+def open_depth(config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumbers | None) -> DepthSource | None:
+    """Open and check the source of depth; None where depth is that of the networks.
+
+    Args:
+        config: which source.
+        intrinsics: of the images.
+        numbers: of the frames; None where they are not known beforehand, as live.
+
+    Raises:
+        SlamError: the source is missing, damaged or does not fit.
+    """
+    kind = config.source.partition(":")[0]
+    if kind == "network":
+        return None
+    if kind == "onnx":
+        return OnnxDepth(config)
+    if numbers is None:
+        raise SlamError(
+            f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or onnx:FILE "
+            "for frames as they come"
+        )
+    return DepthFolder(config, numbers, intrinsics.width, intrinsics.height)
+
+
+def make_predictor(
+    networks: DepthPosePredictor,
+    source: DepthSource | None,
+    config: DepthConfig,
+    intrinsics: Intrinsics,
+    cache: Path | None = None,
+) -> tuple[Predictor, GetOrCompute]:
+    """The networks behind the cache, with depth by ``source`` where there is one, and the cache of measurements.
+
+    Files of a depth folder are read in every run; what is measured with them is cached under their content.
+    """
+    if cache is None:
+        own, get_or_compute = NetworkPredictor(networks, intrinsics), without_cache
+    else:
+        disk, code = DiskCache(cache), code_fingerprint()
+        # outputs of GPU and CPU differ a little and share no entries
+        identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
+        get_or_compute = CacheNamespace(disk, code).get_or_compute
+        own = NetworkPredictor(networks, intrinsics, get_or_compute, CacheNamespace(disk, identity).get_or_compute)
+        if isinstance(source, OnnxDepth):
+            identity = f"{source.identity} {source.runtime} {code}"
+            source.use_cache(CacheNamespace(disk, identity).get_or_compute)
+    if source is None:
+        return own, get_or_compute
+    return SourcedPredictor(own, source, config.align), get_or_compute

@@ -1,0 +1,221 @@
+"""A depth or disparity network from an ONNX file, by ONNX Runtime on the CPU.
+
+Only operators of ONNX Runtime itself are run, and only the one file is read: a graph that needs code or weights from
+elsewhere is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.inference import NETWORK_THREADS
+from erfsfm.readers.images import resize_image
+from slam.config import DepthConfig
+from slam.errors import SlamError
+from slam.frames import Frame, Image
+from slam.prediction.depth_source import Disparity, Kind, disparity_of
+from slam.runtime.imports import import_onnx
+from slam.storage.cache import Answer, GetOrCompute, without_cache
+
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+_OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
+_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
+
+
+class OnnxDepth:
+    """Disparity of images by a network with one image input."""
+
+    def __init__(self, config: DepthConfig) -> None:
+        """Load a file and run it once, on a black image.
+
+        Args:
+            config: a source of kind ``onnx``.
+
+        Raises:
+            SlamError: onnxruntime is not installed, a damaged file, one that is no such network, or settings missing.
+        """
+        self.name = config.source
+        self._path = Path(config.source.partition(":")[2]).expanduser()
+        onnx, runtime = import_onnx()
+        content = self._content()
+        self.sha256 = hashlib.sha256(content).hexdigest()
+        notes = self._require_whole(onnx, content)
+        self._session = self._loaded(runtime, content)
+        self._input, self._shape, self._height, self._width = self._image_input(config)
+        own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
+        self._kind, self._mean, self._std = self._settings(config, own)
+        self._output = self._depth_output(config)
+        numbers = (self._mean.tolist(), self._std.tolist(), self._height, self._width, self._output)
+        self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"
+        self.runtime = f"onnxruntime {runtime.__version__}"
+        self._answers: GetOrCompute = without_cache
+        self._run(np.zeros((self._height, self._width, 3), np.uint8))
+
+    def use_cache(self, answers: GetOrCompute) -> None:
+        """Keep outputs in a cache of this network alone."""
+        self._answers = answers
+
+    def disparity(self, frame: Frame) -> Disparity:
+        """1/depth at the network's own size, NaN where unknown; raises as ``infer``."""
+
+        def compute() -> Answer:
+            return (disparity_of(self.infer(frame.image), self._kind),)
+
+        return self._answers("onnx disparity", [frame], compute)[0]
+
+    def infer(self, image: Image) -> NDArray[np.float32]:
+        """The network's output ``(h, w)`` for an image ``(H, W, 3)`` uint8 RGB.
+
+        Raises:
+            SlamError: the network fails, or its output is no map.
+        """
+        return self._run(image)
+
+    def _run(self, image: Image) -> NDArray[np.float32]:
+        resized = resize_image(image, self._height, self._width).astype(np.float32)
+        values = resized / (255 * self._std) - self._mean / self._std  # (h, w, 3)
+        tensor = values.transpose(2, 0, 1) if self._shape[-3] == 3 else values
+        tensor = np.ascontiguousarray(tensor[(None,) * (len(self._shape) - 3)], _TYPES[self._input.type])
+        try:
+            (output,) = self._session.run([self._output], {self._input.name: tensor})
+        except self._errors() as error:
+            raise SlamError(
+                f"{self._path} fails on an image of {self._width}x{self._height}: {_short(error)}"
+            ) from error
+        found = np.asarray(output)
+        sides = [side for side in found.shape if side != 1]
+        if len(sides) != 2 or found.dtype.kind != "f":
+            raise SlamError(
+                f"output {self._output} of {self._path} must be floats of one map (1, 1, H, W); got {found.dtype} "
+                f"{found.shape}: choose another with depth.output_name"
+            )
+        return np.asarray(found.reshape(sides), dtype=np.float32)
+
+    def _content(self) -> bytes:
+        try:
+            return self._path.read_bytes()
+        except OSError as error:
+            raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
+
+    def _require_whole(self, onnx: Any, content: bytes) -> dict[str, str]:
+        """The metadata of a graph whose weights are all in its file."""
+        from google.protobuf.message import DecodeError
+
+        try:
+            model = onnx.load_model_from_string(content)
+        except DecodeError as error:
+            raise SlamError(f"{self._path} is damaged or no ONNX file ({error}): copy or export it again") from error
+        if not model.graph.node:
+            raise SlamError(f"{self._path} is damaged or no ONNX file (no operators in it): copy or export it again")
+        if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(model)):
+            raise SlamError(f"{self._path} keeps weights in other files, which are not read: save it as one file")
+        return {entry.key: entry.value for entry in model.metadata_props}
+
+    def _loaded(self, runtime: Any, content: bytes) -> Any:
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = NETWORK_THREADS
+        options.inter_op_num_threads = 1
+        options.log_severity_level = _FATAL
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
+        try:
+            return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except self._errors() as error:
+            raise SlamError(
+                f"{self._path} cannot be run by onnxruntime {runtime.__version__}, with its own operators alone: "
+                f"{_short(error)}"
+            ) from error
+
+    def _settings(self, config: DepthConfig, own: bool) -> tuple[Kind, NDArray[np.float32], NDArray[np.float32]]:
+        """Kind of the output, mean and standard deviation of the input; those of our own exports are known."""
+        missing = {
+            "depth.kind=depth or disparity": config.kind == "auto",
+            "depth.mean=[0.485,0.456,0.406]": config.mean is None,
+            "depth.std=[0.229,0.224,0.225]": config.std is None,
+        }
+        wanted = [name for name, is_missing in missing.items() if is_missing]
+        if wanted and not own:
+            raise SlamError(
+                f"{self._path} does not say what it takes and gives: set {', '.join(wanted)} (ImageNet's, or as the "
+                "network was trained)"
+            )
+        kind: Kind = "disparity" if config.kind == "auto" else config.kind
+        half = (0.5, 0.5, 0.5)
+        mean, std = (np.array(given or half, np.float32) for given in (config.mean, config.std))
+        return kind, mean, std
+
+    def _image_input(self, config: DepthConfig) -> tuple[Any, list[Any], int, int]:
+        """The one input, its shape, and the height and width of its image."""
+        inputs = self._session.get_inputs()
+        described = ", ".join(f"{each.name} {each.type} {each.shape}" for each in inputs)
+        shape = list(inputs[0].shape) if len(inputs) == 1 else []
+        channels_first = len(shape) in (3, 4) and shape[-3] == 3
+        channels_last = len(shape) in (3, 4) and shape[-1] == 3
+        is_batch = len(shape) == 4 and isinstance(shape[0], int) and shape[0] != 1
+        if not (channels_first or channels_last) or is_batch or inputs[0].type not in _TYPES:
+            raise SlamError(
+                f"{self._path} must have one input, an RGB image (1, 3, H, W) or (1, H, W, 3) of floats; got "
+                f"{described}"
+            )
+        sides = shape[-2:] if channels_first else shape[-3:-1]
+        height, width = (
+            self._side(name, fixed, given)
+            for name, fixed, given in zip(("height", "width"), sides, (config.height, config.width), strict=True)
+        )
+        return inputs[0], shape, height, width
+
+    def _side(self, name: str, fixed: Any, given: int) -> int:
+        if not isinstance(fixed, int):
+            if not given:
+                raise SlamError(
+                    f"{self._path} takes images of any size: set depth.height and depth.width, such as those of its "
+                    "training"
+                )
+            return given
+        if given and given != fixed:
+            raise SlamError(f"{self._path} takes images of {name} {fixed}, not {given}: leave depth.{name} out")
+        return fixed
+
+    def _depth_output(self, config: DepthConfig) -> str:
+        names = [str(each.name) for each in self._session.get_outputs()]
+        if config.output_name in names:
+            return config.output_name
+        if config.output_name or len(names) > 1:
+            wanted = f"no output {config.output_name}" if config.output_name else f"{len(names)} outputs"
+            raise SlamError(f"{self._path} has {wanted}: set depth.output_name to one of {', '.join(names)}")
+        return names[0]
+
+    def _errors(self) -> tuple[type[Exception], ...]:
+        """What ONNX Runtime raises: classes without a common base of their own."""
+        from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+        own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+        return (*own, RuntimeError, ValueError)
+
+
+def _tensors(model: Any) -> Iterator[Any]:
+    """All constant tensors of a model, also of nested graphs and functions."""
+    waiting = [model.graph]
+    nodes = [node for function in model.functions for node in function.node]
+    while waiting or nodes:
+        if waiting:
+            graph = waiting.pop()
+            yield from graph.initializer
+            for sparse in graph.sparse_initializer:
+                yield from (sparse.values, sparse.indices)
+            nodes += graph.node
+            continue
+        for attribute in nodes.pop().attribute:
+            yield attribute.t
+            yield from attribute.tensors
+            waiting += [*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])]
+
+
+def _short(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else f"{text[:197]}..."

@@ -1,0 +1,164 @@
+"""Depth from folders: which file belongs to which frame, unknown pixels, and folders that are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.config import DepthConfig
+from slam.errors import SlamError
+from slam.frames import Frame
+from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+
+HEIGHT, WIDTH = 12, 40
+
+
+def frame(index: int) -> Frame:
+    return Frame(index, 0.1 * index, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+
+
+def folder_of(path: Path, names: list[str]) -> Path:
+    """Frame k is k + 1 metres away."""
+    path.mkdir(exist_ok=True)
+    for k, name in enumerate(names):
+        np.save(path / name, np.full((HEIGHT, WIDTH), k + 1.0, np.float32))
+    return path
+
+
+def opened(folder: Path, numbers: FrameNumbers, kind: str = "npy", **settings: Any) -> DepthFolder:
+    return DepthFolder(DepthConfig(source=f"{kind}:{folder}", **settings), numbers, WIDTH, HEIGHT)
+
+
+def metres(source: DepthFolder, index: int) -> float:
+    disparity = source.disparity(frame(index))
+    assert disparity is not None
+    return float(1 / disparity[0, 0])
+
+
+@pytest.mark.parametrize("first", [0, 1, 100])
+def test_files_belong_to_frames_in_the_order_of_their_numbers(tmp_path: Path, first: int) -> None:
+    folder = folder_of(tmp_path, [f"depth_{first + k}.npy" for k in range(12)])  # 9 before 10
+    source = opened(folder, FrameNumbers(12, 0, 12))
+    assert [metres(source, k) for k in range(12)] == pytest.approx(range(1, 13))
+
+
+def test_other_names_are_taken_in_sorted_order(tmp_path: Path) -> None:
+    source = opened(folder_of(tmp_path, ["a.npy", "b.npy", "c.npy"]), FrameNumbers(3, 0, 3))
+    assert [metres(source, k) for k in range(3)] == pytest.approx([1, 2, 3])
+
+
+def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
+    assert metres(opened(folder, FrameNumbers(4, 5, 10)), 0) == pytest.approx(6)
+    assert metres(opened(folder, FrameNumbers(10, 300, 400)), 0) == pytest.approx(1), "a folder of this range alone"
+
+
+def test_a_continued_run_reads_the_frames_that_follow(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
+    whole = opened(folder, FrameNumbers(4, 6, 10, first=6))
+    assert metres(whole, 6) == pytest.approx(7) and metres(whole, 5) == pytest.approx(6)
+    following = opened(folder, FrameNumbers(10, 20, 40, first=20))
+    assert metres(following, 20) == pytest.approx(1) and following.disparity(frame(19)) is None
+
+
+def test_a_missing_number_is_an_error_only_if_its_frame_is_there(tmp_path: Path) -> None:
+    names = [f"{k:06d}.npy" for k in range(8)]
+    folder = folder_of(tmp_path, names)
+    (folder / names[3]).unlink()
+    source = opened(folder, FrameNumbers(8, 0, 8))
+    assert metres(source, 4) == pytest.approx(5)
+    with pytest.raises(SlamError, match="no depth for frame 3"):
+        source.disparity(frame(3))
+
+
+def test_what_is_no_depth_is_unknown(tmp_path: Path) -> None:
+    values = np.full((HEIGHT, WIDTH), 4.0)
+    values[0, :6] = [np.nan, np.inf, -np.inf, 0.0, -2.0, 1e300]
+    np.save(tmp_path / "0.npy", values)
+    disparity = opened(tmp_path, FrameNumbers(1, 0, 1)).disparity(frame(0))
+    assert disparity is not None and disparity.dtype == np.float32
+    assert np.isnan(disparity[0, :6]).all() and (disparity[1:] == 0.25).all()
+
+
+@pytest.mark.parametrize(("scale", "value"), [(256.0, 10.0), (1000.0, 2.56)])
+def test_pictures_of_16_bits_have_a_scale_and_zero_is_unknown(tmp_path: Path, scale: float, value: float) -> None:
+    picture = np.full((HEIGHT, WIDTH), 2560, np.uint16)
+    picture[0, 0] = 0
+    cv2.imwrite(str(tmp_path / "000000.png"), picture)
+    disparity = opened(tmp_path, FrameNumbers(1, 0, 1), "png", png_scale=scale).disparity(frame(0))
+    assert disparity is not None and np.isnan(disparity[0, 0]) and disparity[5, 5] == pytest.approx(1 / value)
+
+
+def test_disparity_may_be_given_and_axes_of_length_one_do_not_matter(tmp_path: Path) -> None:
+    np.save(tmp_path / "0.npy", np.full((1, HEIGHT, WIDTH, 1), 0.125, np.float16))
+    source = DepthFolder(DepthConfig(source=f"npy:{tmp_path}", kind="disparity"), FrameNumbers(1, 0, 1), WIDTH, HEIGHT)
+    disparity = source.disparity(frame(0))
+    assert disparity is not None and disparity.shape == (HEIGHT, WIDTH) and (disparity == 0.125).all()
+
+
+def test_the_digest_is_of_names_and_content(tmp_path: Path) -> None:
+    numbers = FrameNumbers(3, 0, 3)
+    first = opened(folder_of(tmp_path / "a", ["0.npy", "1.npy", "2.npy"]), numbers).sha256
+    copy = folder_of(tmp_path / "b", ["0.npy", "1.npy", "2.npy"])
+    assert opened(copy, numbers).sha256 == first
+    np.save(copy / "1.npy", np.full((HEIGHT, WIDTH), 2.5, np.float32))
+    assert opened(copy, numbers).sha256 != first
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    cv2.imwrite(str(path), picture)
+
+
+BAD: dict[str, tuple[str, Any, str]] = {
+    "integers": ("npy", np.ones((HEIGHT, WIDTH), np.int32), r"must hold floats of shape \(H, W\); got int32"),
+    "colour": ("npy", np.ones((HEIGHT, WIDTH, 3), np.float32), r"must hold floats .* got float32 \(12, 40, 3\)"),
+    "flat": ("npy", np.ones(HEIGHT, np.float32), "must hold floats of shape"),
+    "empty": ("npy", np.ones((0, WIDTH), np.float32), "must hold floats of shape"),
+    "objects": ("npy", np.array([[print]], object), "Python objects, which are not loaded"),
+    "other size": ("npy", np.ones((HEIGHT, WIDTH + 1), np.float32), "is 41x12, the depth before it 40x12"),
+    "8 bits": ("png", np.ones((HEIGHT, WIDTH), np.uint8), "grey picture of 8 bits"),
+    "a picture": ("png", np.ones((HEIGHT, WIDTH, 3), np.uint8), "colour picture of 8 bits"),
+    "text": ("npy", b"hello", "is no .npy array"),
+    "text.": ("png", b"hello", "is no PNG"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_files_that_are_no_depth_are_found_before_the_run(tmp_path: Path, name: str) -> None:
+    kind, content, message = BAD[name]
+    for k in range(3):
+        path = tmp_path / f"{k}.{kind}"
+        if k == 1 and isinstance(content, bytes):
+            path.write_bytes(content)
+        elif kind == "npy":
+            np.save(path, content if k == 1 else np.ones((HEIGHT, WIDTH), np.float32), allow_pickle=True)
+        else:
+            write_png(path, content if k == 1 else np.ones((HEIGHT, WIDTH), np.uint16))
+    with pytest.raises(SlamError, match=message) as caught:
+        opened(tmp_path, FrameNumbers(3, 0, 3), kind)
+    assert f"1.{kind}" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_truncated_and_transposed_depth_is_refused(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "cut", ["0.npy"])
+    (folder / "0.npy").write_bytes((folder / "0.npy").read_bytes()[:-100])
+    with pytest.raises(SlamError, match="truncated"):
+        opened(folder, FrameNumbers(1, 0, 1))
+    (tmp_path / "turned").mkdir()
+    np.save(tmp_path / "turned" / "0.npy", np.ones((WIDTH, HEIGHT), np.float32))
+    with pytest.raises(SlamError, match=r"is 12x40 .* images are 40x12: write rows as rows"):
+        opened(tmp_path / "turned", FrameNumbers(1, 0, 1))
+
+
+def test_counts_and_folders_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path / "depth", ["0.npy", "1.npy", "2.npy"])
+    with pytest.raises(SlamError, match=r"has 3 frames .* 10 for the whole sequence, or 4, the frames of this run"):
+        opened(folder, FrameNumbers(4, 0, 10))
+    with pytest.raises(SlamError, match="no depth folder"):
+        opened(tmp_path / "nowhere", FrameNumbers(3, 0, 3))
+    with pytest.raises(SlamError, match=r"holds no \.png file"):
+        opened(folder, FrameNumbers(3, 0, 3), "png")

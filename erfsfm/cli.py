@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from erfsfm import __version__
+from erfsfm.cli_pack import pack
 from erfsfm.errors import ErfsfmError
 
 app = typer.Typer(
@@ -52,7 +53,7 @@ def options(
 def train(
     config: Annotated[str, typer.Option(help="a YAML file, or the name of a shipped configuration")],
     dataset: Annotated[
-        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
+        list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder, video or pack; repeat")
     ] = None,
     output: Annotated[Path, typer.Option(help="receives weights, checkpoints and logs")] = Path("runs/train"),
     resume: Annotated[bool, typer.Option("--resume", help="resume from the last checkpoint in OUTPUT")] = False,
@@ -70,13 +71,13 @@ def train(
     changes = list(overrides or [])
     if seed is not None:
         changes.append(f"training.seed={seed}")
-    experiment = load_experiment(config, changes)
-    if dataset:
-        roots = [*experiment.data.roots, *dataset]
-        experiment = experiment.model_copy(update={"data": experiment.data.model_copy(update={"roots": roots})})
+    experiment = load_experiment(config, changes).with_roots(dataset or [])
     command = shlex.join(["erfsfm", *sys.argv[1:]])
     folder = run_training(experiment, output, resume, device, command, quiet=not sys.stderr.isatty())
     typer.echo(f"weights in {folder}: use them with --weights {folder}")
+
+
+app.command()(pack)
 
 
 @app.command()

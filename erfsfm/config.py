@@ -76,7 +76,7 @@ class DataConfig(Section):
     weather: float = Field(
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
     )
-    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images, MB per process")
+    cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images and labels, MB per process")
     workers: int = Field(default=1, ge=0, description="data loader processes; 0: in the training process")
 
 
@@ -162,6 +162,12 @@ class TrainingConfig(Section):
     """The optimiser and the loop."""
 
     steps: int = Field(default=200_000, ge=1, description="optimisation steps")
+    minutes: float = Field(
+        default=0.0,
+        ge=0,
+        description="longest time of the loop, earlier parts of a resumed run included; the schedule follows steps or "
+        "time, whichever is farther; 0: no limit",
+    )
     batch: int = Field(default=4, ge=1, description="snippets per step and device")
     devices: int = Field(
         default=1, ge=1, description="GPUs, or processes on a CPU; batch normalisation is synchronised on GPUs alone"
@@ -213,12 +219,19 @@ class ExperimentConfig(Section):
         default=None, description="weights to start from; presets may differ, and widths by a factor of two"
     )
 
+    def with_roots(self, roots: Sequence[Path]) -> Self:
+        """The same experiment on further data sets."""
+        data = self.data.model_copy(update={"roots": [*self.data.roots, *roots]})
+        return self.model_copy(update={"data": data})
+
     @model_validator(mode="after")
-    def _masks_exist(self) -> Self:
+    def _parts_agree(self) -> Self:
         if self.loss.mask_weight > 0 and not self.network.masks:
             raise ValueError("loss.mask_weight needs network.masks: true")
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
+        if self.training.minutes > 0 and self.training.devices > 1:
+            raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
         return self
 
 

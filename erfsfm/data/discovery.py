@@ -1,4 +1,4 @@
-"""Recordings under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders and videos.
+"""Recordings under a root: KITTI odometry (real or simulated), KITTI raw drives, image folders, videos, packs.
 
 Discovery reads folder names and the first image of each recording, and counts the frames of videos. A recording
 with missing frame numbers is split there, so that no snippet spans a gap in time.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from erfsfm.data.kitti_raw import open_drive
+from erfsfm.data.pack_index import INDEX_FILE, read_pack
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video
 from erfsfm.errors import DataError
@@ -48,6 +49,8 @@ def discover(root: Path) -> list[Recording]:
 
 
 def _recordings_at(root: Path) -> list[Recording]:
+    if (root / INDEX_FILE).is_file():
+        return read_pack(root)
     odometry = find_odometry_root(root)
     if odometry is not None:
         return [r for folder in sorted(odometry.folders()) for r in _odometry(odometry, folder)]

@@ -21,6 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.data.array_cache import ArrayCache
+from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.errors import TrainingError
 from erfsfm.files import write_atomically
@@ -60,16 +62,23 @@ class DriveLabels:
         return self.folder / "poses.npy"
 
     def label_file(self, target: int) -> Path:
-        """Least and most inverse depth of one frame."""
+        """Least and most inverse depth of one frame, as measured."""
         return self.folder / f"{self.size[1]}x{self.size[0]}" / f"{target:06d}.npz"
 
-    def structure(self, first: int, sources: int) -> TeacherStructure:
-        """Of the snippet that begins at a frame."""
+    def compact_file(self, target: int) -> Path:
+        """The same rounded, in a data set that was packed."""
+        return self.label_file(target).with_suffix(".webp")
+
+    def has_label(self, target: int) -> bool:
+        """Whether a frame has a label in either form."""
+        return self.label_file(target).is_file() or self.compact_file(target).is_file()
+
+    def motion(self, first: int, sources: int) -> NDArray[np.float32]:
+        """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
         target = first + sources // 2
-        least, most = self.label(target)
         others = np.delete(np.arange(first, first + sources + 1), sources // 2)
         T_source_target = np.linalg.inv(self.T_world_camera[others]) @ self.T_world_camera[target]
-        return TeacherStructure(T_source_target.astype(np.float32), least, most)
+        return np.asarray(T_source_target, dtype=np.float32)
 
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
         """Least and most inverse depth ``(H, W)`` of a frame.
@@ -77,8 +86,11 @@ class DriveLabels:
         Raises:
             TrainingError: the file is missing or damaged.
         """
-        path = self.label_file(target)
+        compact = self.compact_file(target)
+        path = compact if compact.is_file() else self.label_file(target)
         try:
+            if path == compact:
+                return decode(path.read_bytes())
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -100,7 +112,10 @@ class DriveLabels:
             cv2.imwrite(str(placed), image[..., ::-1])
             return placed
 
-        T_world_camera = drive_poses(recording.frames_name, len(recording), camera, put_image, weights)
+        self.keep_poses(drive_poses(recording.frames_name, len(recording), camera, put_image, weights))
+
+    def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
+        """Write the poses ``(N, 4, 4)`` of all frames."""
         write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
 
     def measure_labels(self, targets: Sequence[int]) -> int:
@@ -124,12 +139,20 @@ class DriveLabels:
 
 
 class ManyViewTeacher:
-    """Labels of several drives, kept in one folder."""
+    """Labels of several drives, kept in one folder.
 
-    def __init__(self, folder: Path, size: tuple[int, int], stride: int) -> None:
+    Args:
+        folder: of all drives.
+        size: height and width of the labels.
+        stride: every how many frames there is one.
+        cache_mb: memory for labels that were read.
+    """
+
+    def __init__(self, folder: Path, size: tuple[int, int], stride: int, cache_mb: int = 0) -> None:
         self._folder = folder
         self._size = size
         self._stride = stride
+        self._labels = ArrayCache(cache_mb, (2, *size), np.float16)
         self._drives: dict[int, DriveLabels] = {}
 
     def drive(self, recording: Recording) -> DriveLabels:
@@ -139,6 +162,12 @@ class ManyViewTeacher:
             folder = self._folder / _digest(recording)
             known = self._drives[id(recording)] = DriveLabels(recording, folder, self._size, self._stride)
         return known
+
+    def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
+        """Of the snippet that begins at a frame."""
+        drive, target = self.drive(recording), first + sources // 2
+        least, most = self._labels.get((id(recording), target), lambda: np.stack(drive.label(target)))
+        return TeacherStructure(drive.motion(first, sources), least, most)
 
     def prepare(self, recordings: Sequence[Recording], sources: int, weights: str, progress: Progress) -> None:
         """Compute what is not there yet, in as many processes as there are cores.
@@ -170,7 +199,7 @@ class ManyViewTeacher:
 
 def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
     """Frames without a label yet, in portions."""
-    frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
+    frames = [target for target in drive.targets(sources) if not drive.has_label(target)]
     for first in range(0, len(frames), _CHUNK):
         yield frames[first : first + _CHUNK]
 

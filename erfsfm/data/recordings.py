@@ -27,17 +27,18 @@ class Recording:
     """Frames of one drive: ``images`` are their files; of a ``video`` each is the video file.
 
     ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which the files
-    beside the images are indexed. ``depth`` and ``poses_file`` are ground truth where it is known; the poses are of
-    camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its folder in an
-    odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a recording with gaps,
-    ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for these alone.
+    beside the images are indexed. ``depth``, perhaps of some frames alone, and ``poses_file`` are ground truth where it
+    is known; the poses are of camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the
+    name of its folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a
+    recording with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for
+    these alone. ``without_stops`` says that frames in which the car stands still were taken out when it was packed.
     """
 
     name: str
     images: tuple[Path, ...]
     camera: Camera
     video: Video | None = None
-    depth: tuple[Path, ...] | None = None
+    depth: tuple[Path | None, ...] | None = None
     poses_file: Path | None = None
     t_camera_cam0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: int = 0
@@ -45,6 +46,7 @@ class Recording:
     oxts: Path | None = None
     skipped: int = 0
     stored: int = 0
+    without_stops: bool = False
 
     def __len__(self) -> int:
         return len(self.images)
@@ -84,10 +86,9 @@ class Recording:
         return resize_image(image, height, width)
 
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
-        """z-depth in metres ``(H, W)``, 0 where unknown; None where the recording has no depth."""
-        if self.depth is None:
-            return None
-        return read_values(self.depth[index]).astype(np.float32) / np.float32(256)
+        """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""
+        path = None if self.depth is None else self.depth[index]
+        return None if path is None else read_values(path).astype(np.float32) / np.float32(256)
 
     def true_poses(self, fidelity: Fidelity = "default") -> NDArray[np.float64] | None:
         """``T_world_camera`` ``(N, 4, 4)``, or None where the recording has no poses.

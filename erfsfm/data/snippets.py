@@ -63,7 +63,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._draws = draws
         self._first_draw = first_draw
         self._rank = rank
-        self._cache = ImageCache(config.data.cache_mb, config.network.height, config.network.width)
+        images_mb = config.data.cache_mb - (0 if many_views is None else labels_mb(config.data))
+        self._cache = ImageCache(images_mb, config.network.height, config.network.width)
         self._structures = StructureCache(config.teacher.cache)
         self._many_views = many_views
         length = config.network.sources + 1
@@ -126,7 +127,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
             return None
         if self._many_views is None:
             return self._structures.structure(images, K)
-        return self._many_views.drive(snippet.recording).structure(snippet.first, self._config.network.sources)
+        return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):
@@ -143,13 +144,13 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
         chosen = np.linspace(0, len(windows) - 1, min(config.data.validation_snippets, len(windows)))
-        self._snippets = [windows[int(i)] for i in chosen.round()]
+        self.snippets = [windows[int(i)] for i in chosen.round()]
 
     def __len__(self) -> int:
-        return len(self._snippets)
+        return len(self.snippets)
 
     def __getitem__(self, item: int) -> dict[str, Tensor]:
-        snippet, network = self._snippets[item], self._network
+        snippet, network = self.snippets[item], self._network
         recording, length = snippet.recording, network.sources + 1
         images = load_window(self._cache, snippet, length)
         sample = as_tensors(images, recording.camera.resized(network.width, network.height).K)
@@ -163,6 +164,11 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
             sources = np.delete(window, network.sources // 2, axis=0)
             sample["T_source_target"] = torch.from_numpy(np.linalg.inv(sources) @ T_world_camera[middle])
         return sample
+
+
+def labels_mb(config: DataConfig) -> int:
+    """The part of ``data.cache_mb`` for labels of many views: larger than images, but fewer."""
+    return config.cache_mb * 2 // 5
 
 
 def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
@@ -282,10 +288,10 @@ def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> 
 
 def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Recording]:
     """The stretches of KITTI raw drives in which the car moves; other recordings as they are."""
-    raw = [recording for recording in recordings if recording.name.startswith("kitti_raw/")]
+    raw = [recording for recording in recordings if _may_stop(recording)]
     if config.static_frames == "keep" or not raw:
         return recordings
-    kept = [part for r in recordings for part in (moving_parts(r) if r.name.startswith("kitti_raw/") else [r])]
+    kept = [part for r in recordings for part in (moving_parts(r) if _may_stop(r) else [r])]
     lost = sum(map(len, recordings)) - sum(map(len, kept))
     without_speed = sum(recording.oxts is None for recording in raw)
     logger.info(
@@ -297,6 +303,10 @@ def _without_stops(recordings: list[Recording], config: DataConfig) -> list[Reco
     if not kept:
         raise DataError("the car stands still in every frame found: data.static_frames=keep trains on them")
     return kept
+
+
+def _may_stop(recording: Recording) -> bool:
+    return recording.name.startswith("kitti_raw/") and not recording.without_stops
 
 
 def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:

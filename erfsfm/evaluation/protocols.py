@@ -54,7 +54,7 @@ def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, ev
     if not recordings:
         raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")
     leak = refuse_leak(networks, [r.frames_name for r in recordings], allow_leak)
-    frames = [(r, i) for r in recordings for i in range(0, len(r), every)]
+    frames = [(r, i) for r in recordings for i in range(0, len(r), every) if r.depth and r.depth[i]]
     truths = [r.true_depth(i) for r, i in frames]
     sizes = {t.shape for t in truths if t is not None}
     if len(sizes) > 1:

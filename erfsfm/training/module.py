@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Self
 
 import lightning
@@ -30,11 +31,17 @@ _CONSTANT_STEPS = 100
 
 
 class SelfSupervision(lightning.LightningModule):
-    """Depth and pose networks trained together from the photometric error between frames."""
+    """Depth and pose networks trained together from the photometric error between frames.
 
-    def __init__(self, config: ExperimentConfig) -> None:
+    Args:
+        config: the experiment.
+        clock: seconds that the loop has taken, earlier parts of a resumed run included.
+    """
+
+    def __init__(self, config: ExperimentConfig, clock: Callable[[], float] = lambda: 0.0) -> None:
         super().__init__()
         self.config = config
+        self._clock = clock
         plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
         self._warm_up = config.model_copy(update={"loss": plain})
         geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
@@ -142,9 +149,15 @@ class SelfSupervision(lightning.LightningModule):
         else:
             optimiser = torch.optim.Adam([{"params": rest}, slowly], lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser, lambda step: learning_rate_factor(training.schedule, min(step / training.steps, 1))
+            optimiser, lambda step: learning_rate_factor(training.schedule, self._progress(step))
         )
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _progress(self, step: int) -> float:
+        """Fraction of the run that is done, by steps or by time, whichever is farther."""
+        training = self.config.training
+        by_time = self._clock() / (60 * training.minutes) if training.minutes else 0.0
+        return min(max(step / training.steps, by_time), 1)
 
     def on_validation_epoch_start(self) -> None:
         """Start a new validation."""

@@ -6,24 +6,22 @@ import logging
 import os
 import sys
 import warnings
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, Timer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.warnings import PossibleUserWarning
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
@@ -36,6 +34,7 @@ from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.progress import ProgressLine
+from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
 
@@ -79,10 +78,13 @@ def train(
     if config.data.validation and not validation and rank == 0:
         logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
-    module = SelfSupervision(config)
+    timer = Timer(timedelta(minutes=config.training.minutes) if config.training.minutes else None, verbose=False)
+    module = SelfSupervision(config, timer.time_elapsed)
     batch, workers = config.training.batch, config.data.workers
     together = batch * config.training.devices
-    many_views = _many_views(training, config, output, quiet or rank > 0) if config.teacher.views == "many" else None
+    many_views = None
+    if config.teacher.views == "many":
+        many_views = measured_views(training, config, config.teacher.cache or output / "teacher", quiet or rank > 0)
     draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
@@ -92,9 +94,14 @@ def train(
         module.take_imagenet()
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = DataLoader(
-        draws, batch, num_workers=workers, worker_init_fn=_single_threaded_worker, persistent_workers=workers > 0
+        draws,
+        batch,
+        num_workers=workers,
+        pin_memory=choose_device(device).type == "cuda",
+        worker_init_fn=_single_threaded_worker,
+        persistent_workers=workers > 0,
     )
-    trainer = _trainer(config, output, device, quiet or rank > 0, keeper, done_steps)
+    trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if rank == 0:
         folder.write_config(config)
     _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
@@ -102,23 +109,6 @@ def train(
         sys.exit()
     keeper.save(module, trainer.global_step)
     return output
-
-
-def _many_views(recordings: list[Recording], config: ExperimentConfig, output: Path, quiet: bool) -> ManyViewTeacher:
-    """The teacher's measurements of all drives, made where they are not there yet."""
-    folder, size = config.teacher.cache or output / "teacher", (config.network.height, config.network.width)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done)
-
-        teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
-    return teacher
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:
@@ -167,7 +157,12 @@ def _start_from(module: SelfSupervision, name: str) -> list[str]:
 
 
 def _trainer(
-    config: ExperimentConfig, output: Path, device: str, quiet: bool, keeper: WeightKeeper, done_steps: int
+    config: ExperimentConfig,
+    output: Path,
+    device: str,
+    quiet: bool,
+    callbacks: tuple[WeightKeeper, Timer],
+    done_steps: int,
 ) -> lightning.Trainer:
     training = config.training
     on_cpu = choose_device(device).type == "cpu"
@@ -205,11 +200,11 @@ def _trainer(
         max_steps=training.steps,
         gradient_clip_val=training.gradient_clip or None,
         check_val_every_n_epoch=None,
-        val_check_interval=training.validate_every if keeper.validates else None,
+        val_check_interval=training.validate_every if callbacks[0].validates else None,
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, keeper, *progress],
+        callbacks=[latest, *callbacks, *progress],
         plugins=[AtomicCheckpoints()],
         enable_progress_bar=False,
         enable_model_summary=False,

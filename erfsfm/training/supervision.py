@@ -1,0 +1,20 @@
+"""The many-view teacher's measurements of all training drives, made before the first step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import labels_mb
+from erfsfm.training.progress import stage_bars
+
+
+def measured_views(recordings: list[Recording], config: ExperimentConfig, folder: Path, quiet: bool) -> ManyViewTeacher:
+    """The teacher in a folder, with what is not there yet measured."""
+    size = (config.network.height, config.network.width)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, labels_mb(config.data))
+    with stage_bars(quiet) as show:
+        teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
+    return teacher

@@ -5,6 +5,8 @@ Real recordings are packed whole. Simulated ones, which can be made again, are s
 
 from __future__ import annotations
 
+import os
+import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -114,9 +116,14 @@ def pack(
             drives.append(_encoded(recording, config, teacher, quality))
     held_out = _validation_drives(validation, config, quality)
     kept = _fitting(drives, int(megabytes * 1e6) - sum(drive.size for drive in held_out), config)
-    entries = [_write(output, f"{number:04d}", drive, config) for number, drive in enumerate([*kept, *held_out])]
-    write_index(output, PackIndex(recordings=entries))
-    _write_teacher(output, kept, config, trained_on(training))
+    unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
+    try:
+        entries = [_write(unfinished, f"{n:04d}", drive, config) for n, drive in enumerate([*kept, *held_out])]
+        write_index(unfinished, PackIndex(recordings=entries))
+        _write_teacher(unfinished, kept, config, trained_on(training))
+        unfinished.replace(output)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
     return _summary(output, drives, kept)
 
 

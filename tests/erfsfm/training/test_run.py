@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -312,6 +313,46 @@ def test_patience_ends_a_run_also_after_a_resume(
     interrupted(monkeypatch, config, tmp_path / "cut", 2)
     assert load_model(train(config, tmp_path / "cut", resume=True, device="cpu") / "last").record.step == end
     assert same(tmp_path / "whole", tmp_path / "cut")
+
+
+class Clock:
+    """Time that passes by one second a step."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        original = SelfSupervision.training_step
+
+        def timed(module: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+            self.now += 1
+            return original(module, batch, index)
+
+        monkeypatch.setattr(SelfSupervision, "training_step", timed)
+        monkeypatch.setattr("lightning.pytorch.callbacks.timer.time", SimpleNamespace(monotonic=lambda: self.now))
+
+
+def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Six seconds, at a second a step, are six steps, whatever the number of steps allowed."""
+    roots = [world, held_out]
+    six = configure(small, roots, training={"steps": 6, "schedule": "cosine", "validate_every": 100})
+    timed = configure(small, roots, training={**six.training.model_dump(), "steps": 1000, "minutes": 0.1})
+    train(six, tmp_path / "six", device="cpu")
+    Clock(monkeypatch)
+    train(timed, tmp_path / "timed", device="cpu")
+    record = load_model(tmp_path / "timed" / "last").record
+    assert record.step == 6 and "abs_rel" in record.metrics, "the end is validated"
+    assert same(tmp_path / "timed" / "last", tmp_path / "six" / "last")
+    interrupted(monkeypatch, timed, tmp_path / "cut", step=4)
+    train(timed, tmp_path / "cut", resume=True, device="cpu")
+    assert same(tmp_path / "cut" / "last", tmp_path / "six" / "last")
+    train(timed, tmp_path / "cut", resume=True, device="cpu")
+    assert load_model(tmp_path / "cut" / "last").record.step == 6, "no time is left"
+
+
+def test_several_devices_have_no_common_clock(small: Small, world: Path) -> None:
+    with pytest.raises(ValueError, match=r"training\.minutes needs training\.devices: 1"):
+        configure(small, [world], training={"minutes": 1, "devices": 2})
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,57 @@
+"""Labels as small pictures: what stays, and by how much values change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from erfsfm.data.compact_label import decode, encode
+
+SIZE = (48, 64)
+Bounds = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+def measured(sigma: float) -> Bounds:
+    """A road that comes nearer towards the lower edge."""
+    inverse_depth = np.tile(np.geomspace(0.005, 0.4, SIZE[0])[:, None], SIZE[1])
+    return (inverse_depth * np.exp(-sigma)).astype(np.float32), (inverse_depth * np.exp(sigma)).astype(np.float32)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.037, 0.13, 0.5])
+def test_values_move_by_less_than_their_sigma(sigma: float) -> None:
+    least, most = measured(sigma)
+    got_least, got_most = (bound.astype(np.float32) for bound in decode(encode(least, most)))
+    moved = np.log(got_least * got_most / (least * most)) / 2
+    assert np.sqrt(np.mean(moved**2)) < max(0.6 * sigma, 0.01)
+    width = np.log(got_most / got_least) / np.log(most / least)
+    assert (width > 0.65).all() and (width < 1.5).all()
+
+
+def test_what_is_unknown_stays_unknown() -> None:
+    least, most = measured(0.03)
+    least[:8], most[:8] = 0, 1 / 60  # the sky
+    most[20:30, :32] = np.inf  # something in front of the road
+    least[30:40], most[30:40] = 0, np.inf
+    got_least, got_most = decode(encode(least, most))
+    assert got_least.dtype == got_most.dtype == np.float16 and got_least.shape == SIZE
+    np.testing.assert_array_equal(got_least > 0, least > 0)
+    np.testing.assert_array_equal(np.isfinite(got_most), np.isfinite(most))
+    np.testing.assert_allclose(got_most[:8].astype(float), 1 / 60, rtol=0.02)
+    np.testing.assert_allclose(got_least[20:30, :32].astype(float), least[20:30, :32], rtol=0.02)
+
+
+def test_packing_again_changes_nothing() -> None:
+    once = encode(*measured(0.05))
+    assert encode(*decode(once)) == once
+
+
+def test_half_precision_as_measured_is_taken() -> None:
+    least, most = (bound.astype(np.float16) for bound in measured(0.03))
+    assert len(encode(least, most)) < least.nbytes / 4
+
+
+@pytest.mark.parametrize("data", [b"", b"no picture"])
+def test_other_files_are_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match="no picture"):
+        decode(data)

@@ -1,0 +1,179 @@
+"""A pack trains in place of the data that it was made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from erfsfm.checkpoint import load_model
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
+from erfsfm.errors import ConfigError, DataError
+from erfsfm.training.pack import PackSummary, pack
+from erfsfm.training.run import train, trained_on
+
+Small = dict[str, dict[str, Any]]
+SIZE, STRIDE = (32, 64), 3
+
+
+@pytest.fixture
+def roots(tmp_path: Path, write_root: Callable[..., Path]) -> list[Path]:
+    """Twelve real frames, three worlds of ten to twenty, and one to validate on."""
+    real = write_root(tmp_path / "kitti", frames=12, step=(0.0, 0.0, 0.05))
+    worlds = [
+        write_root(tmp_path / f"world{n}", frames=10 + 5 * n, seed=n, step=(0.0, 0.0, 0.05 + n / 100)) for n in range(3)
+    ]
+    return [real, *worlds, write_root(tmp_path / "held_out", frames=9, seed=500, depth=True)]
+
+
+@pytest.fixture
+def config(small: Small, roots: list[Path], tmp_path: Path) -> ExperimentConfig:
+    """Of a training by many views, measured already."""
+    data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3, "exclude": []}
+    teacher = {"views": "many", "stride": STRIDE, "structure_weight": 1.0, "translation_weight": 1.0}
+    tree = small | {
+        "data": small["data"] | data | {"ranges": {"kitti_odometry/00": "2:11"}},
+        "teacher": teacher | {"cache": tmp_path / "measured"},
+        "loss": {"photometric_weight": 0.0},
+    }
+    config = ExperimentConfig.model_validate(tree)
+    measure(config)
+    return config
+
+
+def measure(config: ExperimentConfig) -> None:
+    """A teacher that sees a slope, whose depth is that of the frame's number."""
+    assert config.teacher.cache is not None
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
+    for recording in split_recordings(config.data)[0]:
+        drive = teacher.drive(recording)
+        T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
+        T_world_camera[:, 2, 3] = 0.3 * np.arange(len(recording))
+        drive.keep_poses(T_world_camera)
+        for target in drive.targets(config.network.sources):
+            least = np.full(SIZE, (1 + recording.start + target) / 100, np.float16)
+            drive.label_file(target).parent.mkdir(exist_ok=True)
+            np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
+
+
+def on_pack(config: ExperimentConfig, output: Path) -> ExperimentConfig:
+    data = config.data.model_copy(update={"roots": [output]})
+    teacher = config.teacher.model_copy(update={"cache": output / "teacher"})
+    return config.model_copy(update={"data": data, "teacher": teacher})
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def draws(config: ExperimentConfig) -> SnippetDraws:
+    assert config.teacher.cache is not None
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
+    return SnippetDraws(split_recordings(config.data)[0], config, 100, many_views=teacher)
+
+
+def test_it_trains_with_the_same_record_licence_and_resume(config: ExperimentConfig, tmp_path: Path) -> None:
+    done = pack(config, tmp_path / "pack", megabytes=5)
+    assert (done.real_frames, done.simulated_frames, done.frames_left_out) == (9, 45, 0)
+    files = sorted((tmp_path / "pack").rglob("*"))
+    original = load_model(train(config, tmp_path / "original", device="cpu")).record
+    packed = on_pack(config, tmp_path / "pack")
+    record = load_model(train(packed, tmp_path / "packed", device="cpu")).record
+    assert record.trained_on == original.trained_on == ["simulated/0-2", "kitti_odometry/00[2:11]"]
+    assert record.licence == original.licence
+    assert record.metrics.keys() == original.metrics.keys() >= {"abs_rel", "photometric"}
+    longer = packed.model_copy(update={"training": packed.training.model_copy(update={"steps": 6})})
+    train(longer, tmp_path / "packed", resume=True, device="cpu")
+    assert load_model(tmp_path / "packed" / "last").record.step == 6
+    assert sorted((tmp_path / "pack").rglob("*")) == files, "training measures nothing anew"
+
+
+def test_samples_are_those_of_the_originals(config: ExperimentConfig, tmp_path: Path) -> None:
+    pack(config, tmp_path / "pack", megabytes=5, quality=95)
+    original, packed = draws(config), draws(on_pack(config, tmp_path / "pack"))
+    for number in range(8):
+        one, other = original.draw(number), packed.draw(number)
+        assert (other["target"] - one["target"]).abs().mean() < 0.03
+        torch.testing.assert_close(other["K"], one["K"])
+        torch.testing.assert_close(other["T_source_target"], one["T_source_target"])
+        for bound in ("least", "most"):
+            torch.testing.assert_close(other[bound], one[bound], atol=0, rtol=0.03)
+
+
+def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentConfig, tmp_path: Path) -> None:
+    pack(config, tmp_path / "pack", megabytes=5)
+    _, held_out = split_recordings(config.data)
+    _, packed = split_recordings(on_pack(config, tmp_path / "pack").data)
+    original, again = ValidationSnippets(held_out, config), ValidationSnippets(packed, config)
+    assert len(original) == len(again) == 3
+    for one, other in zip(original, again):
+        assert one.keys() == other.keys() >= {"depth", "T_source_target"}
+        torch.testing.assert_close(other["T_source_target"], one["T_source_target"])
+        assert torch.equal(other["depth"], one["depth"])
+
+
+def test_simulated_drives_are_shortened_until_all_fits(config: ExperimentConfig, tmp_path: Path) -> None:
+    whole = pack(config, tmp_path / "whole", megabytes=5)
+    limit = whole.size - 10_000
+    done = pack(config, tmp_path / "pack", megabytes=limit / 1e6)
+    assert done.size == size_of(tmp_path / "pack") <= limit
+    assert done.real_frames == whole.real_frames
+    assert 0 < done.simulated_frames == whole.simulated_frames - done.frames_left_out < whole.simulated_frames
+    assert done.labels == whole.labels - done.labels_left_out == len(list((tmp_path / "pack").rglob("*.webp")))
+    packed = split_recordings(on_pack(config, tmp_path / "pack").data)[0]
+    assert trained_on(packed) == trained_on(split_recordings(config.data)[0])
+    worlds = [len(recording) for recording in packed if recording.name.startswith("simulated/")]
+    assert max(worlds) - min(worlds) <= max(0, max(worlds) - 10), "the longest lose first"
+    draws(on_pack(config, tmp_path / "pack")).draw(0)
+
+
+def test_real_recordings_that_do_not_fit_are_one_line(config: ExperimentConfig, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"0\.\d MB more at least: allow more --megabytes") as caught:
+        pack(config, tmp_path / "pack", megabytes=0.001)
+    assert "\n" not in str(caught.value) and not (tmp_path / "pack").exists()
+
+
+def test_what_is_there_is_never_overwritten(config: ExperimentConfig, tmp_path: Path) -> None:
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "thesis.txt").touch()
+    with pytest.raises(ConfigError, match="is not empty: choose a new folder"):
+        pack(config, tmp_path / "pack")
+
+
+def test_a_pack_that_fails_leaves_nothing(
+    config: ExperimentConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr("erfsfm.training.pack.write_index", fail)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(OSError, match="the disk is full"):
+        pack(config, tmp_path / "pack")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_measurements_need_a_place(config: ExperimentConfig, tmp_path: Path) -> None:
+    nowhere = config.model_copy(update={"teacher": config.teacher.model_copy(update={"cache": None})})
+    with pytest.raises(ConfigError, match=r"--set teacher\.cache=FOLDER"):
+        pack(nowhere, tmp_path / "pack")
+
+
+def test_drives_without_a_teacher_keep_their_stops_out(
+    small: Small, write_raw: Callable[..., Path], tmp_path: Path
+) -> None:
+    drive = write_raw(tmp_path / "raw", drive="2011_10_03_drive_0099", speeds=[5] * 6 + [0] * 3 + [5] * 6)
+    tree = small | {"data": small["data"] | {"roots": [drive], "exclude": []}}
+    config = ExperimentConfig.model_validate(tree)
+    done: PackSummary = pack(config, tmp_path / "pack")
+    assert (done.real_frames, done.labels) == (24, 0)
+    names = [recording.frames_name for recording in discover(tmp_path / "pack")]
+    assert names == [f"kitti_raw/2011_10_03_drive_0099{frames}" for frames in ("[0:6]", "[9:15]") * 2]
+    train(on_pack(config, tmp_path / "pack"), tmp_path / "run", device="cpu")

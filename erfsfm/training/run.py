@@ -78,10 +78,9 @@ def train(
     if config.data.validation and not validation and rank == 0:
         logger.warning("training runs without validation: no recording of data.validation is among the data")
     lightning.seed_everything(config.training.seed, verbose=False)
-    timer = Timer(timedelta(minutes=config.training.minutes) if config.training.minutes else None, verbose=False)
+    timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    batch, workers = config.training.batch, config.data.workers
-    together = batch * config.training.devices
+    together = config.training.batch * config.training.devices
     many_views = None
     if config.teacher.views == "many":
         many_views = measured_views(training, config, config.teacher.cache or output / "teacher", quiet or rank > 0)
@@ -93,14 +92,7 @@ def train(
     elif config.pretrained == "imagenet" and not resume:
         module.take_imagenet()
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
-    loader = DataLoader(
-        draws,
-        batch,
-        num_workers=workers,
-        pin_memory=choose_device(device).type == "cuda",
-        worker_init_fn=_single_threaded_worker,
-        persistent_workers=workers > 0,
-    )
+    loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if rank == 0:
         folder.write_config(config)
@@ -109,6 +101,23 @@ def train(
         sys.exit()
     keeper.save(module, trainer.global_step)
     return output
+
+
+def _timer(minutes: float) -> Timer:
+    """Time of the loop, kept in checkpoints; it ends the run after some minutes, if any are given."""
+    return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
+
+
+def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
+    workers = config.data.workers
+    return DataLoader(
+        draws,
+        config.training.batch,
+        num_workers=workers,
+        pin_memory=choose_device(device).type == "cuda",
+        worker_init_fn=_single_threaded_worker,
+        persistent_workers=workers > 0,
+    )
 
 
 def trained_on(recordings: list[Recording]) -> list[str]:

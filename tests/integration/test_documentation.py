@@ -70,6 +70,10 @@ SLOW = (
 NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^make ", "it sets up, lints or starts these very tests"),
     (r"^pip install ", "it downloads"),
+    (
+        r"--config lite0-gpu ",
+        "it wants hours of labels, and a GPU; tests/erfsfm/training/test_pack.py packs small data",
+    ),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
 if importlib.util.find_spec("onnxruntime") is None:

@@ -106,9 +106,7 @@ def pack(
         raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
-    teacher = None
-    if config.teacher.views == "many" and config.teacher.cache is not None:
-        teacher = measured_views(training, config, config.teacher.cache, quiet)
+    teacher = measured_views(training, config, output / TEACHER_FOLDER, quiet)
     drives = []
     with stage_bars(quiet) as show:
         for done, recording in enumerate(training):

@@ -81,9 +81,7 @@ def train(
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
     together = config.training.batch * config.training.devices
-    many_views = None
-    if config.teacher.views == "many":
-        many_views = measured_views(training, config, config.teacher.cache or output / "teacher", quiet or rank > 0)
+    many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
     draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)

@@ -11,10 +11,21 @@ from erfsfm.data.snippets import labels_mb
 from erfsfm.training.progress import stage_bars
 
 
-def measured_views(recordings: list[Recording], config: ExperimentConfig, folder: Path, quiet: bool) -> ManyViewTeacher:
-    """The teacher in a folder, with what is not there yet measured."""
+def measured_views(
+    recordings: list[Recording], config: ExperimentConfig, default: Path, quiet: bool
+) -> ManyViewTeacher | None:
+    """The teacher, with what is not there yet measured; None where the experiment has no many views.
+
+    Args:
+        recordings: to train on.
+        config: its ``teacher.cache`` is the folder of the measurements.
+        default: that folder if it names none.
+        quiet: no progress bar.
+    """
+    if config.teacher.views != "many":
+        return None
     size = (config.network.height, config.network.width)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride, labels_mb(config.data))
+    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, labels_mb(config.data))
     with stage_bars(quiet) as show:
         teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
     return teacher

@@ -26,6 +26,7 @@ from slam.config_frontend import (
 )
 
 __all__ = [
+    "DepthConfig",
     "FrontendConfig",
     "GapsConfig",
     "GeometryConfig",
@@ -126,6 +127,14 @@ class PoseGraphConfig(Section):
     max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual beyond which a loop is removed")
 
 
+class DepthConfig(Section):
+    """Depth of the keyframes, see ``depth_refinement.py``."""
+
+    refine: Literal["none", "multiview"] = Field(
+        default="multiview", description="refine learned depth by neighbouring keyframes at the optimised poses"
+    )
+
+
 class MappingConfig(Section):
     """TSDF fusion, see ``mapping.py``; metres, or camera heights under scale mode none."""
 
@@ -147,6 +156,9 @@ class MappingConfig(Section):
     )
     consistency: float = Field(
         default=0.1, gt=0, description="largest relative depth difference to the previous keyframe"
+    )
+    max_relative_sigma: float = Field(
+        default=0.15, gt=0, description="largest sigma of refined depth that is fused, relative to it"
     )
     min_weight: float = Field(default=3.0, ge=0, description="least number of observations of an extracted voxel")
     min_component_triangles: int = Field(
@@ -186,6 +198,7 @@ class SlamConfig(Section):
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
+    depth: DepthConfig = DepthConfig()
     mapping: MappingConfig = MappingConfig()
     output: OutputConfig = OutputConfig()
 

@@ -22,6 +22,7 @@ from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
 from slam.prediction.networks import NetworkPredictor
+from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
@@ -241,9 +242,11 @@ def _run(job: _Job, folder: RunFolder) -> None:
     metrics = estimate_metrics(estimate, job.recording, job.provenance)
     folder.write_metrics(metrics)
     folder.publish()
-    result = replace(estimate, map=job.pipeline.fuse(estimate))
+    quality = DepthQuality(job.recording, estimate.scale.mode)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
     surface = write_map(folder, result, job.recording)
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary))
+    depth = quality.summary(job.settings.depth.refine != "none")
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
     if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, surface.points, surface.colours)

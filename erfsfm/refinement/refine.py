@@ -24,8 +24,8 @@ RESIDUAL = 0.5  # of normalised grey levels, beyond which a pixel loses weight
 RESIDUAL_FLOOR = 0.02  # least variance of the residuals
 SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton steps
 LARGEST_STEP = 0.08
-INDEPENDENT_PIXELS = 6.0  # of a window: residuals of neighbouring pixels are correlated
-SIGMA_FLOOR = 0.025
+INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are correlated
+SIGMA_FLOOR = 0.03
 LEAST_PRIOR_SIGMA = 0.15
 UNDER_ROAD = 1.25  # depth below the camera over the road's from which on nothing can be static
 
@@ -68,7 +68,7 @@ def refine(
     height, width = depth.shape
     inverse = (1 / depth).astype(np.float32)
     change = _coarse_change(target, inverse, neighbours, K, T_neighbour_target)
-    change = _enlarged(change, target)
+    change = _enlarged(np.asarray(cv2.medianBlur(change, 5), np.float32), target)
     projections = [Projection(K, T, height, width) for T in T_neighbour_target]
     views = list(zip(neighbours, projections))
     for _ in range(STEPS):
@@ -81,8 +81,8 @@ def refine(
         moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         change[moving], measured[moving] = 0, False
     prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
-    information = np.where(measured, information, 0) + 1 / prior_sigma**2
-    sigma = np.sqrt(1 / information + SIGMA_FLOOR**2)
+    known = np.where(measured, information, 0) + 1 / prior_sigma**2
+    sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
     return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
 
 
@@ -102,7 +102,7 @@ def _coarse_change(
 
 
 def _enlarged(change: Array, target: Appearance) -> Array:
-    """To full size ``(H, W)``: each pixel takes the change of that neighbour at half size whose grey level is nearest."""
+    """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
     height, width = target.grey.shape
     h, w = change.shape
     u, v = (np.arange(width, dtype=np.float32) - 0.5) / 2, (np.arange(height, dtype=np.float32) - 0.5) / 2
@@ -141,7 +141,7 @@ def _gauss_newton(
     variance = errors / np.maximum(weights, 1e-3) + RESIDUAL_FLOOR
     damping = variance / (INDEPENDENT_PIXELS * SWEEP_SIGMA**2)
     step = np.clip(-products / (squares + damping), -LARGEST_STEP, LARGEST_STEP)
-    return step, INDEPENDENT_PIXELS * squares / variance
+    return step, INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
 
 
 def _under_road(depth: Array, K: NDArray[np.floating], road: Road) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.refinement.appearance import Array
 from erfsfm.refinement.projection import Projection
@@ -14,7 +15,7 @@ from erfsfm.refinement.projection import Projection
 CHANGES: Array = np.concatenate([[-2.4, -1.7], np.arange(-12, 15) / 10]).astype(np.float32)
 LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
 WINDOW_PX = 5
-COST_UNSEEN, WEIGHT_UNSEEN = 0.4, 0.5  # of a pixel outside of the neighbours
+COST_UNSEEN, WEIGHT_UNSEEN = 0.8, 0.5  # of a pixel outside of the neighbours
 COST_OF_CHANGE = 0.1  # a unit of log inverse depth
 _OUTSIDE = 1e3
 
@@ -39,7 +40,10 @@ def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse
             total += np.where(inside, np.minimum(difference, np.float32(LARGEST_DIFFERENCE)), 0)
             seen += inside
         total, seen = cv2.boxFilter(total, -1, window), cv2.boxFilter(seen, -1, window)
-        cost[:] = (total + COST_UNSEEN * WEIGHT_UNSEEN) / (seen + WEIGHT_UNSEEN) + COST_OF_CHANGE * abs(change)
+        # per view: the fewer see a pixel, the more its guess counts
+        cost[:] = (total + COST_UNSEEN * WEIGHT_UNSEEN + COST_OF_CHANGE * len(neighbours) * abs(change)) / (
+            seen + WEIGHT_UNSEEN
+        )
     return costs
 
 
@@ -51,7 +55,7 @@ def warped(image: Array, u: Array, v: Array) -> Array:
     )
 
 
-def is_inside(levels: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def is_inside(levels: Array) -> NDArray[np.bool_]:
     """Which of the levels that ``warped`` gave lie inside of the image."""
     return np.asarray(np.abs(levels) < _OUTSIDE / 100)
 
@@ -63,4 +67,4 @@ def lowest(costs: Array) -> Array:
     before, at, after = (np.take_along_axis(costs, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
     shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1e-6)), -0.5, 0.5)
     position = np.where(best == middle, middle + shift, best)
-    return np.interp(position, np.arange(len(costs)), CHANGES).astype(np.float32)
+    return np.asarray(np.interp(position, np.arange(len(costs)), CHANGES), np.float32)

@@ -26,6 +26,7 @@ SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton steps
 LARGEST_STEP = 0.08
 INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are correlated
 SIGMA_FLOOR = 0.03
+LEAST_FIT = 0.4  # mean weight of the neighbours below which no depth explains them: the guess stays
 LEAST_PRIOR_SIGMA = 0.15
 UNDER_ROAD = 1.25  # depth below the camera over the road's from which on nothing can be static
 
@@ -72,10 +73,11 @@ def refine(
     projections = [Projection(K, T, height, width) for T in T_neighbour_target]
     views = list(zip(neighbours, projections))
     for _ in range(STEPS):
-        step, _ = _gauss_newton(target, views, inverse * np.exp(change))
+        step, _, _ = _gauss_newton(target, views, inverse * np.exp(change))
         change += step
-    _, information = _gauss_newton(target, views, inverse * np.exp(change))
+    _, information, fit = _gauss_newton(target, views, inverse * np.exp(change))
     measured = information > 1 / LEAST_PRIOR_SIGMA**2
+    change[fit < LEAST_FIT] = 0
     if road is not None:
         moving = _under_road(1 / (inverse * np.exp(change)), K, road) & ~_under_road(depth, K, road)
         moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -119,29 +121,32 @@ def _enlarged(change: Array, target: Appearance) -> Array:
 
 def _gauss_newton(
     target: Appearance, views: Sequence[tuple[Appearance, Projection]], inverse_depth: Array
-) -> tuple[Array, Array]:
-    """The next change of log inverse depth ``(H, W)``, and the information about it that the images hold."""
+) -> tuple[Array, Array, Array]:
+    """The next change of log inverse depth ``(H, W)``, the images' information about it, and their mean weight."""
     levels = target.levels
-    squares, products, errors, weights = (np.zeros_like(levels) for _ in range(4))
+    squares, products, errors, weights, seen = (np.zeros_like(levels) for _ in range(5))
     for other, projection in views:
         u, v, inverse_z = projection.pixels(inverse_depth)
         at, along_x, along_y = cv2.split(warped(other.fine, u, v))
         du, dv = projection.motion(u, v, inverse_z, inverse_depth)
-        residual = np.where(is_inside(at), at - levels, 0)
-        weight = np.where(is_inside(at), 1 / np.square(1 + np.square(residual / np.float32(RESIDUAL))), 0)
+        inside = is_inside(at)
+        residual = np.where(inside, at - levels, 0)
+        weight = np.where(inside, 1 / np.square(1 + np.square(residual / np.float32(RESIDUAL))), 0)
         slope = along_x * du + along_y * dv
         squares += weight * slope * slope
         products += weight * slope * residual
         errors += weight * residual * residual
         weights += weight
+        seen += inside
     window = (WINDOW_PX, WINDOW_PX)
-    squares, products, errors, weights = (
-        cv2.boxFilter(part, -1, window) for part in (squares, products, errors, weights)
+    squares, products, errors, weights, seen = (
+        cv2.boxFilter(part, -1, window) for part in (squares, products, errors, weights, seen)
     )
     variance = errors / np.maximum(weights, 1e-3) + RESIDUAL_FLOOR
     damping = variance / (INDEPENDENT_PIXELS * SWEEP_SIGMA**2)
     step = np.clip(-products / (squares + damping), -LARGEST_STEP, LARGEST_STEP)
-    return step, INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
+    information = INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
+    return step, information, weights / np.maximum(seen, 1e-3)
 
 
 def _under_road(depth: Array, K: NDArray[np.floating], road: Road) -> NDArray[np.bool_]:

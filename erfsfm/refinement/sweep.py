@@ -15,7 +15,7 @@ from erfsfm.refinement.projection import Projection
 CHANGES: Array = np.concatenate([[-2.4, -1.7], np.arange(-12, 15) / 10]).astype(np.float32)
 LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
 WINDOW_PX = 5
-COST_UNSEEN, WEIGHT_UNSEEN = 0.8, 0.5  # of a pixel outside of the neighbours
+WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
 COST_OF_CHANGE = 0.1  # a unit of log inverse depth
 _OUTSIDE = 1e3
 
@@ -29,22 +29,29 @@ def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse
         inverse_depth: the guess ``(h, w)``.
     """
     costs = np.empty((len(CHANGES), *levels.shape), np.float32)
-    window = (WINDOW_PX, WINDOW_PX)
+    total, seen = _differences(levels, neighbours, inverse_depth)
+    at_guess = total / np.maximum(seen, np.float32(1e-3))
     for cost, change in zip(costs, CHANGES):
-        changed = inverse_depth * np.exp(change)
-        total, seen = np.zeros_like(levels), np.zeros_like(levels)
-        for other, projection in neighbours:
-            u, v, _ = projection.pixels(changed)
-            difference = np.abs(warped(other, u, v) - levels)
-            inside = difference < _OUTSIDE / 2
-            total += np.where(inside, np.minimum(difference, np.float32(LARGEST_DIFFERENCE)), 0)
-            seen += inside
-        total, seen = cv2.boxFilter(total, -1, window), cv2.boxFilter(seen, -1, window)
-        # per view: the fewer see a pixel, the more its guess counts
-        cost[:] = (total + COST_UNSEEN * WEIGHT_UNSEEN + COST_OF_CHANGE * len(neighbours) * abs(change)) / (
-            seen + WEIGHT_UNSEEN
-        )
+        total, seen = _differences(levels, neighbours, inverse_depth * np.exp(change))
+        # a change out of sight is neither better nor worse than the guess; the fewer see a pixel, the more that counts
+        of_change = COST_OF_CHANGE * len(neighbours) * abs(change)
+        cost[:] = (total + at_guess * WEIGHT_UNSEEN + of_change) / (seen + WEIGHT_UNSEEN)
     return costs
+
+
+def _differences(
+    levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array
+) -> tuple[Array, Array]:
+    """Sums ``(h, w)`` over neighbours of truncated differences, and of how many see a pixel; means over the window."""
+    total, seen = np.zeros_like(levels), np.zeros_like(levels)
+    for other, projection in neighbours:
+        u, v, _ = projection.pixels(inverse_depth)
+        difference = np.abs(warped(other, u, v) - levels)
+        inside = is_inside(difference)
+        total += np.where(inside, np.minimum(difference, np.float32(LARGEST_DIFFERENCE)), 0)
+        seen += inside
+    window = (WINDOW_PX, WINDOW_PX)
+    return np.asarray(cv2.boxFilter(total, -1, window)), np.asarray(cv2.boxFilter(seen, -1, window))
 
 
 def warped(image: Array, u: Array, v: Array) -> Array:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -53,7 +55,7 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         drive = open_sequence(options.dataset, options.sequence, None, options.frames)
         for weights in options.weights:
-            run(drive, weights, options.set, lambda keyframe, name=weights: _note(drive, keyframe, name, errors, shown))
+            run(drive, weights, options.set, partial(_note, drive, Path(weights).name, errors, shown))
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error
     rows = [shown[min(shown, key=lambda index: abs(index - wanted))] for wanted in options.show]
@@ -70,9 +72,8 @@ def run(drive: FrameSequence, weights: str, settings: Sequence[str], compare: Ca
     pipeline.fuse(pipeline.estimate(), compare)
 
 
-def _note(drive: FrameSequence, keyframe: KeyframeDepth, name: str, errors: Errors, shown: dict[int, Shown]) -> None:
+def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Shown], keyframe: KeyframeDepth) -> None:
     """Keep a keyframe's maps and errors."""
-    name = Path(name).name
     depths = {name: keyframe.depth}
     if keyframe.refined is not None:
         depths[f"{name}, refined"] = keyframe.refined.depth
@@ -91,7 +92,7 @@ def _note(drive: FrameSequence, keyframe: KeyframeDepth, name: str, errors: Erro
 
 def table(errors: Errors) -> str:
     """Mean and median relative error of each method, whole and over distance, as Markdown."""
-    bins = list(zip(EDGES_M, EDGES_M[1:]))
+    bins = list(pairwise(EDGES_M))
     lines = ["| depth | all | " + " | ".join(f"{a}-{b} m" for a, b in bins) + " |", "|---|" + "---|" * (len(bins) + 1)]
     for method, parts in errors.items():
         truth, relative = np.concatenate(parts, axis=1)

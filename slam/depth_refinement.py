@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from erfsfm.refinement.appearance import Appearance
 from erfsfm.refinement.refine import RefinedDepth, Road, refine
@@ -44,15 +45,25 @@ class DepthRefiner:
         self._appearance = lru_cache(maxsize=_REMEMBERED)(lambda n: _appearance(image(n)))
 
     def refine(self, n: int, depth: DepthMap, road: Road | None) -> RefinedDepth | None:
-        """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance."""
-        if not (np.isfinite(depth) & (depth > 0)).all():
+        """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance.
+
+        Pixels without depth, as other sources than the networks may have, begin with that of the nearest pixel which
+        has one; what the images do not measure there has an infinite sigma.
+        """
+        unknown = ~(np.isfinite(depth) & (depth > 0))
+        if unknown.all():
             return None
-        neighbours = self._neighbours(n, float(np.median(depth)))
+        neighbours = self._neighbours(n, float(np.median(depth[~unknown])))
         if not neighbours:
             return None
+        if unknown.any():
+            nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+            depth = depth[tuple(nearest)]
         T_neighbour_target = invert(self._T_world_camera[neighbours]) @ self._T_world_camera[n]
         others = [self._appearance(k) for k in neighbours]
-        return refine(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target, road)
+        refined = refine(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target, road)
+        refined.relative_sigma[unknown & ~refined.measured] = np.inf
+        return refined
 
     def _neighbours(self, n: int, median_depth: float) -> list[int]:
         """For each baseline the best keyframe before and the best after."""

@@ -35,7 +35,16 @@ def test_a_standing_camera_has_no_neighbours() -> None:
     assert refiner(np.zeros(20), []).refine(10, DEPTH, None) is None
 
 
-def test_depth_with_holes_is_left_alone() -> None:
+def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured() -> None:
     holes = DEPTH.copy()
-    holes[3, 4] = 0
-    assert refiner(np.arange(20.0), []).refine(10, holes, None) is None
+    holes[10:20, 20:40] = 0
+    holes[0, 0], holes[0, 1] = np.nan, np.inf
+    refined = refiner(np.arange(20.0), []).refine(10, holes, None)
+    assert refined is not None and np.isfinite(refined.depth).all() and (refined.depth > 0).all()
+    unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured
+    assert unmeasured.any() and np.isinf(refined.relative_sigma[unmeasured]).all()
+    assert np.isfinite(refined.relative_sigma[~unmeasured]).all()
+
+
+def test_depth_that_is_unknown_everywhere_is_not_refined() -> None:
+    assert refiner(np.arange(20.0), []).refine(10, np.zeros_like(DEPTH), None) is None

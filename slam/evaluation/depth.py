@@ -28,7 +28,7 @@ class DepthErrors:
         """Add one frame, evenly thinned to 3000 pixels.
 
         Args:
-            depth: estimate ``(H, W)``.
+            depth: estimate ``(H, W)``; where it is not positive or not finite nothing is compared.
             truth: z-depth ``(h, w)`` of any size, 0 where unknown; each pixel is compared with the nearest estimate.
             relative_sigma: sigma of the estimate over it, ``(H, W)``.
         """
@@ -40,14 +40,15 @@ class DepthErrors:
         (height, width), (true_height, true_width) = depth.shape, truth.shape
         at = (2 * v + 1) * height // (2 * true_height), (2 * u + 1) * width // (2 * true_width)
         sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
-        self._depths.append(np.stack([depth[at], truth[v, u], sigma]).astype(np.float32))
+        known = np.isfinite(depth[at]) & (depth[at] > 0)
+        self._depths.append(np.stack([depth[at], truth[v, u], sigma])[:, known].astype(np.float32))
 
     def summary(self) -> dict[str, Any] | None:
         """The numbers over all pixels; None where no frame had truth.
 
         ``coverage`` is the share of errors inside the central interval of so many per cent of the stated noise.
         """
-        if not self._depths:
+        if not any(part.size for part in self._depths):
             return None
         depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
         relative = np.abs(depth - truth) / truth

@@ -45,3 +45,16 @@ def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
     errors.add(depth, np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1))
     summary = errors.summary()
     assert summary is not None and summary["abs_rel"] == 0
+
+
+def test_pixels_without_an_estimate_are_not_compared() -> None:
+    truth = np.full((4, 4), 10, np.float32)
+    depth = np.full((4, 4), 11, np.float32)
+    depth[0], depth[1] = 0, np.nan
+    errors = DepthErrors()
+    errors.add(depth, truth)
+    summary = errors.summary()
+    assert summary is not None and summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
+    nothing = DepthErrors()
+    nothing.add(np.zeros((4, 4), np.float32), truth)
+    assert nothing.summary() is None

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from erfsfm.losses.structure import Bounds, outside, translation_disagreement
+from erfsfm.losses.structure import Bounds, outside, step_disagreement, translation_disagreement
 
 
 def bounds(least: float, most: float) -> Bounds:
@@ -65,3 +65,24 @@ def test_translation_by_hand_with_one_unmeasured():
     predicted = torch.tensor([[0.0, 0.0, 1.0], [5.0, 5.0, 5.0]])
     measured = torch.tensor([[0.0, 0.0, 2.0], [torch.nan] * 3])
     assert translation_disagreement(predicted, measured).item() == pytest.approx(1 / 2.01, rel=1e-5)
+
+
+def test_steps_between_pixels_by_hand():
+    least = torch.full((1, 1, 1, 16), 0.099)
+    least[..., 8:] = 0.198
+    labels = Bounds(least, least * 0.101 / 0.099)
+    edge = (least * labels.most).sqrt()
+    assert step_disagreement(edge, labels).item() == pytest.approx(0, abs=1e-6)
+    assert step_disagreement(5 * edge, labels).item() == pytest.approx(0, abs=1e-6)  # at any scale
+    flat = step_disagreement(torch.full_like(edge, 0.14), labels).item()
+    pairs = [(15, 1), (14, 2), (12, 4), (8, 8)]  # columns apart 1, 2, 4 and 8, and those across the edge
+    expected = sum(crossing / count for count, crossing in pairs) * 0.6931 / 8  # rows have no pairs
+    assert flat == pytest.approx(expected, rel=1e-3)
+
+
+def test_steps_to_pixels_without_a_label_do_not_count():
+    least, most = torch.full((1, 1, 8, 8), 0.1), torch.full((1, 1, 8, 8), 0.11)
+    least[..., ::2, :], most[..., ::2, :] = 0, torch.inf
+    disparity = torch.rand(1, 1, 8, 8, requires_grad=True)
+    step_disagreement(disparity, Bounds(least, most)).backward()
+    assert disparity.grad is not None and not disparity.grad[..., ::2, :].any() and disparity.grad[..., 1::2, :].any()

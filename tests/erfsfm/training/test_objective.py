@@ -390,3 +390,61 @@ def test_the_teacher_loss_is_zero_for_true_outputs_and_positive_for_wrong_ones(b
     assert twice.terms["structure"].item() == pytest.approx(0, abs=1e-3)
     assert twice.terms["unit"].item() == pytest.approx(math.log(2), rel=1e-3)
     assert evaluate(right, config, 1.0, vectors * torch.tensor([0.5] * 3 + [1] * 3)).terms["translation"].item() < 1e-3
+
+
+def _many_views(networks: str = "both", **loss: Any) -> ExperimentConfig:
+    return ExperimentConfig.model_validate(
+        {
+            "network": {"sources": 2},
+            "loss": {"photometric_weight": 0, "smoothness_weight": 0} | loss,
+            "training": {"networks": networks},
+            "teacher": {
+                "views": "many",
+                "rotation_weight": 1,
+                "translation_weight": 1,
+                "structure_weight": 1,
+                "edge_weight": 1,
+            },
+        }
+    )
+
+
+def test_many_views_have_one_unit_that_depth_and_motion_must_have(batch: SnippetBatch) -> None:
+    vectors = torch.tensor([[0.3, 0.0, -0.1, 0.0, 0.1, 0.0], [-0.3, 0.0, 0.1, 0.0, -0.1, 0.0]]).double()
+    height, width = batch.target.shape[-2:]
+    half = torch.full((2, 1, height, width), 0.5).double()
+    T_source_target = pose_vector_to_matrix(vectors * torch.tensor([10.0] * 3 + [1] * 3))[None].expand(2, 2, 4, 4)
+    right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
+    assert evaluate(right, _many_views(), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
+    twice = evaluate(right, _many_views(), 1.0, vectors)
+    assert twice.terms["structure"].item() == pytest.approx(math.log(2 / 1.02), rel=1e-3)
+    assert twice.terms["translation"].item() == pytest.approx(0, abs=1e-3)  # the unit is not the depth's
+
+
+def test_each_network_learns_alone_under_many_views(batch: SnippetBatch) -> None:
+    height, width = batch.target.shape[-2:]
+    half = torch.full((2, 1, height, width), 0.5).double()
+    T_source_target = torch.eye(4).double().expand(2, 2, 4, 4)
+    labelled = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
+
+    class Refused(nn.Module):
+        def forward(self, *_: Any) -> Any:
+            raise AssertionError("this network is not needed")
+
+    pose_net, depth_net = FixedPose(true_poses()), FixedDepth(0.3)
+    for_pose = evaluate_objective(Refused(), pose_net, labelled, _many_views("pose"))
+    assert set(for_pose.terms) >= {"rotation", "translation"} and not for_pose.disparities
+    for_depth = evaluate_objective(depth_net, Refused(), labelled, _many_views("depth"))
+    assert "rotation" not in for_depth.terms and for_depth.terms["structure"].item() > 0
+
+
+def test_many_views_warp_the_images_by_the_measured_motion(batch: SnippetBatch, plane) -> None:
+    in_heights = true_poses() * torch.tensor([10.0] * 3 + [1] * 3)
+    T_source_target = pose_vector_to_matrix(in_heights)[None].expand(2, 2, 4, 4)
+    shape = (2, 1, *batch.target.shape[-2:])
+    unbounded = Bounds(torch.zeros(shape).double(), torch.full(shape, torch.inf).double())
+    labelled = replace(batch, T_source_target=T_source_target, bounds=unbounded)
+    config = _many_views("depth", photometric_weight=1)
+    right = evaluate(labelled, config, 1 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
+    wrong = evaluate(labelled, config, 1.3 / plane.distance, torch.zeros(2, 6).double()).terms["photometric"].item()
+    assert right < 0.5 * wrong

@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError, TrajectoryError
+from slam.exports.export import export
+from slam.exports.options import R_UP_WORLDS, ExportOptions
 from slam.formats.ply import read_ply_points
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
-from slam.results.export import R_UP_WORLD, export
 from slam.results.folder import RunFolder
 from slam.trajectory import read_trajectory
 
 MakeRun = Callable[..., RunFolder]
+
+
+R_UP_WORLD = R_UP_WORLDS["z"]
 
 
 def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> None:

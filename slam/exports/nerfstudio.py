@@ -105,10 +105,13 @@ def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
     if recorded is None and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
     recorded = recorded or {}
-    camera = recorded.get("camera")
-    given: dict[str, Any] = {"name": recorded.get("sequence"), "camera": None if camera is None else Path(camera)}
-    place = dataset if dataset is not None else recorded.get("dataset")
-    return given | {"dataset": None if place is None else Path(place)}
+    camera = Path(recorded["camera"]) if "camera" in recorded else None
+    if dataset is None:
+        place = Path(recorded["dataset"]) if "dataset" in recorded else None
+    else:
+        place = dataset
+        camera = camera if camera is not None and camera.exists() else None  # it may have moved with the images
+    return {"dataset": place, "name": recorded.get("sequence"), "camera": camera}
 
 
 def _interpolated(folder: RunFolder) -> set[int]:

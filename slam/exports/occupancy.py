@@ -20,7 +20,7 @@ _MIN_FREE_AREA, _MIN_OCCUPIED_AREA = 0.25, 0.5  # of a cell
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Cells ``(H, W)``, the first row with the largest y; ``corner`` is x and y of the outer corner at the bottom left."""
+    """Cells ``(H, W)``, largest y first; ``corner`` is x and y of the outer corner at the bottom left."""
 
     cells: NDArray[np.uint8]
     corner: tuple[float, float]

@@ -24,7 +24,7 @@ def prepared(ply: Ply, options: ExportOptions) -> Ply:
     Raises:
         RunError: nothing is left.
     """
-    if len(ply.vertices) == 0:
+    if len(ply.vertices) == 0 or (ply.triangles is not None and len(ply.triangles) == 0):
         raise RunError("the map is empty: there is nothing to export")
     if options.crop is not None:
         ply = cropped(ply, options.crop)

@@ -17,6 +17,7 @@ _SPACING_CELLS = 0.7  # side of the largest sample over that of a cell
 _MAX_SUBDIVISIONS = 512
 _CHUNK_SAMPLES = 1_000_000
 _MAX_CELLS = 64_000_000
+_BORDER_DECIMALS = 6
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,10 @@ class Grid:
         Raises:
             RunError: too many cells.
         """
-        low = np.floor(points[:, :2].min(axis=0) / resolution)
-        high = np.floor(points[:, :2].max(axis=0) / resolution) + 1
+        # rounded, so that an edge on a border of cells does not begin another row
+        low = np.floor((points[:, :2].min(axis=0) / resolution).round(_BORDER_DECIMALS))
+        high = np.ceil((points[:, :2].max(axis=0) / resolution).round(_BORDER_DECIMALS))
+        high = np.maximum(high, low + 1)
         width, height = (high - low).tolist()
         if width * height > _MAX_CELLS:
             raise RunError(

@@ -56,14 +56,11 @@ def write_geotiff(
     }
     profile |= {"nodata": float("nan")} if is_height else {"photometric": "RGB"}
 
-    def fill(partial: Path) -> None:
-        try:
-            # the mask belongs into the file, not beside it
-            with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(partial, "w", **profile) as file:
-                file.write(bands)
-                if known is not None:
-                    file.write_mask(known)
-        except rasterio.errors.RasterioError as error:
-            raise OSError(" ".join(str(error).split())) from error
-
-    write_atomically(path, fill, RunError)
+    # through memory: GDAL only logs what it cannot write as it closes a file; the mask belongs into the file
+    with rasterio.io.MemoryFile() as memory, rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+        with memory.open(**profile) as file:
+            file.write(bands)
+            if known is not None:
+                file.write_mask(known)
+        content = memory.read()
+    write_atomically(path, lambda partial: partial.write_bytes(content), RunError)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -34,11 +35,7 @@ def write_las(path: Path, cloud: Ply) -> None:
     las = laspy.LasData(header)
     las.x, las.y, las.z = points.T
     las.red, las.green, las.blue = colours.astype(np.uint16).T * np.uint16(_TO_16_BITS)
-    # laspy compresses by the end of the name, and knows lower case only
-    suffix = path.suffix.lower()
-
-    def fill(partial: Path) -> None:
-        with partial.open("wb") as file:
-            las.write(file, do_compress=suffix == ".laz")
-
-    write_atomically(path, fill, RunError)
+    # through memory: errors of a full disk come from the codec as an exception of its own
+    content = io.BytesIO()
+    las.write(content, do_compress=path.suffix.lower() == ".laz")
+    write_atomically(path, lambda partial: partial.write_bytes(content.getbuffer()), RunError)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from slam.se3 import FloatArray
 
 OBSTACLE_FROM_M, OBSTACLE_TO_M = 0.3, 2.5
 _USUAL_CAMERA_HEIGHT_M = 1.65
+_HOLE_M = 0.5  # gaps of the map in the road, up to this wide, are closed
 _MIN_FREE_AREA, _MIN_OCCUPIED_AREA = 0.25, 0.5  # of a cell
 
 
@@ -54,6 +56,17 @@ def occupancy_grid(mesh: Ply, T_world_camera: FloatArray, resolution: float, is_
             areas += np.bincount(cells[chosen], part.areas[chosen], len(areas))
     cell_area = resolution**2
     values = np.full(len(free), UNKNOWN, np.uint8)
-    values[free >= _MIN_FREE_AREA * cell_area] = FREE
-    values[occupied >= _MIN_OCCUPIED_AREA * cell_area] = OCCUPIED
-    return OccupancyGrid(values.reshape(grid.shape), (grid.x_min, grid.y_min), resolution)
+    is_free = (free >= _MIN_FREE_AREA * cell_area).reshape(grid.shape)
+    values = values.reshape(grid.shape)
+    values[_without_small_holes(is_free, _HOLE_M * metre / resolution)] = FREE
+    values[(occupied >= _MIN_OCCUPIED_AREA * cell_area).reshape(grid.shape)] = OCCUPIED
+    return OccupancyGrid(values, (grid.x_min, grid.y_min), resolution)
+
+
+def _without_small_holes(cells: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
+    """The same with gaps closed that are narrower than so many cells."""
+    side = int(width)
+    if side < 2:
+        return cells
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    return np.asarray(cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_CLOSE, element) > 0)

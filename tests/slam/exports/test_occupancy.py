@@ -67,7 +67,7 @@ def street() -> tuple[Ply, FloatArray]:
     noise = np.random.default_rng(1).normal(0, 0.03, len(ground.vertices))
     ground.vertices["z"][:] = ground.vertices["z"] + noise
     parts = (
-        standing(-7.5, (0, 60), 0.0, 6.0),
+        standing(-8.5, (0, 60), 0.0, 6.0),
         level((5, 7), (0, 60), 0.15),
         level((2, 4), (30, 34), 1.4),
         level((-3, 3), (44, 48), 3.5),
@@ -107,9 +107,23 @@ def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resol
     assert (cells((5.2, 6.8), (1, 50)) == FREE).mean() > 0.99  # the kerb
     assert (cells((2.2, 3.6), (30.2, 33.6)) == OCCUPIED).mean() > 0.99  # the car
     assert (cells((-2, 2), (45, 47)) == FREE).mean() > 0.99  # under the canopy
-    assert (cells((-7.5, -7.5), (1, 50)) == OCCUPIED).mean() > 0.99  # the wall
-    assert (cells((-7.2, -7.1), (1, 50)) == UNKNOWN).mean() > 0.9
+    assert (cells((-8.5, -8.5), (1, 50)) == OCCUPIED).mean() > 0.99  # the wall
+    assert (cells((-7.9, -7.6), (1, 50)) == UNKNOWN).mean() > 0.9
     assert (grid.cells == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
+
+
+def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]) -> None:
+    _, poses = street
+    parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
+    grid = occupancy_grid(together(*parts), poses, 0.1, True)
+    # the last rows of the parts lie at 9.8, 19.8 and 59.8
+    of_y = {y: grid.cells[grid.cells.shape[0] - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
+    assert {y: set(row.tolist()) for y, row in of_y.items()} == {
+        9.9: {FREE},
+        10.1: {FREE},
+        20.6: {UNKNOWN},
+        30.0: {FREE},
+    }
 
 
 def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None:

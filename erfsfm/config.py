@@ -182,6 +182,9 @@ class TrainingConfig(Section):
     offset_rate: float = Field(
         default=1.0, gt=0, le=1, description="factor on the learning rate of deformable offsets, which may diverge"
     )
+    encoder_rate: float = Field(
+        default=1.0, gt=0, le=1, description="factor on the learning rate of a lite0 encoder, which is pretrained"
+    )
     schedule: Literal["constant", "cosine", "step"] = Field(
         default="constant", description="of the learning rate; step: divided by ten in the last quarter"
     )

@@ -49,7 +49,7 @@ DEPTH_SOURCES = ("onnx", "npy", "png")
 
 
 class DepthConfig(Section):
-    """Where depth comes from, see ``docs/depth-models.md``."""
+    """Where depth comes from, see ``docs/depth-models.md``, and what keyframes make of it."""
 
     source: str = Field(
         default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
@@ -70,6 +70,9 @@ class DepthConfig(Section):
     width: int = Field(default=0, ge=0, description="input width for onnx; 0 where the file fixes it")
     output_name: str = Field(default="", description="output for onnx, where the network has several")
     png_scale: float = Field(default=256.0, gt=0, description="value of 1 m (or other unit) for png; 0 is unknown")
+    refine: Literal["none", "multiview"] = Field(
+        default="multiview", description="refine the keyframes' depth by their neighbours at the optimised poses"
+    )
 
     @field_validator("source")
     @classmethod
@@ -190,6 +193,9 @@ class MappingConfig(Section):
     )
     consistency: float = Field(
         default=0.1, gt=0, description="largest relative depth difference to the previous keyframe"
+    )
+    max_relative_sigma: float = Field(
+        default=0.15, gt=0, description="largest sigma of refined depth that is fused, relative to it"
     )
     min_weight: float = Field(default=3.0, ge=0, description="least number of observations of an extracted voxel")
     min_component_triangles: int = Field(

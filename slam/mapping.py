@@ -7,7 +7,7 @@ two views disagree; these three are filtered out before fusion.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,12 +91,25 @@ class TsdfMap:
         previous = self._previous
         if previous is None:
             self._previous = view
-        elif self._is_keyframe(view, previous):
+        elif self._has_moved(view.T_world_camera, previous.T_world_camera):
             if not self._first_is_fused:
                 self._fuse(previous, self._agrees(previous, view))
                 self._first_is_fused = True
             self._fuse(view, self._agrees(view, previous))
             self._previous = view
+
+    def moved(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
+        """Which of these frames ``integrate`` does not skip, as positions in ``frames``.
+
+        Args:
+            frames: frame numbers in time order.
+            T_world_camera: poses of all frames ``(N, 4, 4)``.
+        """
+        found: list[int] = []
+        for position, frame in enumerate(frames):
+            if not found or self._has_moved(T_world_camera[frame], T_world_camera[frames[found[-1]]]):
+                found.append(position)
+        return found
 
     def mesh(self) -> MapMesh:
         """The surface as triangles, small loose pieces removed.
@@ -170,8 +183,8 @@ class TsdfMap:
         known = np.isfinite(depth) & (depth > 0)
         return _View(np.where(known, depth, np.float32(0)).astype(np.float32), image, T_world_camera)
 
-    def _is_keyframe(self, view: _View, previous: _View) -> bool:
-        T_previous_camera = invert(previous.T_world_camera) @ view.T_world_camera
+    def _has_moved(self, T_world_camera: FloatArray, T_world_previous: FloatArray) -> bool:
+        T_previous_camera = invert(T_world_previous) @ T_world_camera
         moved = float(np.linalg.norm(T_previous_camera[:3, 3]))
         turned = float(rotation_angle(T_previous_camera[:3, :3]))
         config = self._config

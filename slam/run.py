@@ -24,6 +24,7 @@ from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
+from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
@@ -196,7 +197,7 @@ def _settings(request: RunRequest) -> SlamConfig:
     own = load_config(RunFolder.open(continues).require("config.yaml"))
     settings = load_config(continues / "config.yaml", request.overrides)
     # another path may lead to the same source, or to more files of it: its identity is compared later
-    depth = settings.depth.model_copy(update={"source": own.depth.source})
+    depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})
     compared = settings.model_copy(update={"depth": depth})
     for name in _FIXED_SECTIONS:
         if getattr(compared, name) != getattr(own, name):
@@ -259,9 +260,11 @@ def _run(job: _Job, folder: RunFolder) -> None:
     metrics = estimate_metrics(estimate, job.recording, job.provenance)
     folder.write_metrics(metrics)
     folder.publish()
-    result = replace(estimate, map=job.pipeline.fuse(estimate))
+    quality = DepthQuality(job.recording, estimate.scale.mode)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
     surface = write_map(folder, result, job.recording)
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary))
+    depth = quality.summary(job.settings.depth.refine != "none")
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
     if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, surface.points, surface.colours)

@@ -75,7 +75,9 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
         for axis in (2, 3):
             length = max(error.shape[axis] - apart, 0)
             first, second = (values.narrow(axis, 0, length) for values in (error, narrow))
-            first_on, second_on = (values.narrow(axis, error.shape[axis] - length, length) for values in (error, narrow))
+            first_on, second_on = (
+                values.narrow(axis, error.shape[axis] - length, length) for values in (error, narrow)
+            )
             both = second & second_on
             total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)
     return total / (2 * len(STEPS_PX))

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from erfsfm.networks.blocks import ConvBlock, Layer, Normalisation, Variant, crop_like, initialise, scaled
+from erfsfm.networks.blocks import ConvBlock, Layer, Variant, crop_like, initialise, scaled
 from erfsfm.networks.depth_net import FIRST_LOGIT, MAX_DISPARITY, MIN_DISPARITY
 from erfsfm.networks.lite0 import CHANNELS, SKIP_CHANNELS, SKIPS, Lite0Encoder
 
@@ -24,23 +24,23 @@ class Lite0DepthNet(nn.Module):
     1/32, and the decoder's convolutions at 1/16 and 1/8. They start as plain ones.
     """
 
-    def __init__(self, variant: Variant = "plain", width: float = 1.0, normalisation: Normalisation = "none") -> None:
+    def __init__(self, variant: Variant = "plain", width: float = 1.0) -> None:
         super().__init__()
         self.variant = variant
         self.fidelity = "default"
         channels = [scaled(count, width) for count in _DECODER_CHANNELS]
         deformable = variant == "dfc"
         wide = Layer(3, 1, deformable=deformable)
-        context = ConvBlock(CHANNELS, channels[0], wide, normalisation=normalisation)
+        context = ConvBlock(CHANNELS, channels[0], wide)
         self.encoder = Lite0Encoder(self.input_channels, [context])
         skips = [*reversed(SKIP_CHANNELS), 0]  # 1/16 to 1/2; the image itself is not a skip
         before = nn.ModuleList()
         after = nn.ModuleList()
         inside = channels[0]
         for level, (count, skip) in enumerate(zip([*channels[1:], channels[-1]], skips)):
-            before.append(ConvBlock(inside, count, Layer(3, 1), normalisation=normalisation))
+            before.append(ConvBlock(inside, count, Layer(3, 1)))
             layer = wide if level < _WIDE_LEVELS else Layer(3, 1)
-            after.append(ConvBlock(count + skip, count, layer, normalisation=normalisation))
+            after.append(ConvBlock(count + skip, count, layer))
             inside = count
         self.reductions, self.fusions = before, after
         self.heads = nn.ModuleList(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from erfsfm.networks.blocks import ConvBlock, Layer, Normalisation, Variant, initialise, scaled
+from erfsfm.networks.blocks import ConvBlock, Layer, Variant, initialise, scaled
 from erfsfm.networks.lite0 import CHANNELS, Lite0Encoder
 from erfsfm.networks.pose_net import pose_vectors, stack_images
 
@@ -19,9 +19,7 @@ class Lite0PoseNet(nn.Module):
     The ``dfc`` variant has deformable 3 x 3 convolutions, the paper's way to a wider field.
     """
 
-    def __init__(
-        self, variant: Variant = "plain", width: float = 1.0, sources: int = 4, normalisation: Normalisation = "none"
-    ) -> None:
+    def __init__(self, variant: Variant = "plain", width: float = 1.0, sources: int = 4) -> None:
         super().__init__()
         self.variant = variant
         self.fidelity = "default"
@@ -29,8 +27,8 @@ class Lite0PoseNet(nn.Module):
         count = scaled(_CHANNELS, width)
         layer = Layer(3, 1, deformable=variant == "dfc")
         context = [
-            ConvBlock(CHANNELS, count, layer, normalisation=normalisation),
-            ConvBlock(count, count, layer, normalisation=normalisation),
+            ConvBlock(CHANNELS, count, layer),
+            ConvBlock(count, count, layer),
         ]
         self.encoder = Lite0Encoder(self.input_channels, context)
         self.pose_head = nn.Conv2d(count, 6 * sources, 1)

@@ -79,7 +79,8 @@ def build(
         fidelity: ``paper`` for the reference's exact layers and initialisation, ``default`` for ours.
         width: multiplier of the hidden channels.
         sources: number of source images of a pose network; a depth network ignores it.
-        normalisation: batch norm after every convolution but the heads, or none as published.
+        normalisation: batch norm after every convolution but the heads, or none as published; a pretrained
+            encoder has its own, and what follows it has none.
         mask_branch: explainability masks in a pose network; a depth network ignores it.
         activation: after every convolution but the heads, as published or leaking a tenth.
 
@@ -94,7 +95,7 @@ def build(
     _check_choice("activation", activation, get_args(Activation))
     network: Network
     if preset.encoder == "lite0":
-        network = _build_lite0(name, preset, fidelity, width, sources, normalisation, mask_branch)
+        network = _build_lite0(name, preset, fidelity, width, sources, mask_branch)
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
@@ -108,23 +109,17 @@ def build(
 
 
 def _build_lite0(
-    name: str,
-    preset: Preset,
-    fidelity: Fidelity,
-    width: float,
-    sources: int,
-    normalisation: Normalisation,
-    mask_branch: bool,
+    name: str, preset: Preset, fidelity: Fidelity, width: float, sources: int, mask_branch: bool
 ) -> Lite0DepthNet | Lite0PoseNet:
     if fidelity == "paper":
         raise ConfigError(f"{name} is not of the paper: set network.fidelity to default")
     if preset.kind == "depth":
-        return Lite0DepthNet(preset.variant, width, normalisation)
+        return Lite0DepthNet(preset.variant, width)
     if mask_branch:
         raise ConfigError(f"{name} has no explainability masks: set network.masks to false")
     if not 1 <= sources <= MAX_SOURCES:
         raise ConfigError(f"sources must be 1 to {MAX_SOURCES}; got {sources}")
-    return Lite0PoseNet(preset.variant, width, sources, normalisation)
+    return Lite0PoseNet(preset.variant, width, sources)
 
 
 def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:

@@ -20,7 +20,7 @@ from erfsfm.geometry.warp import project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.lite0 import Lite0Encoder
+from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
 
@@ -130,17 +130,23 @@ class SelfSupervision(lightning.LightningModule):
             for parameter in branch.parameters()
             if parameter.requires_grad
         ]
-        slow = {id(parameter) for parameter in offsets}
+        encoders = [m for m in self.modules() if isinstance(m, Lite0Conv)]
+        pretrained = [p for encoder in encoders for p in encoder.parameters() if p.requires_grad]
+        slow = {id(parameter) for parameter in [*offsets, *pretrained]}
         rest = [p for p in self.parameters() if id(p) not in slow and p.requires_grad]
-        slowly: dict[str, Any] = {"params": offsets, "lr": training.learning_rate * training.offset_rate}
+        slowly: list[dict[str, Any]] = [
+            {"params": offsets, "lr": training.learning_rate * training.offset_rate},
+            {"params": pretrained, "lr": training.learning_rate * training.encoder_rate},
+        ]
+        slowly = slowly[: 2 if pretrained else 1]
         optimiser: torch.optim.Optimizer
         if training.optimiser == "muon":
             others: dict[str, Any] = {"params": [p for p in rest if not is_matrix(p)]}
             kernels: dict[str, Any] = {"params": [p for p in rest if is_matrix(p)], "orthogonal": True}
             kernels["lr"] = training.learning_rate * training.kernel_rate
-            optimiser = Muon([others, kernels, slowly], lr=training.learning_rate)
+            optimiser = Muon([others, kernels, *slowly], lr=training.learning_rate)
         else:
-            optimiser = torch.optim.Adam([{"params": rest}, slowly], lr=training.learning_rate, betas=(0.9, 0.999))
+            optimiser = torch.optim.Adam([{"params": rest}, *slowly], lr=training.learning_rate, betas=(0.9, 0.999))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimiser, lambda step: learning_rate_factor(training.schedule, min(step / training.steps, 1))
         )

@@ -86,10 +86,8 @@ def train(
     draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
-    if config.initial_weights and not resume:
-        seen = merge([*seen, *_start_from(module, config.initial_weights)])
-    elif config.pretrained == "imagenet" and not resume:
-        module.take_imagenet()
+    if not resume:
+        seen = merge([*seen, *_start_from(module, config)])
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = DataLoader(
         draws, batch, num_workers=workers, worker_init_fn=_single_threaded_worker, persistent_workers=workers > 0
@@ -149,10 +147,14 @@ def _fit(
         raise TrainingError(f"interrupted at step {trainer.global_step}: continue with --resume") from error
 
 
-def _start_from(module: SelfSupervision, name: str) -> list[str]:
+def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant or half the width; returns what they were trained on."""
+    name, wanted = config.initial_weights, config.network
+    if not name:
+        if config.pretrained == "imagenet":
+            module.take_imagenet()
+        return []
     model = load_model(name)
-    wanted = module.config.network
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width")}
     try:
         if model.record.network.model_copy(update=free) != wanted:

@@ -12,7 +12,7 @@ import numpy as np
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.errors import SlamError
-from slam.frames import DepthMap, Image, Predictor, RelativePose, runs
+from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
@@ -24,6 +24,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pose_graph import PoseGraph
@@ -168,22 +169,33 @@ class SlamPipeline:
             intrinsics, config = self._sequence.intrinsics, self._config.loops
             return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
 
-    def fuse(self, estimate: SlamResult) -> TsdfMap | None:
-        """Learned depth at the optimised poses, fused into one surface; None where mapping is switched off."""
+    def fuse(self, estimate: SlamResult, compare: Callable[[KeyframeDepth], None] | None = None) -> TsdfMap | None:
+        """Learned depth at the optimised poses, refined and fused into one surface; None where mapping is switched off.
+
+        ``compare`` is called with the depth of each keyframe that is far enough from the one before.
+        """
         keyframes = estimate.observations.keyframes
         if not self._config.mapping.enabled or not keyframes:
             return None
         height, width = keyframes[0].depth_unscaled.shape
-        tsdf_map = TsdfMap(self._config.mapping, self._sequence.intrinsics.resized(width, height))
-
-        def read(n: int) -> tuple[DepthMap, Image]:
-            metres = keyframes[n].depth_unscaled * np.float32(estimate.scale.per_frame[keyframes[n].index])
-            return metres, keyframes[n].image
-
-        with self._watch.stage("map"):
-            for done, (metres, image) in enumerate(read_ahead(read, range(len(keyframes)))):
-                tsdf_map.integrate(metres, image, estimate.optimised.T_world_camera[keyframes[done].index])
-                self._progress("map", done + 1, len(keyframes))
+        intrinsics = self._sequence.intrinsics.resized(width, height)
+        T_world_camera = estimate.optimised.T_world_camera
+        config = self._config
+        tsdf_map = TsdfMap(config.mapping, intrinsics)
+        depths = KeyframeDepths(
+            estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
+        )
+        moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
+        ahead = read_ahead(depths.at, moved)
+        for done in range(len(moved)):
+            with self._watch.stage("depth refinement"):
+                keyframe = next(ahead)
+            if compare is not None:
+                compare(keyframe)
+            with self._watch.stage("map"):
+                depth = keyframe.trusted(config.mapping.max_relative_sigma)
+                tsdf_map.integrate(depth, keyframe.image, T_world_camera[keyframe.index])
+            self._progress("map", done + 1, len(moved))
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:

@@ -64,6 +64,7 @@ def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provena
             "trajectories": trajectories,
             "graph": _graph(result),
             "loops": result.loops.summary(),
+            **null("depth", "the run ended before its map was whole"),
             **null("map", "the run ended before its map was whole"),
         }
     )
@@ -71,12 +72,13 @@ def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provena
 
 
 def whole_metrics(
-    metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any]
+    metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
 ) -> dict[str, Any]:
-    """The metrics of a complete run: those of the estimate, with the map and the final timing."""
-    rest = {"timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)), "map": map_summary}
+    """The metrics of a complete run: those of the estimate, with depth, the map and the final timing."""
+    timing = describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence))
+    rest = {"timing": timing, "depth": depth, "map": map_summary}
     whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)
-    return {key: value for key, value in whole.items() if key not in ("reason", "map_reason")}
+    return {key: value for key, value in whole.items() if key not in ("reason", "depth_reason", "map_reason")}
 
 
 def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:

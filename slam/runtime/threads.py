@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 _CORES = 2
 
 
-def read_ahead(read: Callable[[int], T], numbers: range) -> Iterator[T]:
+def read_ahead(read: Callable[[int], T], numbers: Sequence[int]) -> Iterator[T]:
     """The result of ``read`` for each number, computed in another thread while the one before is used."""
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
         waiting: deque[Future[T]] = deque()

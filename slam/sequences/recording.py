@@ -77,7 +77,10 @@ def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
 
 @dataclass(eq=False)
 class RecordedSequence:
-    """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``."""
+    """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
+
+    ``depth_files`` are 16-bit images of true depth, metres times 256, by frame.
+    """
 
     name: str
     images: ImageSource
@@ -88,6 +91,7 @@ class RecordedSequence:
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
     scans: dict[int, Path] = field(default_factory=dict)
+    depth_files: dict[int, Path] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Number of frames."""

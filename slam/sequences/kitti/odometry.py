@@ -58,6 +58,8 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
     else:
         images, intrinsics = calibrated(stored, camera, str(folder))
     scans = (path for path in (folder / "velodyne").glob("*.bin") if path.stem.isdecimal())
+    depths = (path for path in (folder / "depth_2").glob("*.png") if path.stem.isdecimal())
+    has_true_depth = number == 2 and camera is None  # of the images as stored
     return RecordedSequence(
         name=name,
         images=images,
@@ -68,6 +70,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
         camera_height_m=_camera_height(root, camera),
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
         scans={int(path.stem) - files.first: path for path in scans},
+        depth_files={int(path.stem) - files.first: path for path in depths} if has_true_depth else {},
     )
 
 

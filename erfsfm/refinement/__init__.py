@@ -1,0 +1,1 @@
+"""Learned depth refined by neighbouring images at known poses, without torch."""

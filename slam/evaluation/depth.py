@@ -1,0 +1,68 @@
+"""Errors of depth maps in metres, as they are: no scale is fitted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+LEAST_M, LARGEST_M = 1.0, 80.0
+COVERAGES = (50, 90, 95)
+_PIXELS_OF_A_FRAME = 3000
+
+
+class DepthErrors:
+    """Collects the pixels with truth between 1 and 80 m of many frames."""
+
+    def __init__(self) -> None:
+        self._depths: list[NDArray[np.float32]] = []
+
+    def add(
+        self,
+        depth: NDArray[np.floating],
+        truth: NDArray[np.floating],
+        relative_sigma: NDArray[np.floating] | None = None,
+    ) -> None:
+        """Add one frame, evenly thinned to 3000 pixels.
+
+        Args:
+            depth: estimate ``(H, W)``; where it is not positive or not finite nothing is compared.
+            truth: z-depth ``(h, w)`` of any size, 0 where unknown; each pixel is compared with the nearest estimate.
+            relative_sigma: sigma of the estimate over it, ``(H, W)``.
+        """
+        v, u = np.nonzero((truth >= LEAST_M) & (truth <= LARGEST_M))
+        if len(v) == 0:
+            return
+        thinned = np.linspace(0, len(v) - 1, min(len(v), _PIXELS_OF_A_FRAME)).astype(int)
+        v, u = v[thinned], u[thinned]
+        (height, width), (true_height, true_width) = depth.shape, truth.shape
+        at = (2 * v + 1) * height // (2 * true_height), (2 * u + 1) * width // (2 * true_width)
+        sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
+        known = np.isfinite(depth[at]) & (depth[at] > 0)
+        self._depths.append(np.stack([depth[at], truth[v, u], sigma])[:, known].astype(np.float32))
+
+    def summary(self) -> dict[str, Any] | None:
+        """The numbers over all pixels; None where no frame had truth.
+
+        ``coverage`` is the share of errors inside the central interval of so many per cent of the stated noise.
+        """
+        if not any(part.size for part in self._depths):
+            return None
+        depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
+        relative = np.abs(depth - truth) / truth
+        ratio = np.maximum(depth / truth, truth / np.maximum(depth, 1e-9))
+        numbers: dict[str, Any] = {
+            "abs_rel": float(relative.mean()),
+            "median_rel": float(np.median(relative)),
+            "rmse_m": float(np.sqrt(np.square(depth - truth).mean())),
+            "a1": float((ratio < 1.25).mean()),
+        }
+        if np.isnan(sigma).any():
+            numbers |= {"coverage": None, "coverage_reason": "the network states no noise of its depth"}
+        else:
+            errors = np.log(ratio) / sigma
+            levels = {str(level): float((errors < norm.ppf(0.5 + level / 200)).mean()) for level in COVERAGES}
+            numbers["coverage"] = levels
+        return numbers | {"frames": len(self._depths)}

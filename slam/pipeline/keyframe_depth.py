@@ -1,0 +1,79 @@
+"""Metric depth of the keyframes of a finished estimate, refined where the configuration says so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from erfsfm.refinement.refine import RefinedDepth, Road
+from slam.config import DepthConfig
+from slam.depth_refinement import DepthRefiner
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.pipeline.observations import ClosedObservations, Keyframe
+from slam.se3 import FloatArray
+
+
+@dataclass(frozen=True)
+class KeyframeDepth:
+    """A keyframe's image ``(H, W, 3)``, the network's depth ``(H, W)`` in the unit of the trajectory, and that refined.
+
+    ``refined`` is None where refinement is switched off or no neighbour is at a useful distance.
+    """
+
+    index: int
+    image: Image
+    depth: DepthMap
+    refined: RefinedDepth | None
+
+    def trusted(self, max_relative_sigma: float) -> DepthMap:
+        """The depth to fuse: refined where it was, 0 where its sigma is too large."""
+        if self.refined is None:
+            return self.depth
+        known = self.refined.relative_sigma <= max_relative_sigma
+        return np.where(known, self.refined.depth, np.float32(0))
+
+
+class KeyframeDepths:
+    """Depth of each keyframe of a drive, at the optimised poses."""
+
+    def __init__(
+        self,
+        observations: ClosedObservations,
+        scale_per_frame: FloatArray,
+        T_world_camera: FloatArray,
+        intrinsics: Intrinsics,
+        config: DepthConfig,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            observations: with at least one keyframe.
+            scale_per_frame: factor ``(N,)`` on unscaled depth.
+            T_world_camera: poses of all frames ``(N, 4, 4)``.
+            intrinsics: of the keyframes.
+            config: whether to refine.
+        """
+        self._keyframes: Sequence[Keyframe] = observations.keyframes
+        self._roads = observations.roads
+        self._scale = scale_per_frame
+        self._refiner: DepthRefiner | None = None
+        if config.refine == "multiview":
+            indices = [keyframe.index for keyframe in self._keyframes]
+            self._refiner = DepthRefiner(
+                intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image
+            )
+
+    def at(self, n: int) -> KeyframeDepth:
+        """The n-th keyframe."""
+        keyframe = self._keyframes[n]
+        scale = float(self._scale[keyframe.index])
+        depth = keyframe.depth_unscaled * np.float32(scale)
+        refined = None
+        if self._refiner is not None:
+            plane = self._roads[keyframe.index]
+            road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
+            refined = self._refiner.refine(n, depth, road)
+        return KeyframeDepth(keyframe.index, keyframe.image, depth, refined)

@@ -1,0 +1,92 @@
+"""Errors of a run's depth maps where the true depth is known: ``depth`` of ``metrics.json``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam.evaluation.depth import DepthErrors
+from slam.frames import DepthMap, Intrinsics, Sequence
+from slam.frontend.lidar_odometry import read_scan
+from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.results.summary import null
+from slam.se3 import FloatArray, apply
+from slam.sequences.excerpt import Excerpt
+
+_EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refining it
+_PNG_METRES = 1 / 256
+
+
+class DepthQuality:
+    """Collects the errors of keyframes while the map is fused."""
+
+    def __init__(self, sequence: Sequence, unit: str) -> None:
+        """``unit`` is the run's scale mode: with ``none`` depth is not in metres."""
+        self._sequence = sequence
+        self._is_metric = unit != "none"
+        self._network, self._refined = DepthErrors(), DepthErrors()
+        self._keyframes = self._not_refined = 0
+
+    def add(self, keyframe: KeyframeDepth) -> None:
+        """Compare a keyframe with the truth, where it is known."""
+        self._keyframes += 1
+        if not self._is_metric:
+            return
+        truth = true_depth(self._sequence, keyframe.index, self._keyframes)
+        if truth is None:
+            return
+        self._network.add(keyframe.depth, truth)
+        if keyframe.refined is None:
+            self._not_refined += 1
+        else:
+            self._refined.add(keyframe.refined.depth, truth, keyframe.refined.relative_sigma)
+
+    def summary(self, is_refined: bool) -> dict[str, Any]:
+        """``network`` and ``refined``, each null with a reason where it cannot be computed."""
+        network, refined = self._network.summary(), self._refined.summary()
+        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        if self._keyframes == 0:
+            missing = "there are no keyframes (mapping.enabled)"
+        elif not self._is_metric:
+            missing = "depth is in camera heights, not in metres (scale.mode none)"
+        numbers = null("network", missing) if network is None else {"network": network}
+        if refined is not None:
+            return numbers | {"refined": refined}
+        if network is not None:
+            missing = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
+        return numbers | null("refined", missing)
+
+
+def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | None:
+    """The true z-depth ``(H, W)`` of a frame, 0 where unknown; None without any.
+
+    Of a simulated street only every fifth ``count`` is rendered.
+
+    Raises:
+        SlamError: a scan cannot be read.
+    """
+    base, frame = (sequence.base, sequence.start + index) if isinstance(sequence, Excerpt) else (sequence, index)
+    street = getattr(base, "street", None)
+    if street is not None:
+        return None if count % _EVERY_RENDERED != 1 else np.asarray(street.render(frame).depth, np.float32)
+    path = getattr(base, "depth_files", {}).get(frame)
+    if path is not None:
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        return None if stored is None or stored.ndim != 2 else stored.astype(np.float32) * np.float32(_PNG_METRES)
+    if sequence.T_camera_lidar is None or sequence.scan_path(index) is None:
+        return None
+    return projected(read_scan(sequence, index), sequence.T_camera_lidar, sequence.intrinsics)
+
+
+def projected(points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics) -> DepthMap:
+    """z-depth ``(H, W)`` of LiDAR points ``(P, 3)`` in the image, the nearest at each pixel, 0 where there is none."""
+    points = apply(T_camera_lidar, np.asarray(points_lidar, np.float64))
+    x, y, z = points[points[:, 2] > 0.1].T
+    u = np.rint(intrinsics.fx * x / z + intrinsics.cx).astype(int)
+    v = np.rint(intrinsics.fy * y / z + intrinsics.cy).astype(int)
+    inside = (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
+    depth = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)
+    np.minimum.at(depth, (v[inside], u[inside]), z[inside].astype(np.float32))
+    return np.where(np.isfinite(depth), depth, np.float32(0))

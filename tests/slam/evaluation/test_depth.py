@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.evaluation.depth import DepthErrors
+
+TRUTH = np.full((20, 40), 10.0, np.float32)
+
+
+def test_no_truth_gives_no_numbers() -> None:
+    errors = DepthErrors()
+    errors.add(TRUTH, np.zeros_like(TRUTH))
+    errors.add(TRUTH, np.full_like(TRUTH, 81.0))
+    assert errors.summary() is None
+
+
+def test_numbers_of_a_constant_error() -> None:
+    errors = DepthErrors()
+    errors.add(TRUTH * 1.1, TRUTH)
+    errors.add(TRUTH * 0.7, TRUTH)
+    summary = errors.summary()
+    assert summary is not None
+    assert summary["abs_rel"] == pytest.approx(0.2)
+    assert summary["median_rel"] == pytest.approx(0.2)
+    assert summary["rmse_m"] == pytest.approx(np.sqrt(5.0), rel=1e-5)
+    assert (summary["a1"], summary["frames"]) == (0.5, 2)
+    assert summary["coverage"] is None and summary["coverage_reason"]
+
+
+def test_correct_sigmas_cover() -> None:
+    rng = np.random.default_rng(0)
+    errors = DepthErrors()
+    for _ in range(20):
+        errors.add(TRUTH * np.exp(rng.normal(0, 0.05, TRUTH.shape)), TRUTH, np.full_like(TRUTH, 0.05))
+    summary = errors.summary()
+    assert summary is not None
+    for level in (50, 90, 95):
+        assert summary["coverage"][str(level)] == pytest.approx(level / 100, abs=0.02)
+
+
+def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
+    depth = np.repeat(np.arange(1.0, 11.0, dtype=np.float32), 4)[None].repeat(8, axis=0)  # (8, 40)
+    errors = DepthErrors()
+    errors.add(depth, np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1))
+    summary = errors.summary()
+    assert summary is not None and summary["abs_rel"] == 0
+
+
+def test_pixels_without_an_estimate_are_not_compared() -> None:
+    truth = np.full((4, 4), 10, np.float32)
+    depth = np.full((4, 4), 11, np.float32)
+    depth[0], depth[1] = 0, np.nan
+    errors = DepthErrors()
+    errors.add(depth, truth)
+    summary = errors.summary()
+    assert summary is not None and summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
+    nothing = DepthErrors()
+    nothing.add(np.zeros((4, 4), np.float32), truth)
+    assert nothing.summary() is None

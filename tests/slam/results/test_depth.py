@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+
+from erfsfm.refinement.refine import RefinedDepth
+from slam.frames import Intrinsics
+from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.results.depth import DepthQuality, projected, true_depth
+from slam.sequences.excerpt import Excerpt
+from slam.sequences.recording import RecordedSequence, Source
+
+CAMERA = Intrinsics(8, 6, 5.0, 5.0, 3.5, 2.5)
+DEPTH = np.full((6, 8), 5.0, np.float32)
+
+
+def recorded(**more) -> RecordedSequence:
+    images = type("Images", (), {"width": 8, "height": 6, "__len__": lambda self: 4})()
+    return RecordedSequence("a", images, CAMERA, np.arange(4.0), (Source("a"),), **more)
+
+
+def keyframe(refined: bool = True) -> KeyframeDepth:
+    image = np.zeros((6, 8, 3), np.uint8)
+    sigma = np.full_like(DEPTH, 0.1)
+    sigma[0] = 0.3
+    found = RefinedDepth(DEPTH * 1.1, sigma, np.ones_like(DEPTH, bool)) if refined else None
+    return KeyframeDepth(2, image, DEPTH, found)
+
+
+def with_depth(tmp_path) -> RecordedSequence:
+    import cv2
+
+    path = tmp_path / "000002.png"
+    cv2.imwrite(str(path), (DEPTH * 256).astype(np.uint16))
+    return recorded(depth_files={2: path})
+
+
+def test_stored_depth_is_read_and_compared(tmp_path) -> None:
+    quality = DepthQuality(with_depth(tmp_path), "camera-height")
+    quality.add(keyframe())
+    summary = quality.summary(is_refined=True)
+    assert summary["network"]["abs_rel"] == 0
+    assert abs(summary["refined"]["abs_rel"] - 0.1) < 1e-4
+    assert summary["refined"]["coverage"].keys() == {"50", "90", "95"}
+
+
+def test_an_excerpt_reads_the_frame_of_its_base(tmp_path) -> None:
+    excerpt = Excerpt(with_depth(tmp_path), 2, 4)
+    np.testing.assert_allclose(true_depth(excerpt, 0), DEPTH)
+    assert true_depth(excerpt, 1) is None
+
+
+def test_every_missing_number_has_its_reason(tmp_path) -> None:
+    def reasons(unit: str, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True):
+        quality = DepthQuality(sequence, unit)
+        for one in keyframes:
+            quality.add(one)
+        summary = quality.summary(is_refined)
+        return summary.get("network_reason"), summary.get("refined_reason")
+
+    known = with_depth(tmp_path)
+    assert "mapping.enabled" in reasons("reference", known)[0]
+    assert "no true depth" in reasons("reference", recorded(), keyframe())[1]
+    assert "scale.mode none" in reasons("none", known, keyframe())[0]
+    assert reasons("reference", known, keyframe(False)) == (None, "no keyframe has a neighbour at a useful distance")
+    assert reasons("reference", known, keyframe(False), is_refined=False) == (None, "depth.refine is none")
+
+
+def test_the_nearest_lidar_point_of_a_pixel_counts() -> None:
+    depth = projected(np.array([[0.1, 0.1, 4.0], [0.2, 0.2, 8.0], [0, 0, -3.0]]), np.eye(4), CAMERA)
+    assert depth[3, 4] == 4.0 and (depth > 0).sum() == 1
+
+
+def test_depth_of_large_sigma_is_not_fused() -> None:
+    trusted = keyframe().trusted(0.15)
+    assert (trusted[0] == 0).all()
+    np.testing.assert_allclose(trusted[1:], 5.5)
+    np.testing.assert_array_equal(keyframe(False).trusted(0.15), DEPTH)

@@ -1,0 +1,168 @@
+"""Depth maps of a drive in one picture, and their errors over distance: image, networks, refined depth, truth.
+
+Runs the whole system with each of the weights; depth is in metres as the run gives it, no scale is fitted.
+
+Example: python tools/depth_page.py docs/images/depth-0013.jpg --dataset KITTI_RAW/DRIVE --show 12 28 --weights OLD NEW
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.errors import ErfsfmError
+from erfsfm.inference import DepthPosePredictor, save_image
+from slam.config import load_config
+from slam.errors import SlamError
+from slam.frames import DepthMap, Image
+from slam.frames import Sequence as FrameSequence
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.prediction.networks import NetworkPredictor
+from slam.results.depth import true_depth
+from slam.sequences.catalogue import open_sequence
+
+EDGES_M = (1, 5, 10, 20, 40, 80)
+WIDTH_PX = 416
+NEAREST_M = 4.0  # of the colour scale
+RIM_PX = 6
+
+Errors = dict[str, list[NDArray[np.float64]]]  # by method: rows of truth and relative error
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A row of the picture."""
+
+    image: Image
+    depths: dict[str, DepthMap]
+    truth: DepthMap | None
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run with each of the weights, draw, print one table."""
+    options = _parser().parse_args(words)
+    errors: Errors = {}
+    shown: dict[int, Shown] = {}
+    try:
+        drive = open_sequence(options.dataset, options.sequence, None, options.frames)
+        for weights in options.weights:
+            run(drive, weights, options.set, partial(_note, drive, Path(weights).name, errors, shown))
+    except (SlamError, ErfsfmError) as error:
+        raise SystemExit(str(error)) from error
+    rows = [shown[min(shown, key=lambda index: abs(index - wanted))] for wanted in options.show]
+    save_image(options.output, picture(rows))
+    print(table(errors))
+
+
+def run(drive: FrameSequence, weights: str, settings: Sequence[str], compare: Callable[[KeyframeDepth], None]) -> None:
+    """The whole system on a drive; ``compare`` is called with the depth of every keyframe."""
+    networks = DepthPosePredictor.from_weights(weights, "cpu")
+    pipeline = SlamPipeline(
+        drive, NetworkPredictor(networks, drive.intrinsics), load_config(None, settings), noise=networks.noise
+    )
+    pipeline.fuse(pipeline.estimate(), compare)
+
+
+def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Shown], keyframe: KeyframeDepth) -> None:
+    """Keep a keyframe's maps and errors."""
+    depths = {name: keyframe.depth}
+    if keyframe.refined is not None:
+        depths[f"{name}, refined"] = keyframe.refined.depth
+    truth = true_depth(drive, keyframe.index)
+    before = shown.get(keyframe.index)
+    shown[keyframe.index] = Shown(keyframe.image, (before.depths if before else {}) | depths, truth)
+    if truth is None:
+        return
+    known = (truth >= EDGES_M[0]) & (truth < EDGES_M[-1])
+    for method, depth in depths.items():
+        size = (truth.shape[1], truth.shape[0])
+        guess = cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT)[known].astype(np.float64)
+        relative = np.abs(guess - truth[known]) / truth[known]
+        errors.setdefault(method, []).append(np.stack([truth[known], relative]))
+
+
+def table(errors: Errors) -> str:
+    """Mean and median relative error of each method, whole and over distance, as Markdown."""
+    bins = list(pairwise(EDGES_M))
+    lines = ["| depth | all | " + " | ".join(f"{a}-{b} m" for a, b in bins) + " |", "|---|" + "---|" * (len(bins) + 1)]
+    for method, parts in errors.items():
+        truth, relative = np.concatenate(parts, axis=1)
+        chosen = [np.ones(len(truth), bool), *((truth >= a) & (truth < b) for a, b in bins)]
+        cells = [f"{relative[c].mean():.3f} / {np.median(relative[c]):.3f}" if c.any() else "-" for c in chosen]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def picture(rows: Sequence[Shown]) -> Image:
+    """Rows of frames, columns image, methods and truth, with their names above."""
+    names = list(rows[0].depths)
+    titles = ["image", *names, *(["truth"] if any(row.truth is not None for row in rows) else [])]
+    lines = []
+    for row in rows:
+        height = round(WIDTH_PX * row.image.shape[0] / row.image.shape[1])
+        cells = [np.asarray(cv2.resize(row.image, (WIDTH_PX, height), interpolation=cv2.INTER_AREA), np.uint8)]
+        cells += [coloured(row.depths[name], height) for name in names]
+        if row.truth is not None:
+            cells.append(_sparse(row.truth, height))
+        lines.append(
+            np.concatenate([np.pad(cell, ((0, RIM_PX), (0, RIM_PX), (0, 0)), constant_values=255) for cell in cells], 1)
+        )
+    head = np.full((24, lines[0].shape[1], 3), 255, np.uint8)
+    for column, title in enumerate(titles):
+        cv2.putText(
+            head,
+            title,
+            (column * (WIDTH_PX + RIM_PX) + 4, 17),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.5,
+            (0, 0, 0),
+            1,
+            cv2.LINE_AA,
+        )
+    return np.concatenate([head, *lines])
+
+
+def coloured(depth: DepthMap, height: int) -> Image:
+    """Inverse depth on one scale for all: bright is near, 4 m and nearer the brightest, unknown grey."""
+    inverse = np.where(depth > 0, NEAREST_M / np.maximum(depth, 1e-6), 0).astype(np.float32)
+    inverse = cv2.resize(inverse, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    shade = np.clip(np.sqrt(inverse) * 255, 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
+
+
+def _sparse(truth: DepthMap, height: int) -> Image:
+    """As `coloured`; points of LiDAR are enlarged to be seen, and what has no truth is grey."""
+    inverse = np.where(truth > 0, NEAREST_M / np.maximum(truth, 1e-6), 0).astype(np.float32)
+    if (truth > 0).mean() < 0.5:
+        inverse = cv2.dilate(inverse, np.ones((5, 3), np.uint8))
+    inverse = cv2.resize(inverse, (WIDTH_PX, height), interpolation=cv2.INTER_NEAREST)
+    shade = np.clip(np.sqrt(inverse) * 255, 0, 255).astype(np.uint8)
+    colours = np.ascontiguousarray(cv2.applyColorMap(shade, cv2.COLORMAP_MAGMA)[..., ::-1])
+    colours[inverse == 0] = 128
+    return colours
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("output", type=Path, help=".jpg or .png")
+    add("--dataset", type=Path, help="as for erfsfm-slam run; default: the embedded sequence")
+    add("--sequence")
+    add("--frames", metavar="A:B", help="half-open")
+    add("--weights", nargs="+", default=["default"])
+    add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="of the run")
+    add("--show", nargs="+", type=int, default=[20, 60], help="frames; the nearest keyframes are shown")
+    return parser
+
+
+if __name__ == "__main__":
+    main()

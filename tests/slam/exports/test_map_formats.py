@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import importlib
 import json
+import resource
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 from slam.errors import RunError, SlamError
 from slam.exports.export import export
-from slam.exports.options import R_UP_WORLDS, ExportOptions, parse_crop
+from slam.exports.options import R_UP_WORLDS, ExportOptions, parse_crop, parse_origin
 from slam.formats.ply import Ply, coloured_ply, read_ply, write_ply
 from slam.results.folder import RunFolder
 from slam.runtime.imports import import_open3d
@@ -122,8 +123,6 @@ def test_an_absent_extra_is_named(
     missing: str,
     extra: str,
 ) -> None:
-    from slam.exports.options import parse_origin
-
     folder, there = make_recorded(), importlib.import_module
 
     def absent(module: str, *rest: Any) -> Any:
@@ -211,6 +210,36 @@ def test_errors_are_one_line_and_leave_nothing(
     with pytest.raises(RunError, match=why) as caught:
         export(folder, what, tmp_path / "new" / "out.ply", "y-down", options)
     assert "\n" not in str(caught.value) and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "size", "origin"),
+    [
+        ("mesh", "m.glb", 2000, ""),
+        ("mesh", "m.obj", 2000, ""),
+        ("cloud", "c.laz", 500, ""),
+        ("cloud", "c.las", 500, ""),
+        ("raster", "raster/colour.tif", 1000, "49,8,0"),
+        ("occupancy", "map.pgm", 100, ""),
+        ("nerfstudio", "scene/points.ply", 3000, ""),
+    ],
+)
+def test_a_disk_that_is_full_is_one_line(
+    make_recorded: MakeRecorded, tmp_path: Path, what: str, name: str, size: int, origin: str
+) -> None:
+    folder, output = make_recorded(), tmp_path / "new" / name
+    target = output.parent if what in ("raster", "nerfstudio") else output
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(RunError, match="cannot be written") as caught:
+            export(folder, what, target, "z", ExportOptions(origin=parse_origin(origin or None)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "\n" not in str(caught.value) and not output.exists()
+    assert not [path.name for path in tmp_path.rglob(".*")]
+    ends = {"raster.yaml", "transforms.json", "map.yaml"}
+    assert not ends & {path.name for path in (tmp_path / "new").rglob("*")}
 
 
 def test_an_empty_map_is_not_exported(make_recorded: MakeRecorded, tmp_path: Path) -> None:

@@ -15,8 +15,10 @@ import typer
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from slam.errors import SlamError
+from slam.exports.cli import verbs as export_verbs
 from slam.runtime.progress import progress_bar
 from slam.runtime.signals import Terminated
+from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,9 +38,6 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-# Hidden options of verbs that once offered them without effect.
-UnusedDevice = Annotated[DeviceName, typer.Option("--device", hidden=True)]
-UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True)]
 
 
 def _print_version(wanted: bool) -> None:
@@ -138,26 +137,7 @@ def evaluate(
         raise typer.BadParameter(f"give two trajectory files, or run folders that exist; got {what}")
 
 
-@app.command()
-def export(
-    run: Annotated[Path, typer.Argument(help="a run folder")],
-    what: Annotated[str, typer.Option(help="mesh, cloud, trajectory, graph or colmap")],
-    output: Annotated[Path, typer.Option(help="the file to write; for colmap a folder")],
-    up: Annotated[str, typer.Option(help="axes of the world: y-down (camera axes) or z")] = "y-down",
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Parts of a run as files for other programs.
-
-    The map as PLY, the trajectory as KITTI or TUM, the graph as g2o, or the whole run as a COLMAP model.
-
-    Example: erfsfm-slam export results/latest --what mesh --output map.ply --up z
-    """
-    from slam.results.export import export as export_run
-    from slam.results.folder import RunFolder
-
-    written = export_run(RunFolder.open(run), what, output, up)
-    typer.echo(f"{what} of {run} in {written}")
+app.add_typer(export_verbs)
 
 
 @app.command()

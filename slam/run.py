@@ -240,7 +240,16 @@ def _provenance(
         leak=bool(networks.leaks(recording.provenance())),
         depth_source="network" if source is None else source.name,
         depth_sha256=networks.sha256 if source is None else source.sha256,
+        recording=_recording(request),
     )
+
+
+def _recording(request: RunRequest) -> dict[str, str]:
+    """The options that name the recording; files by their whole paths, for it may be opened from another folder."""
+    files = {"dataset": request.dataset, "camera": request.camera}
+    named = {name: Path(path) for name, path in files.items() if path is not None}
+    places = {name: str(path.absolute() if path.exists() else path) for name, path in named.items()}
+    return places if request.sequence is None else places | {"sequence": request.sequence}
 
 
 def _run(job: _Job, folder: RunFolder) -> None:

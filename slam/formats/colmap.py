@@ -70,5 +70,5 @@ def _images(T_world_camera: FloatArray) -> str:
 def _points(points_world: FloatArray, colours: NDArray[np.uint8]) -> str:
     lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK (none)"]
     for k, (point, colour) in enumerate(zip(points_world.tolist(), colours.tolist(), strict=True)):
-        lines.append(f"{k + 1} {' '.join(f'{x:.6g}' for x in point)} {' '.join(map(str, colour))} 0")
+        lines.append(f"{k + 1} {' '.join(f'{x:.9g}' for x in point)} {' '.join(map(str, colour))} 0")
     return "\n".join(lines) + "\n"

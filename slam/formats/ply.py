@@ -43,6 +43,27 @@ class Ply:
             return None
         return np.stack([self.vertices[name].astype(np.float64) for name in names], axis=1)
 
+    @property
+    def points(self) -> FloatArray:
+        """Positions ``(V, 3)``."""
+        return np.stack([self.vertices[name].astype(np.float64) for name in _AXES], axis=1)
+
+    @property
+    def normals(self) -> FloatArray | None:
+        """Normals ``(V, 3)``, None where the file has none."""
+        return self.columns(_NORMALS)
+
+    @property
+    def colours(self) -> NDArray[np.uint8] | None:
+        """RGB ``(V, 3)``, None where the file has none."""
+        colours = self.columns(_COLOURS)
+        return None if colours is None else colours.astype(np.uint8)
+
+    def extra_fields(self) -> list[str]:
+        """Names of the fields besides position, normal and colour."""
+        known = {*_AXES, *_NORMALS, *_COLOURS}
+        return [name for name in self.vertices.dtype.names or () if name not in known]
+
 
 @dataclass
 class _Element:

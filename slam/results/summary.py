@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from slam.frames import Sequence, runs
@@ -16,7 +16,11 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Provenance:
-    """Version, command, weights and their training data, and where depth comes from."""
+    """Version, command, weights and their training data, where depth comes from, and where the recording is.
+
+    ``recording`` holds ``dataset``, ``sequence`` and ``camera`` as far as they were given; none for the embedded
+    street.
+    """
 
     version: str
     commit: str
@@ -30,6 +34,7 @@ class Provenance:
     leak: bool
     depth_source: str
     depth_sha256: str
+    recording: dict[str, str] = field(default_factory=dict)
 
 
 def null(name: str, reason: str) -> dict[str, Any]:

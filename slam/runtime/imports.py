@@ -51,6 +51,31 @@ def import_onnx() -> tuple[ModuleType, ModuleType]:
         ) from error
 
 
+def import_laspy() -> ModuleType:
+    """Import laspy with its LAZ codec, an optional extra.
+
+    Raises:
+        SlamError: if one is not installed or cannot be loaded.
+    """
+    try:
+        importlib.import_module("lazrs")
+        return importlib.import_module("laspy")
+    except (ImportError, OSError) as error:
+        raise SlamError(f"LAS and LAZ need laspy and lazrs ({error}): pip install 'erfsfm-slam[las]'") from error
+
+
+def import_rasterio() -> ModuleType:
+    """Import rasterio, an optional extra.
+
+    Raises:
+        SlamError: if it is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("rasterio")
+    except (ImportError, OSError) as error:
+        raise SlamError(f"GeoTIFF needs rasterio ({error}): pip install 'erfsfm-slam[geotiff]'") from error
+
+
 def import_open3d_beside() -> None:
     """Import Open3D, which takes a second, in another thread; errors are raised by the next `import_open3d`."""
 

@@ -16,7 +16,8 @@ import erfsfm
 
 # They compute nothing that is cached; by the layers in pyproject.toml no other code imports them.
 _ABOVE_THE_CACHE = (
-    *("slam/cli.py", "slam/__main__.py", "slam/doctor.py", "slam/run.py", "slam/localisation/", "slam/results/"),
+    *("slam/cli.py", "slam/__main__.py", "slam/doctor.py", "slam/run.py"),
+    *("slam/exports/", "slam/localisation/", "slam/results/"),
     *("erfsfm/cli.py", "erfsfm/training/"),
 )
 

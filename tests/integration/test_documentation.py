@@ -80,6 +80,10 @@ if importlib.util.find_spec("onnxruntime") is None:
     NOT_RUN = (*NOT_RUN, (r"onnx", "the extra 'onnx' is not installed"))
 if importlib.util.find_spec("rerun") is None:
     NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
+if importlib.util.find_spec("laspy") is None:
+    NOT_RUN = (*NOT_RUN, (r"\.la[sz]\b", "the extra 'las' is not installed"))
+if importlib.util.find_spec("rasterio") is None:
+    NOT_RUN = (*NOT_RUN, (r"--origin ", "the extra 'geotiff' is not installed"))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from slam.storage import fingerprint as module
 from slam.storage.fingerprint import code_fingerprint, fingerprint
 
 PACKAGES = [Path(package.__file__ or "").parent for package in (erfsfm, slam)]
-ABOVE = {"slam/results", "slam/localisation", "erfsfm/training"}
+ABOVE = {"slam/exports", "slam/results", "slam/localisation", "erfsfm/training"}
 SUBPACKAGES = sorted(
     {path.parent.relative_to(folder.parent).as_posix() for folder in PACKAGES for path in folder.rglob("*.py")}
 )

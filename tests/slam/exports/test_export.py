@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError, TrajectoryError
+from slam.exports.export import export
+from slam.exports.options import R_UP_WORLDS
 from slam.formats.ply import read_ply_points
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
-from slam.results.export import R_UP_WORLD, export
 from slam.results.folder import RunFolder
 from slam.trajectory import read_trajectory
 
 MakeRun = Callable[..., RunFolder]
+
+
+R_UP_WORLD = R_UP_WORLDS["z"]
 
 
 def test_z_up_axes_are_a_rotation_with_the_sky_above_and_the_road_ahead() -> None:
@@ -96,9 +100,14 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     ("what", "name", "up", "why"),
     [
         ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
-        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap"),
-        ("mesh", "out.obj", "y-down", r"ends in \.ply"),
-        ("mesh", "out.ply", "x", "y-down or z"),
+        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap, nerfstudio"),
+        ("mesh", "out.stl", "y-down", r"written as \.ply, \.obj, \.glb, \.gltf; got 'out\.stl'"),
+        ("cloud", "out.obj", "y-down", r"written as \.ply, \.las, \.laz"),
+        ("occupancy", "out.png", "z", r"ends in \.yaml"),
+        ("raster", "file", "z", "is a file: a raster is several files"),
+        ("nerfstudio", "file", "z", "is a file: a scene is several files"),
+        ("raster", "folder", "y-up", "leave --up out or give --up z"),
+        ("mesh", "out.ply", "x", "y-down, z or y-up"),
         ("graph", "out.g2o", "z", "leave --up out"),
         ("mesh", "", "y-down", "is a folder"),
         ("graph", "file/out.g2o", "y-down", "cannot be written"),
@@ -123,6 +132,7 @@ def test_errors_are_clear_and_leave_nothing(
         ("mesh", "map_mesh.ply"),
         ("trajectory", "trajectory_optimised.tum.txt"),
         ("colmap", "places.npz"),
+        ("raster", "map_mesh.ply"),
     ],
 )
 def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:

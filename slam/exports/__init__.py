@@ -1,0 +1,1 @@
+"""Parts of a run as files for other programs."""

@@ -1,0 +1,174 @@
+"""Parts of a run as files for other programs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from slam import se3
+from slam.errors import RunError
+from slam.exports.nerfstudio import write_scene
+from slam.exports.occupancy import occupancy_grid
+from slam.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
+from slam.exports.raster import height_raster, write_raster
+from slam.exports.surface import prepared
+from slam.formats.colmap import write_colmap
+from slam.formats.g2o import check_g2o
+from slam.formats.gltf import write_gltf
+from slam.formats.las import write_las
+from slam.formats.obj import write_obj
+from slam.formats.ply import Ply, read_ply, rotated, write_ply
+from slam.formats.ros_map import write_ros_map
+from slam.loops.places import PLACES, Places
+from slam.results.comparison import lookup
+from slam.results.folder import RunFolder
+from slam.storage.files import write_atomically
+from slam.trajectory import Trajectory, write_kitti, write_tum
+
+Progress = Callable[[str, int, int], None]
+Writer = Callable[[Path, Ply], None]
+
+_WRITERS: dict[str, dict[str, Writer]] = {
+    "mesh": {".ply": write_ply, ".obj": write_obj, ".glb": write_gltf, ".gltf": write_gltf},
+    "cloud": {".ply": write_ply, ".las": write_las, ".laz": write_las},
+}
+_FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
+
+
+def export(
+    folder: RunFolder,
+    what: str,
+    output: Path,
+    up: str = "y-down",
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one part of a run, each file whole or not at all; missing parent folders are made.
+
+    The part is read whole and checked before anything is written.
+
+    Args:
+        folder: the run.
+        what: ``mesh`` (PLY, OBJ or glTF by the end of ``output``), ``cloud`` (PLY, LAS or LAZ), ``trajectory`` (the
+            optimised one: TUM where ``output`` ends in ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o),
+            ``colmap`` (a model in text form), ``nerfstudio`` (images and ``transforms.json``), ``raster`` (heights
+            and colours from above) or ``occupancy`` (a grid for ROS).
+        output: the file; for ``colmap``, ``nerfstudio`` and ``raster`` the folder.
+        up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up; ``y-up``: x right, y up, z backwards. Cameras
+            keep their own axes, only the world is rotated.
+        options: what to do with the part on the way.
+        progress: called with (stage, done, total).
+
+    Returns:
+        What was written.
+
+    Raises:
+        SlamError: an option that is unknown or has no effect, a part that the run lacks or that is damaged, images
+            that are not found, or a file that cannot be written.
+    """
+    options = options or ExportOptions()
+    options.check(what, up)
+    if what in _FOLDERS:
+        if output.is_file():
+            raise RunError(f"{output} is a file: {_FOLDERS[what]} is several files, give the name of a folder")
+    elif output.is_dir():
+        raise RunError(f"{output} is a folder: give the name of a file to write")
+    if what in _WRITERS:
+        _export_map(folder, what, output, up, options)
+    elif what == "trajectory":
+        write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
+        write(output, _trajectory(folder, up))
+    elif what == "graph":
+        source = folder.require("graph.g2o")
+        check_g2o(source)
+        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
+    elif what == "colmap":
+        _export_colmap(folder, output, up, options)
+    elif what == "nerfstudio":
+        cloud = _cloud(folder, up, options)
+        write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
+    elif what == "raster":
+        _export_raster(folder, output, options)
+    else:
+        return _export_occupancy(folder, output, options)
+    return output
+
+
+def _export_map(folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions) -> None:
+    writers = _WRITERS[what]
+    write = writers.get(output.suffix.lower())
+    if write is None:
+        known = ", ".join(writers)
+        raise RunError(f"a {what} is written as {known}; got '{output.name}', give a name that ends in one of these")
+    source = folder.require(f"map_{what}.ply")
+    ply = read_ply(source)
+    if write is write_ply and up == "y-down" and options == ExportOptions():
+        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
+    else:
+        write(output, _rotated(prepared(ply, options), up))
+
+
+def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions) -> None:
+    """Poses of all frames, the run's camera, and the cloud of the map where there is one."""
+    trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
+    cloud = _cloud(folder, up, options)
+    points = np.zeros((0, 3)) if cloud is None else cloud.points
+    colours = None if cloud is None else cloud.colours
+    if colours is None:
+        colours = np.full(points.shape, 128, np.uint8)
+    write_colmap(output, camera, trajectory.T_world_camera, points, colours)
+
+
+def _export_raster(folder: RunFolder, output: Path, options: ExportOptions) -> None:
+    mode, _ = lookup(folder.metrics(), "scale", "mode")
+    if options.origin is not None and mode == "none":
+        raise RunError(
+            "a place on the earth needs metres, but this run's lengths are in camera heights: leave --origin"
+        )
+    mesh = prepared(read_ply(folder.require("map_mesh.ply")), options)
+    raster = height_raster(_rotated(mesh, "z"), options.resolution or DEFAULT_RESOLUTION, options.origin)
+    write_raster(output, raster, "camera heights" if mode == "none" else "metres")
+
+
+def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions) -> Path:
+    if output.suffix.lower() not in (".yaml", ".pgm"):
+        raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
+    mode, _ = lookup(folder.metrics(), "scale", "mode")
+    mesh = prepared(read_ply(folder.require("map_mesh.ply")), options)
+    trajectory = _trajectory(folder, "z")
+    grid = occupancy_grid(
+        _rotated(mesh, "z"), trajectory.T_world_camera, options.resolution or DEFAULT_RESOLUTION, mode != "none"
+    )
+    written = output.with_suffix(".yaml")
+    write_ros_map(written, grid.cells, grid.corner, grid.resolution)
+    return written
+
+
+def _cloud(folder: RunFolder, up: str, options: ExportOptions) -> Ply | None:
+    """The cloud of the map, None where the run has none."""
+    path = folder.path / "map_cloud.ply"
+    return _rotated(prepared(read_ply(path), options), up) if path.is_file() else None
+
+
+def _rotated(ply: Ply, up: str) -> Ply:
+    return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
+
+
+def _trajectory(folder: RunFolder, up: str) -> Trajectory:
+    """The optimised trajectory in the given axes."""
+    folder.require("trajectory_optimised.tum.txt")
+    trajectory = folder.trajectory("optimised")
+    if trajectory is None:
+        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    frames, _ = lookup(folder.metrics(), "sequence", "frames")
+    if frames is not None and frames != len(trajectory):
+        raise RunError(
+            f"{folder.path}: trajectory_optimised.tum.txt is damaged: it has {len(trajectory)} rows for {frames} frames"
+        )
+    if up != "y-down":
+        T_up_world = se3.make(R_UP_WORLDS[up], np.zeros(3))
+        trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
+    return trajectory

@@ -1,0 +1,126 @@
+"""A scene for NeRF and Gaussian splatting: undistorted images, their poses, the cloud of the map."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from erfsfm.errors import ErfsfmError
+from slam.errors import RunError, SlamError
+from slam.formats.ply import Ply, write_ply
+from slam.formats.transforms import write_transforms
+from slam.frames import Image, Sequence
+from slam.loops.places import PLACES, Places
+from slam.results.comparison import lookup
+from slam.results.folder import RunFolder
+from slam.se3 import FloatArray
+from slam.sequences.catalogue import open_sequence
+from slam.storage.files import write_atomically
+from slam.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+_POINTS = "points.ply"
+_SAME_STAMP_S = 2e-3
+_SAME_PIXEL = 0.01
+
+
+def write_scene(
+    folder: RunFolder,
+    output: Path,
+    trajectory: Trajectory,
+    cloud: Ply | None,
+    dataset: Path | None,
+    progress: Callable[[str, int, int], None] | None,
+) -> None:
+    """Write ``images/``, ``points.ply`` and, last, ``transforms.json``.
+
+    Frames without a usable image are left out.
+
+    Args:
+        folder: the run.
+        output: made where missing; other files in it stay.
+        trajectory: optimised, in the axes of the scene.
+        cloud: of the map, in the same axes.
+        dataset: where the images are now; None where the run found them.
+        progress: called with (stage, done, total).
+
+    Raises:
+        SlamError: the images are not there or are others, or a file cannot be written.
+    """
+    sequence, rows = _recording(folder, trajectory, dataset)
+    poses: dict[str, FloatArray] = {}
+    left_out = _interpolated(folder)
+    for k, row in enumerate(rows):
+        if progress is not None:
+            progress("images", k + 1, len(rows))
+        if row is None or k in left_out:
+            continue
+        try:
+            image = sequence.frame(row).image
+        except (SlamError, ErfsfmError):
+            continue
+        name = f"images/{k:06d}.png"
+        _write_image(output / name, image)
+        poses[name] = trajectory.T_world_camera[k]
+    if not poses:
+        raise RunError(f"no image of {folder.path} can be read: check the data set")
+    if len(poses) < len(trajectory):
+        logger.warning("%d of %d frames have no usable image: left out", len(trajectory) - len(poses), len(trajectory))
+    if cloud is not None:
+        write_ply(output / _POINTS, cloud)
+    write_transforms(output / "transforms.json", sequence.intrinsics, poses, None if cloud is None else _POINTS)
+
+
+def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:
+    """The recording, and which frame of it each row of the trajectory is."""
+    given = _given(folder, dataset)
+    try:
+        sequence = open_sequence(**given)
+    except (SlamError, ErfsfmError) as error:
+        raise RunError(
+            f"the images of {folder.path} are needed and not found ({error}); give --dataset ROOT"
+        ) from error
+    camera = Places.read(folder.require(PLACES)).intrinsics
+    wanted, found = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (camera, sequence.intrinsics))
+    if not np.allclose(wanted, found, atol=_SAME_PIXEL):
+        raise RunError(f"{sequence.name} has another camera than {folder.path}: give the data set of the run")
+    stamps, rows = np.asarray(sequence.stamps), list[int | None]()
+    for stamp in trajectory.stamps:
+        nearest = int(np.argmin(np.abs(stamps - stamp)))
+        rows.append(nearest if abs(stamps[nearest] - stamp) < _SAME_STAMP_S else None)
+    if all(row is None for row in rows):
+        raise RunError(f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run")
+    return sequence, rows
+
+
+def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
+    """Arguments of `open_sequence`, as recorded by the run."""
+    recorded, _ = lookup(folder.metrics(), "provenance", "recording")
+    if recorded is None and dataset is None:
+        raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
+    recorded = recorded or {}
+    camera = Path(recorded["camera"]) if "camera" in recorded else None
+    if dataset is None:
+        place = Path(recorded["dataset"]) if "dataset" in recorded else None
+    else:
+        place = dataset
+        camera = camera if camera is not None and camera.exists() else None  # it may have moved with the images
+    return {"dataset": place, "name": recorded.get("sequence"), "camera": camera}
+
+
+def _interpolated(folder: RunFolder) -> set[int]:
+    gaps, _ = lookup(folder.metrics(), "sequence", "bridged")
+    return {k for gap in gaps or () for k in range(gap["first"], gap["last"] + 1)}
+
+
+def _write_image(path: Path, image: Image) -> None:
+    done, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise RunError(f"{path}: cannot be encoded")
+    write_atomically(path, lambda partial: partial.write_bytes(content.tobytes()), RunError)

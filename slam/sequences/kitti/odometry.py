@@ -18,6 +18,7 @@ from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import beside
+from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti.calibration import moved_to_camera
 from slam.sequences.recording import (
@@ -68,6 +69,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
         camera_height_m=_camera_height(root, camera),
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
         scans={int(path.stem) - files.first: path for path in scans},
+        depth_maps=depth_maps_in(folder / f"depth_{number}", files) if images is stored else None,
     )
 
 

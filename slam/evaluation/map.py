@@ -39,7 +39,6 @@ BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 OUTLIER_M = 1.0
 
 _LEVER_M = 10.0  # distance from the camera at which an alignment counts rotations
-_MOST_SAMPLES = 50_000  # of a stretch
 _LEAST_IN_BIN = 20
 
 _NO_MAP = "no map point lies within 25 m of a camera whose surroundings are known"
@@ -127,7 +126,7 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
         on_surface, surface_range = _surface_samples(surface, cameras, part)
         for name, points in maps.items():
             away, camera = nearest[name]
-            own = _sampled(points, np.flatnonzero(np.isin(camera, part) & np.isfinite(away)))[:_MOST_SAMPLES]
+            own = _sampled(points, np.flatnonzero(np.isin(camera, part) & np.isfinite(away)))
             if truth.distance is not None:
                 to_surface = truth.distance(points[own]) if len(own) else np.empty(0)
             else:
@@ -191,17 +190,16 @@ def _harmonic_mean(precision: float | None, recall: float | None) -> float | Non
 
 
 def _sampled(points: FloatArray, candidates: Indices) -> Indices:
-    """Of the candidates, a random one of each 0.2 m voxel, in random order."""
-    rng = np.random.default_rng(0)
-    shuffled = rng.permutation(candidates)
-    return rng.permutation(shuffled[thinned(points[shuffled], SAMPLE_VOXEL_M)])
+    """Of the candidates, a random one of each 0.2 m voxel."""
+    shuffled = np.random.default_rng(0).permutation(candidates)
+    return shuffled[thinned(points[shuffled], SAMPLE_VOXEL_M)]
 
 
 def _surface_samples(surface: Surface, cameras: cKDTree, part: Indices) -> tuple[FloatArray, FloatArray]:
     """Samples ``(S, 3)`` of the surface in images whose nearest camera is on a stretch, with that distance ``(S,)``."""
     points = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
     away, camera = cameras.query(points, distance_upper_bound=RANGE_M)
-    own = np.flatnonzero(np.isfinite(away) & np.isin(camera, part))[:_MOST_SAMPLES]
+    own = np.flatnonzero(np.isfinite(away) & np.isin(camera, part))
     return points[own], away[own]
 
 

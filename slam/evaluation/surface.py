@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from slam.se3 import FloatArray, rotation_angle
 
-RANGE_M = 25.0  # of map points to the nearest camera, and of the true surface to the camera that measured it
+RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
 MOST_STRETCHES = 8
 TRUTH_VOXEL_M = 0.05
@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Surface:
-    """Points ``(P, 3)`` of the true surface in the world, and whether a camera's image shows them ``(P,)``."""
+    """Points ``(P, 3)`` of the true surface in the world, and whether an image shows them within 25 m ``(P,)``."""
 
     points: FloatArray
     in_image: Mask
@@ -53,7 +53,7 @@ class SurfaceTruth(Protocol):
     distance: Callable[[FloatArray], FloatArray] | None
 
     def view(self, frame: int) -> Surface:
-        """The surface within 25 m as one frame measured it."""
+        """The surface as one frame measured it."""
         ...
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:

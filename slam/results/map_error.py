@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 
 _ERRORS = ("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall")
 _NAMES = (*_ERRORS, "in_field", "by_distance")
+_DEPTH_RANGE_M = 50.0
 _MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
 
 
@@ -56,7 +57,7 @@ class DepthTruth:
             self.distance = lambda points: np.asarray(street.distance_to_surface(apply(T_street_first, points)))
 
     def view(self, frame: int) -> Surface:
-        """Surface within 25 m; all of it is in the image."""
+        """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
         assert self._poses is not None
         depth = self._depth.true_depth(self._first + frame)
         height, width = depth.shape
@@ -64,8 +65,8 @@ class DepthTruth:
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
         offset = frame % step  # other pixels in neighbouring frames
         rays = camera.rays(camera.pixel_grid()[offset::step, offset::step])
-        points = backprojected(depth[offset::step, offset::step], rays, self._poses[frame], RANGE_M)
-        return Surface(points, np.ones(len(points), dtype=bool))
+        points = backprojected(depth[offset::step, offset::step], rays, self._poses[frame], _DEPTH_RANGE_M)
+        return Surface(points, np.linalg.norm(points - self._poses[frame][:3, 3], axis=1) <= RANGE_M)
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
         """True: the map comes from the same images."""

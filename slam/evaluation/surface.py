@@ -18,7 +18,7 @@ from slam.se3 import FloatArray, rotation_angle
 
 RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
-MOST_STRETCHES = 8
+MOST_STRETCHES = 5
 TRUTH_VOXEL_M = 0.05
 SAMPLE_VOXEL_M = 0.2
 VIEW_STEP_M = 1.0
@@ -71,7 +71,7 @@ def thinned(points: FloatArray, voxel_m: float) -> Indices:
 
 
 def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices]:
-    """Frames of stretches of 100 m along a drive with known surface: all of them, or eight evenly spread.
+    """Frames of stretches of 100 m along a drive with known surface: all of them, or five evenly spread.
 
     Args:
         T_world_camera: true poses of all frames ``(N, 4, 4)``.

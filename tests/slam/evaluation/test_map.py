@@ -121,12 +121,12 @@ def test_only_the_road_of_known_surface_counts() -> None:
 def test_a_long_drive_is_sampled_evenly() -> None:
     T_world_camera = straight(5000)
     parts = stretches(T_world_camera, np.arange(5000))
-    assert len(parts) == 8 and all(len(part) == 100 for part in parts)
-    assert parts[0][0] < 700 and parts[-1][-1] > 4300
+    assert len(parts) == 5 and all(len(part) == 100 for part in parts)
+    assert parts[0][0] < 1000 and parts[-1][-1] > 4000
     truth = Road(road(1.0, 1.0), np.arange(5000))
     found = compare(truth, T_world_camera, {"map": road(1.0)})
-    assert found.length_m == pytest.approx(800.0)
-    assert truth.views <= 8 * 201
+    assert found.length_m == pytest.approx(500.0)
+    assert truth.views <= 5 * 201
 
 
 def test_one_point_of_each_voxel() -> None:

@@ -189,4 +189,4 @@ def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_ru
     write_report(folder, examples(), None, None)
     html, _ = parsed(folder)
     assert "not drawn, no time stamps match" in html
-    assert html.count("<img") == 1
+    assert html.count("<img") == 2  # depth and the error of the map

@@ -81,7 +81,7 @@ def test_registered_depth_maps_belong_to_the_images_of_their_stamps(folder: Path
     sequence = open_sequence(folder)
     assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == []
     cv2.imwrite(str(folder / "near.png"), np.full((4, 6), 10_000, dtype=np.uint16))
-    (folder / "depth.txt").write_text("# timestamp filename\n100.04 near.png\n100.30 near.png\n")
+    (folder / "depth.txt").write_text("# timestamp filename\n100.035 near.png\n100.30 near.png\n")
     sequence = open_sequence(folder)
     assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == [0, 1]
     np.testing.assert_array_equal(sequence.true_depth(1), np.full((4, 6), 2.0))

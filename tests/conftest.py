@@ -64,6 +64,11 @@ _T = {
 _WEIGHTS = ("weights", "weights_sha256", "weights_licence", "depth_source", "depth_sha256")
 _WORDS = ("version", "commit", "command", "device", *_WEIGHTS)
 _PROVENANCE = {**dict.fromkeys(_WORDS, str), "seed": int, "trained_on": list, "leak": bool}
+_AT = dict.fromkeys(("0.2", "0.5"), float)
+_MAP_ERRORS = {
+    **dict.fromkeys(("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness"), float),
+    **dict.fromkeys(("f_score", "precision", "recall"), _AT),
+}
 # metrics.json of a run that ended well: design, section 7
 _METRICS = {
     "schema": int,
@@ -80,7 +85,9 @@ _METRICS = {
     "loops": {**dict.fromkeys(("candidates", "verified", "accepted"), int), "rejected": list},
     "map": {
         **dict.fromkeys(("triangles", "points", "blocks"), int),
-        **dict.fromkeys(("accuracy_median_m", "completeness"), float),
+        **_MAP_ERRORS,
+        **{"in_field": dict, "by_distance": list, "truth": str, "evaluated_m": float},
+        "with_scale": {"scale": float, **_MAP_ERRORS},
     },
 }
 # never null

@@ -1,63 +1,222 @@
-"""Accuracy and completeness of a map."""
+"""Error of a map against the true surface: accuracy, completeness and F-score.
+
+Distances are to the nearest point. Map points within 25 m of a camera count, one per 0.2 m voxel, so that density does
+not weigh; so do points of the true surface that the images show. Map where no true surface was measured counts as an
+error.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from slam.evaluation.surface import (
+    RANGE_M,
+    SAMPLE_VOXEL_M,
+    SPARSE_VIEW_STEP_M,
+    VIEW_STEP_M,
+    Indices,
+    Mask,
+    Surface,
+    SurfaceTruth,
+    accumulated,
+    length_m,
+    moved_frames,
+    nearby,
+    stretches,
+    thinned,
+)
 from slam.se3 import FloatArray, Similarity, nearest_rotation
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
+F_SCORES_M = {"0.2": 0.2, "0.5": 0.5}
+BINS_M = ((0.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
+OUTLIER_M = 1.0
+
+_LEVER_M = 10.0  # distance from the camera at which an alignment counts rotations
+_LEAST_IN_BIN = 20
+
+_NO_MAP = "no map point lies within 25 m of a camera whose surroundings are known"
+_NO_SURFACE = "no true surface is known at this distance from a camera"
+_FEW = "too few points at this distance from a camera"
 
 
-def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray) -> Similarity:
-    """The similarity that takes a trajectory and its map to the truth, poses ``(N, 4, 4)`` both.
+def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray, with_scale: bool = True) -> Similarity:
+    """The similarity, or rigid motion, that takes a trajectory and its map to the truth, poses ``(N, 4, 4)`` both.
 
-    The rotation is the chordal mean over all orientations, scale and translation are least
-    squares on positions: positions alone do not determine the roll about a straight road, which the map depends on.
+    Least squares of positions and of points 10 m from every camera: positions alone do not determine the roll about a
+    straight road, which the map depends on.
     """
     R_true, R_estimate = T_world_camera_true[:, :3, :3], T_world_camera[:, :3, :3]
-    R = nearest_rotation((R_true @ np.swapaxes(R_estimate, 1, 2)).sum(axis=0))
-    true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3] @ R.T
+    true, estimate = T_world_camera_true[:, :3, 3], T_world_camera[:, :3, 3]
     centred_true, centred = true - true.mean(axis=0), estimate - estimate.mean(axis=0)
-    agreement, energy = float((centred_true * centred).sum()), float((centred**2).sum())
-    scale = agreement / energy if agreement > 0 else 1.0
-    return Similarity(scale, R, true.mean(axis=0) - scale * estimate.mean(axis=0))
+    size_true, size = float(np.linalg.norm(centred_true)), float(np.linalg.norm(centred))
+    rough = size_true / size if with_scale and size > 0 else 1.0
+    turns = (R_true @ np.swapaxes(R_estimate, 1, 2)).sum(axis=0)
+    R = nearest_rotation(rough * centred_true.T @ centred + _LEVER_M**2 * turns)
+    turned, energy = centred @ R.T, float((centred**2).sum())
+    agreement = float((centred_true * turned).sum())
+    scale = agreement / energy if with_scale and agreement > 0 else 1.0
+    return Similarity(scale, R, true.mean(axis=0) - scale * R @ estimate.mean(axis=0))
 
 
-def accuracy_median_m(points_true: FloatArray, distance_to_surface: Callable[[FloatArray], FloatArray]) -> float | None:
-    """Median distance of map points ``(P, 3)`` to the true surface, metres; None for an empty map."""
-    if len(points_true) == 0:
-        return None
-    return float(np.median(distance_to_surface(points_true)))
+@dataclass(frozen=True)
+class MapDistances:
+    """Distances in metres at samples of the map and of the true surface, with those to the nearest camera.
+
+    ``to_surface``, ``map_range`` and ``in_field`` ``(M,)`` belong to map points, ``to_map`` and ``surface_range``
+    ``(S,)`` to points of the true surface. ``in_field`` marks map points where the truth's sensor looked.
+    """
+
+    to_surface: FloatArray
+    map_range: FloatArray
+    in_field: Mask
+    to_map: FloatArray
+    surface_range: FloatArray
+
+    def between(self, from_m: float, to_m: float) -> MapDistances:
+        """Those of points so far from the nearest camera, half-open."""
+        own = (self.map_range >= from_m) & (self.map_range < to_m)
+        true = (self.surface_range >= from_m) & (self.surface_range < to_m)
+        return self._of(own, true)
+
+    def _of(self, own: Mask, true: Mask) -> MapDistances:
+        map_part = (self.to_surface[own], self.map_range[own], self.in_field[own])
+        return MapDistances(*map_part, self.to_map[true], self.surface_range[true])
+
+    def headline(self) -> MapDistances:
+        """Those of all map points, and of the true surface within 20 m of a camera."""
+        return self._of(np.ones(len(self.to_surface), dtype=bool), self.surface_range < NEAR_CAMERA_M)
+
+    def where_measured(self) -> MapDistances:
+        """Without map points that the truth's sensor could not have seen."""
+        return self._of(self.in_field, np.ones(len(self.to_map), dtype=bool))
 
 
-def completeness(surface_points: FloatArray, map_points: FloatArray) -> float | None:
-    """Ratio of true surface points ``(S, 3)`` that have a map point ``(P, 3)`` within 0.3 m."""
-    if len(surface_points) == 0:
-        return None
-    if len(map_points) == 0:
-        return 0.0
-    distances, _ = cKDTree(map_points).query(surface_points, distance_upper_bound=COVERED_WITHIN_M)
-    return float(np.isfinite(distances).mean())
+@dataclass(frozen=True)
+class MapComparison:
+    """Distances by name of the placed map, and the length of road that was looked at."""
+
+    distances: Mapping[str, MapDistances]
+    length_m: float
 
 
-def visible_surface(depth_m: FloatArray, K: FloatArray, T_world_camera: FloatArray, step: int = 4) -> FloatArray:
-    """True surface points ``(S, 3)`` in the world that a camera sees within 20 m.
+def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, FloatArray]) -> MapComparison:
+    """Distances between maps and the true surface, one stretch of road at a time.
 
     Args:
-        depth_m: true z-depth ``(H, W)``, 0 where there is nothing.
-        K: camera matrix ``(3, 3)``.
-        T_world_camera: ``(4, 4)``.
-        step: every n-th pixel of both axes.
+        truth: the surface.
+        T_world_camera: true poses of all frames ``(N, 4, 4)``.
+        maps: points ``(P, 3)`` in the world of the true poses, by name; they share the cost of the truth.
     """
-    v, u = np.mgrid[0 : depth_m.shape[0] : step, 0 : depth_m.shape[1] : step]
-    depth = np.asarray(depth_m[v, u], dtype=np.float64)
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(depth)], axis=-1)
-    points_camera = rays * depth[..., None]
-    near = (depth > 0) & (np.linalg.norm(points_camera, axis=-1) < NEAR_CAMERA_M)
-    points_world: FloatArray = points_camera[near] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return points_world
+    parts = stretches(T_world_camera, truth.frames)
+    views = moved_frames(T_world_camera, truth.frames, VIEW_STEP_M if truth.distance is None else SPARSE_VIEW_STEP_M)
+    cameras = cKDTree(T_world_camera[:, :3, 3])
+    nearest = {name: cameras.query(points, distance_upper_bound=RANGE_M) for name, points in maps.items()}
+    found: dict[str, list[MapDistances]] = {name: [] for name in maps}
+    for part in parts:
+        near = nearby(T_world_camera, views, part)
+        surface = accumulated(truth, near)
+        tree = cKDTree(surface.points) if truth.distance is None and len(surface.points) else None
+        on_surface, surface_range = _surface_samples(surface, cameras, part)
+        for name, points in maps.items():
+            away, camera = nearest[name]
+            own = _sampled(points, np.flatnonzero(np.isin(camera, part) & np.isfinite(away)))
+            if truth.distance is not None:
+                to_surface = truth.distance(points[own]) if len(own) else np.empty(0)
+            else:
+                to_surface = np.full(len(own), np.inf) if tree is None else tree.query(points[own])[0]
+            to_map = _to_map(on_surface, points)
+            in_field = truth.in_field(points[own], near)
+            found[name].append(MapDistances(to_surface, away[own], in_field, to_map, surface_range))
+    return MapComparison({name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts))
+
+
+def statistics(distances: MapDistances) -> dict[str, Any]:
+    """All errors of a placed map, also by distance from the nearest camera; a missing one is None with a reason."""
+    whole = distances.headline()
+    measured = whole.where_measured()
+    curve = []
+    for from_m, to_m in BINS_M:
+        ring = distances.between(from_m, to_m)
+        points = {"map_points": len(ring.to_surface), "surface_points": len(ring.to_map)}
+        curve.append({"from_m": from_m, "to_m": to_m, **points, **_errors(ring, _LEAST_IN_BIN)})
+    return {
+        **_errors(whole, 1),
+        "in_field": _number("share", _share(whole.in_field), _NO_MAP) | _errors(measured, 1),
+        "by_distance": curve,
+    }
+
+
+def _errors(distances: MapDistances, least: int) -> dict[str, Any]:
+    """Accuracy, completeness and F-scores of these points; None with a reason below ``least`` points."""
+    own, true = distances.to_surface, distances.to_map
+    no_map = _NO_MAP if least == 1 else _FEW
+    no_surface = _NO_SURFACE if least == 1 else _FEW
+    has_map, has_surface = len(own) >= least, len(true) >= least
+    precision = {key: _share(own <= within) if has_map else None for key, within in F_SCORES_M.items()}
+    recall = {key: _share(true <= within) if has_surface else None for key, within in F_SCORES_M.items()}
+    f_score: dict[str, Any] = {}
+    for key in F_SCORES_M:
+        f_score |= _number(key, _harmonic_mean(precision[key], recall[key]), no_map if not has_map else no_surface)
+    return {
+        **_number("accuracy_median_m", float(np.median(own)) if has_map else None, no_map),
+        **_number("accuracy_90_m", float(np.quantile(own, 0.9)) if has_map else None, no_map),
+        **_number("outlier_share", _share(own > OUTLIER_M) if has_map else None, no_map),
+        **_number("completeness", _share(true <= COVERED_WITHIN_M) if has_surface else None, no_surface),
+        "f_score": f_score,
+        "precision": {k: v for key in precision for k, v in _number(key, precision[key], no_map).items()},
+        "recall": {k: v for key in recall for k, v in _number(key, recall[key], no_surface).items()},
+    }
+
+
+def _number(name: str, value: float | None, reason: str) -> dict[str, Any]:
+    return {name: value} if value is not None else {name: None, f"{name}_reason": reason}
+
+
+def _share(which: Mask) -> float | None:
+    return float(which.mean()) if len(which) else None
+
+
+def _harmonic_mean(precision: float | None, recall: float | None) -> float | None:
+    if precision is None or recall is None:
+        return None
+    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+
+
+def _sampled(points: FloatArray, candidates: Indices) -> Indices:
+    """Of the candidates, a random one of each 0.2 m voxel."""
+    shuffled = np.random.default_rng(0).permutation(candidates)
+    return shuffled[thinned(points[shuffled], SAMPLE_VOXEL_M)]
+
+
+def _surface_samples(surface: Surface, cameras: cKDTree, part: Indices) -> tuple[FloatArray, FloatArray]:
+    """Samples ``(S, 3)`` of the surface in images whose nearest camera is on a stretch, with that distance ``(S,)``."""
+    points = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
+    away, camera = cameras.query(points, distance_upper_bound=RANGE_M)
+    own = np.flatnonzero(np.isfinite(away) & np.isin(camera, part))
+    return points[own], away[own]
+
+
+def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:
+    """Distances from samples ``(S, 3)`` of the surface to the map ``(P, 3)``; infinite beyond 1 m."""
+    if len(samples) == 0 or len(points) == 0:
+        return np.full(len(samples), np.inf)
+    low, high = samples.min(axis=0) - OUTLIER_M, samples.max(axis=0) + OUTLIER_M
+    near = points[((points >= low) & (points <= high)).all(axis=1)]
+    if len(near) == 0:
+        return np.full(len(samples), np.inf)
+    distances: FloatArray = cKDTree(near).query(samples, distance_upper_bound=OUTLIER_M)[0]
+    return distances
+
+
+def _together(parts: list[MapDistances]) -> MapDistances:
+    def all_of(name: str) -> np.ndarray[Any, Any]:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return MapDistances(*(all_of(each.name) for each in fields(MapDistances)))

@@ -54,7 +54,7 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     odometry = KissICP(settings)
     T_first_lidar = []
     for frame in frames:
-        odometry.register_frame(read_scan(sequence, frame), np.array([]))
+        odometry.register_frame(scan_points(sequence, frame), np.array([]))
         T_first_lidar.append(odometry.last_pose.copy())
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
@@ -73,12 +73,8 @@ def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:
     ]
 
 
-def read_scan(sequence: Sequence, frame: int) -> FloatArray:
-    """The points of a frame's Velodyne file ``(P, 3)``, metres, in the LiDAR frame.
-
-    Raises:
-        SlamError: it cannot be read, or is no scan.
-    """
+def scan_points(sequence: Sequence, frame: int) -> FloatArray:
+    """The points of a Velodyne file ``(P, 3)``, metres, in the LiDAR frame."""
     path = sequence.scan_path(frame)
     assert path is not None
     try:

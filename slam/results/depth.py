@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
-from slam.frontend.lidar_odometry import read_scan
+from slam.frontend.lidar_odometry import scan_points
 from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.results.map_error import HasTrueDepth
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply
 from slam.sequences.excerpt import Excerpt
 
 _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refining it
-_PNG_METRES = 1 / 256
 
 
 class DepthQuality:
@@ -65,19 +64,16 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
     Of a simulated street only every fifth ``count`` is rendered.
 
     Raises:
-        SlamError: a scan cannot be read.
+        SlamError: a depth map or a scan cannot be read.
     """
     base, frame = (sequence.base, sequence.start + index) if isinstance(sequence, Excerpt) else (sequence, index)
-    street = getattr(base, "street", None)
-    if street is not None:
-        return None if count % _EVERY_RENDERED != 1 else np.asarray(street.render(frame).depth, np.float32)
-    path = getattr(base, "depth_files", {}).get(frame)
-    if path is not None:
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        return None if stored is None or stored.ndim != 2 else stored.astype(np.float32) * np.float32(_PNG_METRES)
+    if getattr(base, "street", None) is not None and count % _EVERY_RENDERED != 1:
+        return None
+    if isinstance(base, HasTrueDepth) and frame in base.true_depth_frames():
+        return np.asarray(base.true_depth(frame), np.float32)
     if sequence.T_camera_lidar is None or sequence.scan_path(index) is None:
         return None
-    return projected(read_scan(sequence, index), sequence.T_camera_lidar, sequence.intrinsics)
+    return projected(scan_points(sequence, index), sequence.T_camera_lidar, sequence.intrinsics)
 
 
 def projected(points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics) -> DepthMap:

@@ -162,7 +162,7 @@ def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Se
     seen = np.concatenate([disparity.compressed() for disparity in disparities])
     limits = np.percentile(seen, [2, 98]) if seen.size else np.array([0.0, 1.0])
     colours = colormaps["inferno"].with_extremes(bad="#9aa0a6")
-    with _figure_style() as new_figure:
+    with figure_style() as new_figure:
         block_width = 7.4 / columns
         size = (7.4, blocks * (2 * block_width * height / width + 0.3))
         narrow = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
@@ -203,7 +203,7 @@ def map_figure(
     corners = np.concatenate([np.percentile(ground, [0.5, 99.5], axis=0) if len(ground) else np.zeros((1, 2)), path])
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.04 * float((high - low).max()) or 1.0
-    with _figure_style() as new_figure:
+    with figure_style() as new_figure:
         share = float((high - low + margin)[1] / (high - low + margin)[0])
         figure = new_figure(figsize=(7.4, np.clip(6.4 * share + 1.0, 2.6, 7.0)), layout="constrained")
         axes = figure.subplots()
@@ -236,7 +236,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
         raise RunError(f"figures are written as {', '.join(SUFFIXES)}; got '{output.name}'")
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [4.6 if name == "trajectory" else 3.2 for name in what]
-    with _figure_style() as new_figure:
+    with figure_style() as new_figure:
         figure = new_figure(figsize=(7.4 * len(runs), sum(heights)), layout="constrained")
         grid = figure.subfigures(len(what), len(runs), squeeze=False, height_ratios=heights)
         for name, row in zip(what, grid):
@@ -281,7 +281,7 @@ def _figure(
     unit: str,
     size: tuple[float, float],
 ) -> Figure:
-    with _figure_style() as new_figure:
+    with figure_style() as new_figure:
         figure = new_figure(figsize=size, layout="constrained")
         if title:
             figure.suptitle(title, fontsize=12)
@@ -290,7 +290,7 @@ def _figure(
 
 
 @contextmanager
-def _figure_style() -> Iterator[Callable[..., Figure]]:
+def figure_style() -> Iterator[Callable[..., Figure]]:
     """The figure class under our style; without pyplot it leaves no global state."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure

@@ -20,6 +20,7 @@ from slam.frames import DepthMap, Image
 from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
+from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_sizes
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -120,7 +121,9 @@ def write_report(
         error_pictures=list(_error_pictures(trajectories)),
         depth=_depth_picture(examples),
         map_picture=_map_picture(trajectories.get("optimised"), unit, map_points, map_colours),
-        map=report_tables.map_numbers(metrics),
+        map=map_sizes(metrics),
+        map_errors=map_errors_table(metrics),
+        map_curve=_map_curve(metrics),
         no_map=_absence(metrics, "map"),
         loops=report_tables.loops(metrics, folder.path / "loops.json"),
         no_loops=_absence(metrics, "loops"),
@@ -178,6 +181,13 @@ def _map_picture(
         return None
     caption = "The map from above in its own colours."
     return _drawn(lambda: map_figure(points, colours, optimised, unit), "Map from above", caption)
+
+
+def _map_curve(metrics: Metrics) -> Picture | None:
+    if not has_map_curve(metrics):
+        return None
+    caption = "Error of the map by the distance of its points, and of the true surface, from the nearest camera."
+    return _drawn(lambda: map_error_figure(metrics), "Map error over distance", caption)
 
 
 def _files(folder: RunFolder) -> Table | None:

@@ -59,7 +59,6 @@ _PER_ALIGNMENT = (
     ("rpe_rot_deg", "RPE, deg", 4),
     ("scale", "scale", 4),
 )
-_MAP_NAMES = {"accuracy_median_m": "accuracy, median (m)"}
 
 
 def number(metrics: Metrics, *path: str, decimals: int = 0) -> Cell:
@@ -149,7 +148,7 @@ def errors(metrics: Metrics) -> Table | None:
         "Cross-check",
         row(EVO_DIFFERENCE),
     ]
-    return Table(["", *known], rows, notes=["Bold: the best of a row.", *_notes(_missing_errors(metrics, known))])
+    return Table(["", *known], rows, notes=["Bold: the best of a row.", *notes_on(_missing_errors(metrics, known))])
 
 
 def alignments(metrics: Metrics) -> Table | None:
@@ -164,18 +163,6 @@ def alignments(metrics: Metrics) -> Table | None:
             cells = [number(metrics, *place, how, key, decimals=decimals) for key, _, decimals in _PER_ALIGNMENT]
             rows.append([Cell(how), *cells])
     return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
-
-
-def map_numbers(metrics: Metrics) -> Table | None:
-    """Size and quality of the map; None without one."""
-    numbers, _ = lookup(metrics, "map")
-    if numbers is None:
-        return None
-    keys = [key for key in numbers if not key.endswith("_reason")]
-    names = [_MAP_NAMES.get(key, key.replace("_", " ")) for key in keys]
-    cells = [number(numbers, key, decimals=3) for key in keys]
-    missing = [f"{name}: {cell.tooltip}" for name, cell in zip(names, cells) if cell.tooltip]
-    return Table(["", *names], [[Cell("map"), *cells]], notes=_notes(missing))
 
 
 def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
@@ -195,7 +182,7 @@ def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
     head = ("from frame", "to frame", "verdict", "reason")
     return {
         "counts": ", ".join(f"{number(tree, stage).text} {stage}" for stage in stages),
-        "reasons": _notes(lookup(tree, stage)[1] for stage in stages),
+        "reasons": notes_on(lookup(tree, stage)[1] for stage in stages),
         "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
     }
 
@@ -207,7 +194,7 @@ def graph(metrics: Metrics) -> dict[str, Any] | None:
     size = {key: number(metrics, "graph", key).text for key in ("nodes", "factors")}
     coverage, reason = lookup(metrics, "graph", "coverage")
     if coverage is None:
-        return size | {"coverage": None, "reasons": _notes([f"coverage: {reason}"])}
+        return size | {"coverage": None, "reasons": notes_on([f"coverage: {reason}"])}
     rows = []
     for level in ("50", "90", "95"):
         ratio, why = lookup(coverage, level)
@@ -271,7 +258,7 @@ def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) ->
     return cells
 
 
-def _notes(reasons: Iterable[str]) -> list[str]:
+def notes_on(reasons: Iterable[str]) -> list[str]:
     """One line with the reasons of missing numbers, each once; none where nothing is missing."""
     distinct = [reason for reason in dict.fromkeys(reasons) if reason]
     return [f"{MISSING}  {'; '.join(distinct)}."] if distinct else []

@@ -20,6 +20,7 @@ from slam import se3
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray
+from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import too_long
 
 logger = logging.getLogger(__name__)
@@ -79,7 +80,7 @@ def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
 class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
 
-    ``depth_files`` are 16-bit images of true depth, metres times 256, by frame.
+    ``depth_maps`` are the true depth beside the images, where there is any.
     """
 
     name: str
@@ -91,7 +92,7 @@ class RecordedSequence:
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
     scans: dict[int, Path] = field(default_factory=dict)
-    depth_files: dict[int, Path] = field(default_factory=dict)
+    depth_maps: DepthMaps | None = None
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -111,6 +112,21 @@ class RecordedSequence:
     def scan_path(self, index: int) -> Path | None:
         """The Velodyne ``.bin`` file taken with a frame, or None."""
         return self.scans.get(index)
+
+    def true_depth_frames(self) -> list[int]:
+        """Frames with a depth map beside their image."""
+        return [] if self.depth_maps is None else sorted(k for k in self.depth_maps.paths if 0 <= k < len(self))
+
+    def true_depth(self, index: int) -> FloatArray:
+        """The depth map ``(h, w)`` beside an image in metres, 0 where unknown.
+
+        Raises:
+            SequenceError: it cannot be read.
+        """
+        if self.depth_maps is None:
+            raise SequenceError(f"{self.name} has no depth maps")
+        with sequence_errors():
+            return self.depth_maps.read(index)
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""

@@ -11,6 +11,7 @@ from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
+from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles
 from slam.sequences.recording import RecordedSequence, Source, interpolated_poses, rebased, require_stamps
 from slam.sequences.undistortion import calibrated
@@ -20,6 +21,9 @@ logger = logging.getLogger(__name__)
 
 INDEX_FILE = "rgb.txt"
 _MAX_GAP_S = 0.1
+_DEPTH_INDEX = "depth.txt"
+_DEPTH_PER_METRE = 5000.0
+_MAX_DEPTH_DELAY_S = 0.02
 
 
 def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
@@ -30,7 +34,8 @@ def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
     """
     stamps, paths = _read_index(folder / INDEX_FILE)
     files = NumberedFiles(tuple(paths), tuple(range(len(paths))))
-    images, intrinsics = calibrated(ImageFiles(files), camera, str(folder))
+    stored = ImageFiles(files)
+    images, intrinsics = calibrated(stored, camera, str(folder))
     name = folder.absolute().name
     return RecordedSequence(
         name=name,
@@ -40,11 +45,12 @@ def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
         sources=(Source(f"tum/{name}"),),
         reference=_reference(folder / "groundtruth.txt", stamps),
         camera_height_m=camera.height_or(None),
+        depth_maps=_depth_maps(folder, stamps) if images is stored else None,
     )
 
 
 def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
-    """Stamps and image paths of ``rgb.txt``."""
+    """Stamps and image paths of ``rgb.txt`` or ``depth.txt``."""
     stamps, paths = [], []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         words = line.split()
@@ -62,6 +68,16 @@ def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
     if missing is not None:
         raise SequenceError(f"no image {missing}, which {path} names: restore it or remove the row")
     return np.array(stamps), paths
+
+
+def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
+    """The registered depth maps of ``depth.txt`` whose stamps are within 20 ms of an image's."""
+    if not (folder / _DEPTH_INDEX).is_file():
+        return None
+    known, paths = _read_index(folder / _DEPTH_INDEX)
+    nearest = np.abs(known[None] - stamps[:, None]).argmin(axis=1)
+    close = np.abs(known[nearest] - stamps) <= _MAX_DEPTH_DELAY_S
+    return DepthMaps({int(k): paths[nearest[k]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
 
 
 def _reference(path: Path, stamps: FloatArray) -> FloatArray | None:

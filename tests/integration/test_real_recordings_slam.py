@@ -20,3 +20,17 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
     for name, measured_m in (("network", 0.382), ("odometry", 0.216), ("optimised", 0.227)):
         assert metrics["trajectories"][name]["align"]["7dof"]["ate_rmse_m"] < 2 * measured_m
     assert metrics["map"]["accuracy_median_m"] is None and (metrics["map"]["triangles"] or 0) > 0
+
+
+@pytest.mark.data
+def test_the_map_of_a_drive_against_its_scans(
+    data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
+    drive = data_root / "kitti_raw" / "2011_09_26" / "2011_09_26_drive_0013_sync"
+    run = run_slam(drive, frames="0:60", output=tmp_path / "run", device="cpu")
+    found = check_run(run.path)["map"]
+    assert found["truth"] == "lidar" and 50 < found["evaluated_m"] < 70
+    assert found["accuracy_median_m"] < 2 * 0.097 and found["completeness"] > 0.4
+    # some 15 % of the map is above the highest beam: it counts as an error
+    assert found["accuracy_90_m"] > found["in_field"]["accuracy_90_m"] < 2 * 0.46
+    assert [ring["to_m"] for ring in found["by_distance"]] == [5, 10, 15, 20, 25]

@@ -24,7 +24,7 @@ from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulatedFrame, SimulationOptions
+from slam.sequences.simulation.street import SimulatedFrame, SimulationOptions, write_kitti_root
 from slam.trajectory import Trajectory, read_trajectory
 
 FACTOR = 0.2  # unscaled lengths per metre
@@ -151,3 +151,15 @@ def test_the_system_is_better_than_its_networks(learned: Path, check_run: Callab
     assert errors["optimised"]["6dof"]["ate_rmse_m"] < 2 * 0.367
     assert metrics["scale"]["mode"] == "camera-height"
     assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"]["accuracy_median_m"] < 2 * 0.153
+
+
+def test_the_map_of_a_simulated_root_on_disk_has_an_error(
+    tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
+) -> None:
+    street = SimulatedSequence(SimulationOptions("straight", frames=40, seed=703)).street
+    write_kitti_root(street, tmp_path / "root", depth=True)
+    run = run_slam(tmp_path / "root", weights="sim", output=tmp_path / "run", device="cpu")
+    found = check_run(run.path)["map"]
+    assert found["truth"] == "depth maps"
+    assert 0.02 < found["accuracy_median_m"] < 0.5 and found["completeness"] > 0.4
+    assert 0.3 < found["f_score"]["0.2"] < found["f_score"]["0.5"] < 1.0

@@ -18,6 +18,7 @@ from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import beside
+from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti.calibration import moved_to_camera
 from slam.sequences.recording import (
@@ -58,8 +59,6 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
     else:
         images, intrinsics = calibrated(stored, camera, str(folder))
     scans = (path for path in (folder / "velodyne").glob("*.bin") if path.stem.isdecimal())
-    depths = (path for path in (folder / "depth_2").glob("*.png") if path.stem.isdecimal())
-    has_true_depth = number == 2 and camera is None  # of the images as stored
     return RecordedSequence(
         name=name,
         images=images,
@@ -70,7 +69,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
         camera_height_m=_camera_height(root, camera),
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
         scans={int(path.stem) - files.first: path for path in scans},
-        depth_files={int(path.stem) - files.first: path for path in depths} if has_true_depth else {},
+        depth_maps=depth_maps_in(folder / f"depth_{number}", files) if images is stored else None,
     )
 
 

@@ -18,6 +18,7 @@ from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import beside
+from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
 from slam.sequences.kitti.calibration import moved_to_camera
@@ -35,6 +36,7 @@ from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
+_DEPTH_MAPS = "proj_depth/groundtruth"  # of KITTI's depth benchmark
 _EPOCH = np.datetime64("2011-01-01", "ns")
 
 
@@ -52,7 +54,8 @@ def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
         looked = ", ".join(f"image_{c}/data" for c in RAW_CAMERAS)
         raise SequenceError(f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again")
     files = by_number(list_images(drive / f"image_{number}" / "data"))
-    images: ImageSource = ImageFiles(files)
+    stored = ImageFiles(files)
+    images: ImageSource = stored
     cameras = CalibrationFile(drive.parent / CAM_TO_CAM)
     intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, images.width, images.height))
     if camera is not None:
@@ -74,6 +77,7 @@ def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
         camera_height_m=_camera_height(drive, camera),
         T_camera_lidar=T_camera_lidar,
         scans={int(path.stem) - files.first: path for path in scans},
+        depth_maps=depth_maps_in(drive / _DEPTH_MAPS / f"image_{number}", files) if images is stored else None,
     )
 
 

@@ -49,6 +49,14 @@ class SimulatedSequence:
         """None: scans are not on disk; ``street.scan(index)`` gives them."""
         return None
 
+    def true_depth_frames(self) -> range:
+        """All frames."""
+        return range(len(self))
+
+    def true_depth(self, index: int) -> FloatArray:
+        """True z-depth ``(H, W)`` of a frame in metres, 0 where unknown."""
+        return np.asarray(self.street.depth(index), dtype=np.float64)
+
     def provenance(self) -> tuple[str, ...]:
         """The simulated world by its seed; all excerpts of it are of the same streets."""
         return labels(self.sources, len(self))

@@ -154,6 +154,14 @@ class SimulatedStreet:
         image = self._develop(rgb, index)
         return SimulatedFrame(index, index / FPS, image, depth, self.T_world_camera[index].copy())
 
+    def depth(self, index: int) -> Float32Array:
+        """The z-depth ``(H, W)`` of `render`, without the image."""
+        self._require(index)
+        rays = _rays(self._route.T_street_camera[index], self._rays)
+        depth: Float32Array = np.min([_cast(surface.scene, rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
+        depth[depth >= FARTHEST_M] = 0.0
+        return depth.reshape(self.options.height, self.options.width)
+
     def scan(self, index: int) -> Float32Array:
         """LiDAR points of one frame: x, y, z in the LiDAR frame, metres, and reflectance, ``(M, 4)``."""
         self._require(index)

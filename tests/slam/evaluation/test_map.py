@@ -1,41 +1,151 @@
-"""Accuracy and completeness of a map, by hand values."""
+"""Error of a map against a known surface, by hand values."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
 from slam import se3
-from slam.evaluation.map import accuracy_median_m, completeness, pose_similarity, visible_surface
+from slam.evaluation.map import compare, pose_similarity, statistics
+from slam.evaluation.surface import Indices, Mask, Surface, backprojected, stretches, thinned
+from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 
-
-def test_accuracy_is_the_median_distance() -> None:
-    points = np.array([[0.0, 0.1, 0.0], [1.0, -0.2, 3.0], [2.0, 9.0, 1.0]])
-    assert accuracy_median_m(points, lambda p: np.abs(p[:, 1])) == pytest.approx(0.2)
-    assert accuracy_median_m(np.empty((0, 3)), lambda p: p[:, 1]) is None
+HEIGHT_M = 1.65
+CELL_M = 0.05
 
 
-def test_completeness_is_the_ratio_within_30_cm() -> None:
-    surface = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
-    found = np.array([[0.0, 0.29, 0.0], [1.0, 0.31, 0.0], [3.0, 0.0, 0.1], [9.0, 9.0, 9.0]])
-    assert completeness(surface, found) == pytest.approx(0.5)
-    assert completeness(surface, np.empty((0, 3))) == 0.0
-    assert completeness(np.empty((0, 3)), found) is None
+def road(width_m: float = 6.0, length_m: float = 20.0) -> FloatArray:
+    """A grid of points under the cameras, one in each 5 cm voxel."""
+    x, z = np.arange(-width_m / 2, width_m / 2, CELL_M), np.arange(0.0, length_m, CELL_M)
+    grid = np.stack(np.meshgrid(x, z), axis=-1).reshape(-1, 2) + CELL_M / 2
+    return np.column_stack([grid[:, 0], np.full(len(grid), HEIGHT_M), grid[:, 1]])
 
 
-def test_visible_surface_is_near_and_in_the_world() -> None:
-    K = np.array([[50.0, 0, 10.0], [0, 50.0, 5.0], [0, 0, 1]])
+@dataclass
+class Road:
+    """A plane that every camera sees whole."""
+
+    points: FloatArray
+    frames: Indices
+    exact: bool = False
+    name: str = "plane"
+    views: int = 0
+
+    @property
+    def distance(self) -> Callable[[FloatArray], FloatArray] | None:
+        return (lambda points: np.abs(points[:, 1] - HEIGHT_M)) if self.exact else None
+
+    def view(self, frame: int) -> Surface:
+        self.views += 1
+        return Surface(self.points, np.ones(len(self.points), dtype=bool))
+
+    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
+        return points[:, 0] > 0
+
+
+def straight(frames: int = 21, step_m: float = 1.0) -> FloatArray:
+    T_world_camera = np.tile(np.eye(4), (frames, 1, 1))
+    T_world_camera[:, 2, 3] = step_m * np.arange(frames)
+    return T_world_camera
+
+
+def errors(points: FloatArray, exact: bool = False) -> dict[str, Any]:
+    truth = Road(road(), np.arange(21), exact)
+    return statistics(compare(truth, straight(), {"map": points}).distances["map"])
+
+
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize(("offset_m", "covered", "f_scores"), [(0.1, 1, (1, 1)), (0.25, 1, (0, 1)), (0.4, 0, (0, 1))])
+def test_a_raised_plane_is_wrong_by_its_offset(
+    offset_m: float, covered: float, f_scores: tuple[float, float], exact: bool
+) -> None:
+    found = errors(road() - [0.0, offset_m, 0.0], exact)
+    assert found["accuracy_median_m"] == pytest.approx(offset_m)
+    assert found["accuracy_90_m"] == pytest.approx(offset_m)
+    assert found["completeness"] == covered
+    assert (found["f_score"]["0.2"], found["f_score"]["0.5"]) == f_scores
+    assert found["outlier_share"] == 0.0
+
+
+def test_half_a_plane_is_accurate_and_half_complete() -> None:
+    points = road()
+    found = errors(points[points[:, 0] < 0])
+    assert found["accuracy_median_m"] == pytest.approx(0.0, abs=1e-9)
+    assert found["completeness"] == pytest.approx(0.5 + 0.3 / 6.0, abs=0.02)
+    assert found["precision"] == {"0.2": 1.0, "0.5": 1.0}
+    recall = 0.5 + 0.5 / 6.0
+    assert found["f_score"]["0.5"] == pytest.approx(2 * recall / (1 + recall), abs=0.02)
+
+
+def test_density_does_not_weigh() -> None:
+    points = road()
+    good, bad = points[points[:, 0] < 0], points[points[:, 0] >= 0] - [0.0, 2.0, 0.0]
+    found = errors(np.concatenate([np.repeat(good, 20, axis=0), bad]))
+    assert found["outlier_share"] == pytest.approx(0.5, abs=0.03)
+    assert found["accuracy_90_m"] == pytest.approx(2.0)
+    assert found["in_field"]["share"] == pytest.approx(0.5, abs=0.03)
+    assert found["in_field"]["accuracy_median_m"] == pytest.approx(2.0)
+
+
+def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
+    points = road(36.0)
+    points[np.abs(points[:, 0]) > 9.0, 1] -= 0.35
+    truth = Road(road(36.0), np.arange(21))
+    found = statistics(compare(truth, straight(), {"map": points}).distances["map"])
+    near, _, _, far, beyond = found["by_distance"]
+    assert (near["from_m"], near["to_m"], beyond["to_m"]) == (0.0, 5.0, 25.0)
+    assert near["accuracy_median_m"] == pytest.approx(0.0, abs=1e-9) and near["f_score"]["0.2"] == 1.0
+    assert far["accuracy_median_m"] == pytest.approx(0.35) and far["completeness"] < 0.1
+    assert far["f_score"] == {"0.2": 0.0, "0.5": 1.0}
+    assert "too few" in beyond["f_score"]["0.2_reason"] and beyond["completeness"] is None
+
+
+def test_an_empty_map_has_reasons_and_covers_nothing() -> None:
+    found = errors(np.array([[0.0, 90.0, 0.0]]))
+    assert found["completeness"] == 0.0 and found["accuracy_median_m"] is None
+    assert "no map point" in found["accuracy_median_m_reason"] and "no map point" in found["f_score"]["0.2_reason"]
+
+
+def test_only_the_road_of_known_surface_counts() -> None:
+    truth = Road(road(), np.arange(21))
+    found = compare(truth, straight(200), {"map": np.concatenate([road(), road() + np.array([0.0, 0.0, 100.0])])})
+    assert statistics(found.distances["map"])["outlier_share"] == 0.0
+    assert found.length_m == pytest.approx(26.0)
+
+
+def test_a_long_drive_is_sampled_evenly() -> None:
+    T_world_camera = straight(5000)
+    parts = stretches(T_world_camera, np.arange(5000))
+    assert len(parts) == 5 and all(len(part) == 100 for part in parts)
+    assert parts[0][0] < 1000 and parts[-1][-1] > 4000
+    truth = Road(road(1.0, 1.0), np.arange(5000))
+    found = compare(truth, T_world_camera, {"map": road(1.0)})
+    assert found.length_m == pytest.approx(500.0)
+    assert truth.views <= 5 * 201
+
+
+def test_one_point_of_each_voxel() -> None:
+    points = np.array([[0.01, 0, 0], [0.04, 0, 0], [0.06, 0, 0], [-0.01, 0, 0], [0.02, 0.06, 0]])
+    assert thinned(points, 0.05).tolist() == [0, 2, 3, 4]
+    assert len(thinned(np.empty((0, 3)), 0.05)) == 0
+
+
+def test_depth_becomes_points_in_the_world() -> None:
+    rays = Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).rays(Intrinsics(21, 11, 50.0, 50.0, 10.0, 5.0).pixel_grid())
     depth = np.full((11, 21), 8.0)
     depth[:, 0] = 0.0  # nothing there
     depth[:, 20] = 20.0  # a ray longer than 20 m
     T_world_camera = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.array([1.0, 2.0, 3.0]))
-    points = visible_surface(depth, K, T_world_camera, step=5)
-    assert points.shape == (3 * 3, 3)
+    points = backprojected(depth, rays, T_world_camera, 20.0)
+    assert points.shape == (11 * 19, 3)
     # the camera looks along +x of the world: its own x axis is -z there
     np.testing.assert_allclose(points[:, 0], 9.0)
     assert [9.0, 2.0, 3.0] in points.round(9).tolist()
-    np.testing.assert_allclose(sorted(set(points[:, 2].round(9))), [2.2, 3.0, 3.8])
 
 
 def drive(frames: int = 40) -> FloatArray:
@@ -63,3 +173,18 @@ def test_similarity_keeps_the_roll_of_a_straight_road() -> None:
 
 def test_similarity_of_an_estimate_that_stands_still_keeps_its_scale() -> None:
     assert pose_similarity(drive(), np.tile(np.eye(4), (40, 1, 1))).scale == 1.0
+
+
+def test_a_rigid_motion_keeps_the_scale() -> None:
+    truth = drive()
+    moved = se3.Similarity(0.5, se3.from_rotation_vector(np.array([0.3, -1.0, 0.2]), np.zeros(3))[:3, :3], np.ones(3))
+    back = pose_similarity(truth, moved.apply_to_poses(truth), with_scale=False)
+    assert back.scale == 1.0
+    np.testing.assert_allclose(back.R_a_b, moved.R_a_b.T, atol=1e-9)
+
+
+def test_positions_of_a_long_drive_outweigh_a_constant_error_of_its_orientations() -> None:
+    truth = straight(200)
+    tilted = truth.copy()
+    tilted[:, :3, :3] = se3.from_rotation_vector(np.array([np.deg2rad(1.0), 0.0, 0.0]), np.zeros(3))[:3, :3]
+    assert se3.rotation_angle(pose_similarity(truth, tilted, with_scale=False).R_a_b) < np.deg2rad(0.1)

@@ -6,6 +6,7 @@ from erfsfm.refinement.refine import RefinedDepth
 from slam.frames import Intrinsics
 from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
+from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.recording import RecordedSequence, Source
 
@@ -31,7 +32,7 @@ def with_depth(tmp_path) -> RecordedSequence:
 
     path = tmp_path / "000002.png"
     cv2.imwrite(str(path), (DEPTH * 256).astype(np.uint16))
-    return recorded(depth_files={2: path})
+    return recorded(depth_maps=DepthMaps({2: path}))
 
 
 def test_stored_depth_is_read_and_compared(tmp_path) -> None:

@@ -87,6 +87,7 @@ def test_its_pictures_are_whole_and_not_blank(full: RunFolder) -> None:
         "Drift over segment length",
         "Depth maps",
         "Map from above",
+        "Map error over distance",
     ]
     for each in pictures:
         data = str(each["src"]).removeprefix("data:image/png;base64,")
@@ -113,6 +114,23 @@ def test_its_table_marks_the_best_and_explains_what_is_missing(full: RunFolder) 
     assert all(attrs.get("title") for attrs in missing)
     assert "t_rel, % (7 dof) of odometry: no segment of 100 m was left" in html
     assert "lidar trajectory: the sequence has no LiDAR scans" in html
+
+
+def test_the_error_of_the_map_has_its_truth_and_a_curve(full: RunFolder) -> None:
+    html, balance = parsed(full)
+    words = " ".join(balance.words)
+    for said in ("where the scanner looked", "with one scale", "10 to 15 m", "LiDAR scans accumulated at true poses"):
+        assert said in words
+    assert "0.081" in words and "0.729" in words and "the true surface is not known" in html
+
+
+def test_without_a_truth_the_reason_is_given(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    metrics = make_metrics()
+    metrics["map"] = {"triangles": 5, "points": 7, "blocks": 1, "truth": None, "truth_reason": "no true poses"}
+    folder = make_run(metrics=metrics)
+    write_report(folder, examples(), None, None)
+    html, _ = parsed(folder)
+    assert "error of the map: no true poses" in html and "Map error over distance" not in html
 
 
 def test_loops_are_listed_with_their_verdict(full: RunFolder) -> None:
@@ -171,4 +189,4 @@ def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_ru
     write_report(folder, examples(), None, None)
     html, _ = parsed(folder)
     assert "not drawn, no time stamps match" in html
-    assert html.count("<img") == 1
+    assert html.count("<img") == 2  # depth and the error of the map

@@ -1,11 +1,13 @@
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.recording import RecordedSequence
 
 STAMPS = [100.02, 100.05, 100.09]
 
@@ -73,3 +75,13 @@ def test_needs_a_camera_file(folder: Path) -> None:
     (folder / "camera.yaml").unlink()
     with pytest.raises(SequenceError, match=r"no camera\.yaml for TUM folder"):
         open_sequence(folder, None, None, None)
+
+
+def test_registered_depth_maps_belong_to_the_images_of_their_stamps(folder: Path) -> None:
+    sequence = open_sequence(folder)
+    assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == []
+    cv2.imwrite(str(folder / "near.png"), np.full((4, 6), 10_000, dtype=np.uint16))
+    (folder / "depth.txt").write_text("# timestamp filename\n100.035 near.png\n100.30 near.png\n")
+    sequence = open_sequence(folder)
+    assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == [0, 1]
+    np.testing.assert_array_equal(sequence.true_depth(1), np.full((4, 6), 2.0))

@@ -1,0 +1,161 @@
+"""The true surface around a drive: measured points accumulated at true poses, one stretch of road at a time.
+
+A long drive is sampled: a number of stretches, evenly spread, with all that cameras on them see. Time and memory have a
+bound, whatever the length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from slam.se3 import FloatArray, rotation_angle
+
+RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
+STRETCH_M = 100.0
+MOST_STRETCHES = 5
+TRUTH_VOXEL_M = 0.05
+SAMPLE_VOXEL_M = 0.2
+VIEW_STEP_M = 1.0
+SPARSE_VIEW_STEP_M = 3.0  # where views do not measure the accuracy
+
+_MERGED_POINTS = 1_000_000
+_VIEW_STEP_DEG = 5.0
+_NEAR_TRUTH_M = 5.0  # of a camera to the nearest one that measured the surface
+_KEY_BITS = 21  # a coordinate in voxels, both signs
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points ``(P, 3)`` of the true surface in the world, and whether an image shows them within 25 m ``(P,)``."""
+
+    points: FloatArray
+    in_image: Mask
+
+
+class SurfaceTruth(Protocol):
+    """A source of the true surface; its world is that of the true poses.
+
+    ``name`` says what it is, ``frames`` ``(F,)`` which frames measured the surface. ``distance``, where the surface is
+    known exactly, gives the distances ``(P,)`` of points ``(P, 3)`` to it.
+    """
+
+    name: str
+    frames: Indices
+    distance: Callable[[FloatArray], FloatArray] | None
+
+    def view(self, frame: int) -> Surface:
+        """The surface as one frame measured it."""
+        ...
+
+    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
+        """Whether the sensor could have measured points ``(P, 3)`` from any of these frames, if nothing hid them."""
+        ...
+
+
+def thinned(points: FloatArray, voxel_m: float) -> Indices:
+    """One point of each voxel, the first: indices into ``points`` ``(P, 3)``, increasing."""
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64)
+    keys = np.floor(points / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
+    key = (keys[:, 0] << (2 * _KEY_BITS)) | (keys[:, 1] << _KEY_BITS) | keys[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices]:
+    """Frames of stretches of 100 m along a drive with known surface: all of them, or five evenly spread.
+
+    Args:
+        T_world_camera: true poses of all frames ``(N, 4, 4)``.
+        truth_frames: frames that measured the surface; others count where the camera is within 5 m of one of them.
+    """
+    positions = T_world_camera[:, :3, 3]
+    away, _ = cKDTree(positions[truth_frames]).query(positions)
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    number = (travelled / STRETCH_M).astype(np.int64)
+    parts = [np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)]
+    parts = [part for part in parts if len(part)]
+    if len(parts) <= MOST_STRETCHES:
+        return parts
+    chosen = ((np.arange(MOST_STRETCHES) + 0.5) * len(parts) / MOST_STRETCHES).astype(np.intp)
+    return [parts[k] for k in chosen]
+
+
+def length_m(T_world_camera: FloatArray, parts: list[Indices]) -> float:
+    """Length of the road in these stretches, each frame's up to the next frame."""
+    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    to_next = np.append(steps, 0.0)
+    return float(sum(to_next[part].sum() for part in parts))
+
+
+def moved_frames(T_world_camera: FloatArray, frames: Indices, step_m: float) -> Indices:
+    """Those of increasing ``frames`` that are ``step_m`` or 5 degrees from the one before."""
+    kept: list[int] = []
+    for frame in frames:
+        if kept:
+            T_last, T_next = T_world_camera[kept[-1]], T_world_camera[frame]
+            moved = float(np.linalg.norm(T_next[:3, 3] - T_last[:3, 3]))
+            turned = float(rotation_angle(T_last[:3, :3].T @ T_next[:3, :3]))
+            if moved < step_m and turned < np.deg2rad(_VIEW_STEP_DEG):
+                continue
+        kept.append(int(frame))
+    return np.array(kept, dtype=np.int64)
+
+
+def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:
+    """Those of ``views`` that can see what is near a stretch of road."""
+    positions = T_world_camera[:, :3, 3]
+    away, _ = cKDTree(positions[part]).query(positions[views])
+    near: Indices = views[away <= 2 * RANGE_M]
+    return near
+
+
+def accumulated(truth: SurfaceTruth, views: Indices) -> Surface:
+    """The surface from all ``views``, one point in each voxel of 5 cm, one in an image where there is one."""
+    return _merged(truth.view(int(frame)) for frame in views)
+
+
+def _merged(views: Iterable[Surface]) -> Surface:
+    """All views as one surface; the number of points held at a time is bounded by that of voxels."""
+    whole = Surface(np.empty((0, 3)), np.empty(0, dtype=bool))
+    waiting: list[Surface] = []
+    for view in views:
+        waiting.append(_thinned(view))
+        if sum(len(each.points) for each in waiting) > _MERGED_POINTS:
+            whole, waiting = _thinned(_joined([whole, *waiting])), []
+    return _thinned(_joined([whole, *waiting]))
+
+
+def _joined(parts: list[Surface]) -> Surface:
+    return Surface(np.concatenate([part.points for part in parts]), np.concatenate([part.in_image for part in parts]))
+
+
+def _thinned(surface: Surface) -> Surface:
+    order = np.concatenate([np.flatnonzero(surface.in_image), np.flatnonzero(~surface.in_image)])
+    kept = order[thinned(surface.points[order], TRUTH_VOXEL_M)]
+    return Surface(surface.points[kept], surface.in_image[kept])
+
+
+def backprojected(depth_m: FloatArray, rays: FloatArray, T_world_camera: FloatArray, range_m: float) -> FloatArray:
+    """Points ``(P, 3)`` in the world of a depth map ``(H, W)``, no further than ``range_m`` from the camera.
+
+    Args:
+        depth_m: z-depth, 0 or not finite where unknown.
+        rays: through every pixel, z = 1, ``(H, W, 3)``.
+        T_world_camera: ``(4, 4)``.
+        range_m: largest distance from the camera.
+    """
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    points = rays[known] * depth_m[known][:, None]
+    near = points[np.linalg.norm(points, axis=1) <= range_m]
+    points_world: FloatArray = near @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return points_world

@@ -1,0 +1,181 @@
+"""The error of a run's map, by the best truth that its sequence has: a surface, depth maps or LiDAR scans."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from slam.errors import SlamError
+from slam.evaluation.map import compare, pose_similarity, statistics
+from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected
+from slam.frames import Intrinsics, Sequence
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import scan_points
+from slam.pipeline.batch import SlamResult
+from slam.results.summary import null
+from slam.se3 import FloatArray, apply, invert
+from slam.sequences.excerpt import Excerpt
+
+logger = logging.getLogger(__name__)
+
+_ERRORS = ("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall")
+_NAMES = (*_ERRORS, "in_field", "by_distance")
+_DEPTH_RANGE_M = 50.0
+_MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
+
+
+@runtime_checkable
+class HasTrueDepth(Protocol):
+    """A sequence that may have true depth beside its images."""
+
+    def true_depth_frames(self) -> range | list[int]:
+        """Frames that have it, increasing."""
+        ...
+
+    def true_depth(self, index: int) -> FloatArray:
+        """Z-depth ``(h, w)`` of one of them in metres, 0 where unknown."""
+        ...
+
+
+class DepthTruth:
+    """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
+
+    def __init__(self, sequence: Sequence, depth: HasTrueDepth, first: int) -> None:
+        """Depth of a sequence whose frame 0 is frame ``first`` of ``depth``."""
+        self._depth, self._first = depth, first
+        self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
+        frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - first
+        self.frames: Indices = frames[(frames >= 0) & (frames < len(sequence))]
+        street = getattr(depth, "street", None)
+        self.name = "depth maps" if street is None else "exact surface"
+        self.distance: Callable[[FloatArray], FloatArray] | None = None
+        if street is not None:
+            T_street_first = street.T_world_camera[first]
+            self.distance = lambda points: np.asarray(street.distance_to_surface(apply(T_street_first, points)))
+
+    def view(self, frame: int) -> Surface:
+        """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
+        assert self._poses is not None
+        depth = self._depth.true_depth(self._first + frame)
+        height, width = depth.shape
+        camera = Intrinsics.of(self._intrinsics.resized(width, height))
+        step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
+        offset = frame % step  # other pixels in neighbouring frames
+        rays = camera.rays(camera.pixel_grid()[offset::step, offset::step])
+        points = backprojected(depth[offset::step, offset::step], rays, self._poses[frame], _DEPTH_RANGE_M)
+        return Surface(points, np.linalg.norm(points - self._poses[frame][:3, 3], axis=1) <= RANGE_M)
+
+    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
+        """True: the map comes from the same images."""
+        return np.ones(len(points), dtype=bool)
+
+
+class LidarTruth:
+    """LiDAR scans at true poses, points within 25 m of the scanner; moving objects are among them.
+
+    Completeness is about points in the images; the accuracy of the map is measured against all.
+    """
+
+    name = "lidar"
+    distance: Callable[[FloatArray], FloatArray] | None = None
+
+    def __init__(self, sequence: Sequence) -> None:
+        """The scans of a sequence with true poses."""
+        self._sequence = sequence
+        scanned = [k for k in range(len(sequence)) if sequence.scan_path(k) is not None]
+        self.frames: Indices = np.array(scanned, dtype=np.int64)
+        self._limits: dict[int, tuple[float, float]] = {}
+
+    def view(self, frame: int) -> Surface:
+        """The points of one scan; those that project into its image are in the image."""
+        sequence = self._sequence
+        assert sequence.reference is not None and sequence.T_camera_lidar is not None
+        points = scan_points(sequence, frame)
+        ranges = np.linalg.norm(points, axis=1)
+        self._limits[frame] = _elevations(points, ranges)
+        points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
+        camera = sequence.intrinsics
+        depth = np.where(points[:, 2] > 0.1, points[:, 2], np.inf)
+        u = camera.fx * points[:, 0] / depth + camera.cx
+        v = camera.fy * points[:, 1] / depth + camera.cy
+        inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5) & np.isfinite(depth)
+        return Surface(apply(sequence.reference[frame], points), inside)
+
+    def in_field(self, points: FloatArray, frames: Indices) -> Mask:
+        """Points within 25 m of a scanner, between its lowest and its highest beam."""
+        sequence = self._sequence
+        assert sequence.reference is not None and sequence.T_camera_lidar is not None
+        found = np.zeros(len(points), dtype=bool)
+        for frame in frames:
+            if int(frame) not in self._limits:
+                self.view(int(frame))
+            low, high = self._limits[int(frame)]
+            T_lidar_world = invert(sequence.reference[frame] @ sequence.T_camera_lidar)
+            seen = apply(T_lidar_world, points)
+            ranges = np.linalg.norm(seen, axis=1)
+            sine = seen[:, 2] / np.maximum(ranges, 1e-6)
+            found |= (ranges <= RANGE_M) & (sine >= low) & (sine <= high)
+        return found
+
+
+def _elevations(points: FloatArray, ranges: FloatArray) -> tuple[float, float]:
+    """Sines of the lowest and the highest beam of a scan, stray points left out."""
+    sines = points[ranges > 1.0, 2] / ranges[ranges > 1.0]
+    if len(sines) == 0:
+        return 1.0, -1.0
+    low, high = np.quantile(sines, [0.001, 0.999])
+    return float(low), float(high)
+
+
+def find_truth(sequence: Sequence) -> SurfaceTruth | str:
+    """The best truth of a sequence, or why there is none."""
+    if sequence.reference is None:
+        return "the sequence has no true poses"
+    base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+    if isinstance(base, HasTrueDepth):
+        depth = DepthTruth(sequence, base, first)
+        if len(depth.frames):
+            return depth
+    if sequence.T_camera_lidar is not None:
+        lidar = LidarTruth(sequence)
+        if len(lidar.frames):
+            return lidar
+    return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
+
+
+def no_map_errors(reason: str) -> dict[str, Any]:
+    """Every number of the map's error as missing."""
+    names = (*_NAMES, "truth", "evaluated_m", "with_scale")
+    return {key: value for name in names for key, value in null(name, reason).items()}
+
+
+def map_errors(points: FloatArray, result: SlamResult, sequence: Sequence) -> dict[str, Any]:
+    """Errors of a map ``(P, 3)`` moved to the truth by one rigid motion, and under ``with_scale`` by a similarity."""
+    truth = find_truth(sequence)
+    if isinstance(truth, str):
+        return no_map_errors(truth)
+    assert sequence.reference is not None
+    fits = {
+        "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
+        "with_scale": pose_similarity(sequence.reference, result.optimised.T_world_camera),
+    }
+    unmetric = result.scale.mode == "none" or isinstance(result.scale.estimate, MeasurementFailure)
+    if unmetric:
+        del fits["rigid"]
+    placed = {name: fit.scale * points @ fit.R_a_b.T + fit.t_a_b for name, fit in fits.items()}
+    try:
+        found = compare(truth, sequence.reference, placed)
+    except SlamError as error:
+        logger.warning("the error of the map is not known: %s", error)
+        return no_map_errors(str(error))
+    scaled = {"scale": fits["with_scale"].scale} | statistics(found.distances["with_scale"])
+    rigid = _unknown_scale() if unmetric else statistics(found.distances["rigid"])
+    return {**rigid, "truth": truth.name, "evaluated_m": found.length_m, "with_scale": scaled}
+
+
+def _unknown_scale() -> dict[str, Any]:
+    reason = "lengths are not in metres: see with_scale"
+    return {key: value for name in _NAMES for key, value in null(name, reason).items()}

@@ -1,0 +1,42 @@
+"""Depth maps beside the images of a recording: 16-bit PNG, 0 where unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.errors import DataError
+from erfsfm.readers.images import read_values
+from erfsfm.readers.numbering import NumberedFiles
+from slam.se3 import FloatArray
+
+KITTI_PER_METRE = 256.0
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Files by frame, and the stored value of one metre."""
+
+    paths: dict[int, Path]
+    per_metre: float = KITTI_PER_METRE
+
+    def read(self, index: int) -> FloatArray:
+        """The depth map ``(h, w)`` of a frame in metres.
+
+        Raises:
+            DataError: it cannot be read, or is no 16-bit grey image.
+        """
+        path = self.paths[index]
+        values = read_values(path)
+        if values.ndim != 2 or values.dtype != np.uint16:
+            raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
+        return values.astype(np.float64) / self.per_metre
+
+
+def depth_maps_in(folder: Path, images: NumberedFiles) -> DepthMaps | None:
+    """The depth maps of a folder, by the numbers of the images; None where there are none."""
+    found = (path for path in folder.glob("*.png") if path.stem.isdecimal()) if folder.is_dir() else ()
+    paths = {int(path.stem) - images.first: path for path in found}
+    return DepthMaps(paths) if paths else None

@@ -62,7 +62,7 @@ def run(
     ] = None,
     sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
     camera: Annotated[Path | None, typer.Option(help="camera.yaml of a folder or video")] = None,
-    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc or a training output")] = "default",
+    weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,

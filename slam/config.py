@@ -195,7 +195,7 @@ class MappingConfig(Section):
         default=0.1, gt=0, description="largest relative depth difference to the previous keyframe"
     )
     max_relative_sigma: float = Field(
-        default=0.15, gt=0, description="largest sigma of refined depth that is fused, relative to it"
+        default=0.2, gt=0, description="largest sigma of refined depth that is fused, relative to it"
     )
     min_weight: float = Field(default=3.0, ge=0, description="least number of observations of an extracted voxel")
     min_component_triangles: int = Field(

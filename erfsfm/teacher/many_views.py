@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.multiview import Array, Grey, measure, rays
-from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
+from erfsfm.teacher.road import impose_road, road_plane
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma
@@ -48,10 +48,7 @@ def label(
     plane = None if forward is None else road_plane(inverse_depth, reliable, p, forward)
     if plane is not None:
         road = (p @ plane).astype(np.float32)
-        under = under_road(inverse_depth, sigma, road)
-        sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
-        level = on_road(inverse_depth, reliable, road) & ~under & ~reliable
-        inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
+        at_least = impose_road(inverse_depth, sigma, reliable, road, ~reliable)
     sigma = np.maximum(sigma, LEAST_SIGMA * np.abs(inverse_depth))
     least = np.maximum(np.where(np.isfinite(sigma), inverse_depth - sigma, 0), at_least)
     most = np.where(np.isfinite(sigma), np.maximum(inverse_depth, 0) + sigma, np.inf)

@@ -102,3 +102,30 @@ def under_road(inverse_depth: Array, sigma: Array, road: Array) -> NDArray[np.bo
     under = (road > 0) & (inverse_depth + SIGMAS_UNDER * sigma < (1 - NEAR) * road)
     rim = np.ones((RIM_PX, RIM_PX), np.uint8)
     return np.asarray((cv2.dilate(under.astype(np.uint8), rim) > 0) & (road > 0))
+
+
+def impose_road(
+    inverse_depth: Array,
+    sigma: Array,
+    reliable: NDArray[np.bool_],
+    road: Array,
+    fillable: NDArray[np.bool_] | bool = True,
+) -> Array:
+    """Forget what lies under the road and put the road's own depth where a pixel lies on it, both in place.
+
+    Args:
+        inverse_depth: ``(H, W)``.
+        sigma: of the inverse depth, ``(H, W)``; infinite afterwards where a pixel is under the road.
+        reliable: where the inverse depth may be used, ``(H, W)``.
+        road: inverse depth of the road at every pixel, ``(H, W)``, not positive above the horizon.
+        fillable: where the road may replace a measurement, ``(H, W)``.
+
+    Returns:
+        Smallest possible inverse depth ``(H, W)``: that of the road, less its tolerance, of pixels under it; else 0.
+    """
+    at_least = np.zeros_like(inverse_depth)
+    under = under_road(inverse_depth, sigma, road)
+    sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
+    level = on_road(inverse_depth, reliable, road) & ~under & fillable
+    inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
+    return at_least

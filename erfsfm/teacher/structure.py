@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from erfsfm.files import write_atomically
 from erfsfm.multiview import rays
-from erfsfm.teacher.road import NEAR, TOLERANCE, on_road, road_plane, under_road
+from erfsfm.teacher.road import impose_road, road_plane
 from erfsfm.teacher.two_view import MotionAndDepth, two_view
 
 VERSION = 4
@@ -67,10 +67,7 @@ def measure_structure(images: Sequence[NDArray[np.uint8]], K: NDArray[np.float32
     else:
         height = float(1 / np.linalg.norm(plane))
         road = p @ plane.astype(np.float32)
-        under = under_road(inverse_depth, sigma, road)
-        sigma[under], at_least[under] = np.inf, (1 - NEAR) * road[under]
-        level = on_road(inverse_depth, reliable, road) & ~under
-        inverse_depth[level], sigma[level] = road[level], TOLERANCE * road[level]
+        at_least = impose_road(inverse_depth, sigma, reliable, road)
     T_source_target[:, :3, 3] /= height
     with np.errstate(over="ignore"):
         least = (np.maximum(inverse_depth - sigma, at_least) * height).astype(np.float16)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
+from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
 
 Image = NDArray[np.uint8]
 
@@ -97,7 +98,7 @@ def _is_image(path: Path) -> bool:
 
 def _complete_bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, MAX_IMAGE_BYTES)
     except OSError as error:
         raise DataError(f"cannot read image {path}: {error.strerror}") from error
     if not data:

@@ -24,6 +24,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
@@ -32,6 +33,7 @@ from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray
+from slam.sequences.continued import Continued
 from slam.storage.cache import GetOrCompute, without_cache
 from slam.trajectory import Trajectory
 
@@ -56,7 +58,7 @@ class Measurements:
 class SlamResult:
     """Trajectories with one row a frame, the graph, the map and the measurements.
 
-    ``state`` is that of the observer, for a run that continues this one.
+    ``state`` is that of the observer, for a run that continues this one; frames before ``first`` are of earlier runs.
     """
 
     network: Trajectory
@@ -72,6 +74,7 @@ class SlamResult:
     graph: PoseGraph
     map: TsdfMap | None
     stopwatch: Stopwatch
+    first: int
 
 
 class SlamPipeline:
@@ -109,6 +112,7 @@ class SlamPipeline:
         self._progress = progress or (lambda stage, done, total: None)
         self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
+        self.first = 0 if checkpoint is None else len(checkpoint.state.seen.roads)  # frames before are measured
         self._seed = seed
         self._watch = Stopwatch()
 
@@ -122,12 +126,16 @@ class SlamPipeline:
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
 
-    def estimate(self) -> SlamResult:
-        """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
+    def estimate(self, journal: Journal | None = None) -> SlamResult:
+        """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
+
+        Args:
+            journal: keeps the state of the pass every 100 frames.
+        """
         mode = self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        observations, state = self._observe()
+        observations, state = self._observe(journal)
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
@@ -149,6 +157,7 @@ class SlamPipeline:
             graph=graph,
             map=None,
             stopwatch=self._watch,
+            first=self.first,
         )
 
     def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
@@ -228,10 +237,10 @@ class SlamPipeline:
             )
         return mode
 
-    def _observe(self) -> tuple[ClosedObservations, ObserverState]:
+    def _observe(self, journal: Journal | None) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, total = self._checkpoint, len(self._sequence)
-        first = 0 if checkpoint is None else len(checkpoint.stamps)
+        first = self.first
         state = None if checkpoint is None else checkpoint.state
         if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
             logger.warning(
@@ -255,8 +264,12 @@ class SlamPipeline:
                     frame = next(frames)
                 observer.add(index, frame)
                 self._progress("frames", index + 1, total)
+                done = index + 1 - first
+                if journal is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
+                    with self._watch.stage("journal"):
+                        journal.keep(observer.state())
             closed = observer.closed()
-            if checkpoint is not None:
+            if isinstance(self._sequence, Continued):
                 self._warn_of_another_place(closed, first)
             return closed, observer.state()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.images import list_images
 from erfsfm.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CALIBRATION, CalibrationFile
@@ -74,7 +75,8 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
 
 
 def _no_images(folder: Path) -> str:
-    found = ", ".join(sorted(p.name for p in folder.iterdir())) if folder.is_dir() else "no such folder"
+    names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else ["no such folder"]
+    found = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     looked = ", ".join(f"image_{camera}" for camera in ODOMETRY_CAMERAS)
     return f"no images in {folder}: looked for png or jpg in {looked}; found {found or 'an empty folder'}"
 
@@ -83,7 +85,7 @@ def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
     if not path.is_file():
         return fallback_stamps(path, len(files))
     try:
-        stamps = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+        stamps = np.array([float(line) for line in read_text(path).split()])
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
     return require_stamps(stamps, path, files)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -81,11 +81,20 @@ def read_camera_file(path: Path) -> CameraFile:
     if not isinstance(content, dict):
         keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
         raise DataError(f"{path} holds no keys: a camera file needs {keys}")
+    return camera_of(content, str(path))
+
+
+def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
+    """The camera of the keys of a camera file, found at ``where``; an unlikely camera is logged as a warning.
+
+    Raises:
+        DataError: naming the key that is missing, unknown or wrong.
+    """
     try:
-        camera = CameraFile.model_validate(content)
+        camera = CameraFile.model_validate(keys)
     except ValidationError as error:
-        raise DataError(f"{path}: {_complaints(error)}") from error
-    require_plausible(camera.pinhole, str(path))
+        raise DataError(f"{where}: {_complaints(error)}") from error
+    require_plausible(camera.pinhole, where)
     return camera
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 
@@ -82,9 +81,13 @@ class Continued:
             raise MissingFrameError(f"frame {index} of {self.name} is missing between two runs")
         return Frame(index, float(self.stamps[index]), self._following.frame(index - first).image)
 
-    def scan_path(self, index: int) -> Path | None:
-        """None: scans of earlier frames are not kept."""
-        return None
+    def has_scan(self, index: int) -> bool:
+        """False: scans of earlier frames are not kept."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SequenceError``: scans of earlier frames are not kept."""
+        raise SequenceError(f"frame {index} of {self.name} has no scan: those of earlier frames are not kept")
 
     def provenance(self) -> tuple[str, ...]:
         """Names of all parts, as in the leak record of a checkpoint."""

@@ -61,7 +61,9 @@ def run(
         str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
     sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+    ] = None,
     weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,

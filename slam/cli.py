@@ -60,7 +60,10 @@ def run(
     dataset: Annotated[
         str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
-    sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
+    ] = None,
     camera: Annotated[
         Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
     ] = None,

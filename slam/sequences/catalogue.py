@@ -16,6 +16,7 @@ from slam.sequences import euroc, folder, tum, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.ros import loader as ros
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
@@ -27,6 +28,7 @@ LOADERS: tuple[Loader, ...] = (
     odometry.LOADER,
     raw.LOADER,
     euroc.LOADER,
+    ros.LOADER,
     tum.LOADER,
     folder.LOADER,
     video.LOADER,
@@ -149,7 +151,7 @@ def _choose(root: Path, asked: Asked) -> SourcedSequence:
         if len(contents) > 1:
             raise SequenceError(f"{root} has {len(contents)} sequences: {found}; choose one with --sequence")
         (name,) = contents
-    name = name if name in contents else drive_name(name)
+    name = drive_name(name) if drive_name(name) in contents else name
     if name not in contents:
         kitti = find_odometry_root(root)
         under = root if kitti is None else kitti.sequences
@@ -162,7 +164,7 @@ def _choose(root: Path, asked: Asked) -> SourcedSequence:
 def _unknown(root: Path) -> str:
     if root.is_file():
         known = ", ".join(suffix[1:] for suffix in VIDEO_SUFFIXES)
-        return f"{root} is no video ({known}): give a video, or the folder of a data set"
+        return f"{root} is no video ({known}) and no bag (bag, db3, mcap): give one, or the folder of a data set"
     kitti = find_odometry_root(root)
     if kitti is not None:
         return (

@@ -17,7 +17,7 @@ from slam.sequences.recording import MAX_GAP_S, require_frame
 logger = logging.getLogger(__name__)
 
 _ROUNDING_PX = 0.01
-_OWN = ("folder/", "tum/")  # names of recordings that the user gave
+_NUMBERED = ("kitti_", "simulated/")  # of names whose frame numbers are those of the recording
 
 
 class Continued:
@@ -124,7 +124,7 @@ def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
             return 0
         ends += [(wanted.start - span.stop, name) for span in same if span is not None]
     if not ends:
-        if all(name.startswith(_OWN) for name in following):
+        if not any(name.startswith(_NUMBERED) for name in following):
             logger.warning("%s is assumed to follow %s without a gap", ", ".join(following), ", ".join(before))
             return 0
         raise SequenceError(

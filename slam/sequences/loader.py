@@ -32,7 +32,7 @@ class Loader:
         kind: what ``doctor`` calls it.
         layout: the files by which it is recognised, for the message about a folder of no known kind.
         find: the sequences under a path by name, and how to open each; empty where the path is of another kind. It
-            reads names of files at most.
+            reads no images.
     """
 
     kind: str

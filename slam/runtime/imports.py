@@ -91,6 +91,18 @@ def import_rosbags() -> tuple[ModuleType, ModuleType, ModuleType]:
     return rosbag1, rosbag2, typesys
 
 
+def import_feather() -> ModuleType:
+    """Import pyarrow's reader of feather files, an optional extra.
+
+    Raises:
+        SequenceError: if it is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("pyarrow.feather")
+    except (ImportError, OSError) as error:
+        raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
+
+
 def import_open3d_beside() -> None:
     """Import Open3D, which takes a second, in another thread; errors are raised by the next `import_open3d`."""
 

@@ -12,7 +12,7 @@ from erfsfm.readers.kitti_drives import drive_name, find_odometry_root
 from erfsfm.readers.video import VIDEO_SUFFIXES
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Sequence
-from slam.sequences import euroc, folder, tum, video
+from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
@@ -30,6 +30,11 @@ LOADERS: tuple[Loader, ...] = (
     euroc.LOADER,
     ros.LOADER,
     tum.LOADER,
+    tum_mono.LOADER,
+    seven_scenes.LOADER,
+    scannet.LOADER,
+    nuscenes.LOADER,
+    argoverse.LOADER,
     folder.LOADER,
     video.LOADER,
 )

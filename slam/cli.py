@@ -77,7 +77,7 @@ def run(
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run: these frames follow its last one; alone: it goes on after a kill")
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",

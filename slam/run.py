@@ -68,10 +68,10 @@ class RunRequest:
     """All inputs of a run.
 
     Attributes:
-        dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
+        dataset: a recording of a kind that ``docs/recordings.md`` lists; None with no
             ``sequence`` is the embedded simulated street.
         sequence: name inside the data set.
-        camera: ``camera.yaml`` of a folder or video, where none lies beside it.
+        camera: ``camera.yaml`` in place of the one beside the images or their calibration, or ``fov=DEGREES``.
         weights: a shipped name or a training output folder.
         config: a YAML file or a shipped name; None for the defaults.
         overrides: ``section.key=value`` each.

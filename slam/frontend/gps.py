@@ -62,8 +62,9 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
     inside = (shifted >= stamps[0]) & (shifted <= stamps[-1])
     if inside.sum() < _LEAST_FIXES:
         return MeasurementFailure(
-            f"{int(inside.sum())} GPS fixes lie between the first and the last frame: the track has {shifted[0]:.1f} to "
-            f"{shifted[-1]:.1f} s and the frames {stamps[0]:.1f} to {stamps[-1]:.1f} s, set gps.offset_s"
+            f"{int(inside.sum())} GPS fixes lie between the first and the last frame: the track has stamps from "
+            f"{shifted[0]:.1f} to {shifted[-1]:.1f} s, the frames from {stamps[0]:.1f} to {stamps[-1]:.1f} s: set "
+            "gps.offset_s, or give the track of this drive"
         )
     times, dilution = shifted[inside], track.dilution[inside]
     frame = LocalFrame(track.places[inside][0])
@@ -76,7 +77,7 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
 def scale_by_gps(
     fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
 ) -> ScaleEstimate | MeasurementFailure:
-    """Length of chords by GPS over their estimated length: the median, so that bends, drift and outliers count little."""
+    """Chords by GPS over those of the estimate: the median, so that drift and outliers count little."""
     estimated = fixes.antenna(T_world_camera_unscaled, stamps)
     span = max(len(estimated) // _CHORDS, 1)
     by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))

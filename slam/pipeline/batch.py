@@ -11,19 +11,16 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
-from slam.errors import SlamError
 from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
+from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
-    known_frames,
-    resolve_mode,
     scale_from_distance,
     scale_from_reference,
 )
@@ -36,6 +33,7 @@ from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pipeline.positioning import Location, Positioning
+from slam.pipeline.requirements import require_possible
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -214,37 +212,9 @@ class SlamPipeline:
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed.
-
-        Raises:
-            SlamError: too few frames, or the sequence lacks what the configuration needs.
-        """
-        sequence, shortest = self._sequence, self._predictor.sources + 1
-        if len(sequence) < shortest:
-            raise SlamError(
-                f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
-                "choose a longer range"
-            )
-        mode = resolve_mode(self._config.scale, sequence.camera_height_m, self._gps_track is not None)
-        wants_lidar = {"scale.mode=lidar": mode == "lidar", "lidar.factors=true": self._config.lidar.factors}
-        for setting in (name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)):
-            raise SlamError(
-                f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
-                "leave the setting out or give a sequence with scans"
-            )
-        if mode == "reference" and sequence.reference is None:
-            raise SlamError(
-                f"scale mode reference needs true poses; {sequence.name} has none: choose camera-height or none"
-            )
-        if mode == "camera-height" and sequence.camera_height_m is None:
-            raise SlamError(
-                f"scale mode camera-height needs a known height; {sequence.name} has none: add camera_height_m "
-                "to camera.yaml or choose scale.mode=none"
-            )
-        if mode == "known":
-            known_frames(self._config.scale, sequence.stamps)
-        if mode == "gps" and self._gps_track is None:
-            raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")
+        """The scale mode of this run, after checks that it can succeed; raises as `require_possible`."""
+        shortest = self._predictor.sources + 1
+        mode = require_possible(self._sequence, shortest, self._config, self._gps_track is not None)
         self._positioning(mode)
         return mode
 

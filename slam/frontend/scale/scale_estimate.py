@@ -82,7 +82,9 @@ def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
         found.append(index)
     first, second = found
     if first == second:
-        raise SlamError(f"scale.known_between names frame {first} twice: choose two frames with a distance between them")
+        raise SlamError(
+            f"scale.known_between names frame {first} twice: choose two frames with a distance between them"
+        )
     return first, second
 
 

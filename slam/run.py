@@ -28,6 +28,7 @@ from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places
 from slam.results.map import write_map
+from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
 from slam.results.output import UNFINISHED, check_output
 from slam.results.report import DepthExample, write_report
@@ -266,12 +267,13 @@ def _run(job: _Job, folder: RunFolder) -> None:
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
-    surface = write_map(folder, result, job.recording)
+    numbers = write_map(folder, result, job.recording)
     depth = quality.summary(job.settings.depth.refine != "none")
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    views = write_map_views(folder, job.settings.output.viewer_triangles)
     if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
-        write_report(folder, examples, surface.points, surface.colours)
+        write_report(folder, examples, views)
     if job.request.rerun is not None:
         write_rerun(job.request.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
 
@@ -312,4 +314,4 @@ def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseExce
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
         if report:
-            write_report(folder, [], None, None)
+            write_report(folder, [], None)

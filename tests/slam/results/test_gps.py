@@ -41,9 +41,9 @@ def test_a_run_without_a_track_says_so(kitti_root: Path, tiny_weights: Path, tmp
 
 
 @pytest.mark.data
-def test_the_recorded_track_of_a_drive(real_data: Path, tmp_path: Path) -> None:
+def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
     """Fixes with 0.2 m of noise added give a metric scale without the road, and hold the heading."""
-    drive = real_data / DRIVE
+    drive = data_root / DRIVE
     begin = np.datetime64((drive / "image_02/timestamps.txt").read_text().split("\n")[0], "ns")
     times = np.array((drive / "oxts/timestamps.txt").read_text().split("\n"), dtype="datetime64[ns]")
     stamps = (times[~np.isnat(times)] - begin).astype(np.float64) * 1e-9

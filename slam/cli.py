@@ -80,6 +80,7 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -107,6 +108,7 @@ def run(
             cache=cache,
             rerun=rerun,
             continues=continues,
+            gps=gps,
         )
     metrics = folder.metrics()
     if as_json:

@@ -37,6 +37,7 @@ from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
+from slam.results.gps import write_places
 from slam.results.map import write_map
 from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
@@ -50,6 +51,7 @@ from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.continued import Continued
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.gps import read_gps
 
 logger = logging.getLogger(__name__)
 
@@ -70,6 +72,7 @@ class RunOptions(TypedDict, total=False):
     cache: Path | None
     rerun: Path | None
     continues: Path | None
+    gps: Path | None
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ class RunRequest:
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
             configuration is used, and the new folder has the whole drive. A run that did not end goes on in its own
-            folder: its recording and weights need not be given again.
+            folder, with its recording, weights and seed.
+        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``.
     """
 
     dataset: str | Path | None = None
@@ -112,6 +116,7 @@ class RunRequest:
     cache: Path | None = None
     rerun: Path | None = None
     continues: Path | None = None
+    gps: Path | None = None
 
 
 def run_slam(
@@ -182,22 +187,14 @@ def _begin(request: RunRequest) -> tuple[_Job, RunFolder]:
 def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tuple[_Job, RunFolder]:
     """A run that did not end, on what it was run on, from its last kept state."""
     named = provenance["recording"]
-    camera = named.get("camera")
-    same = replace(
-        request,
-        dataset=named.get("dataset"),
-        sequence=named.get("sequence"),
-        camera=None if camera is None else Path(camera),
-        frames=named.get("frames"),
-        weights=provenance["weights"] if request.weights == "default" else request.weights,
-        seed=request.seed or provenance["seed"],
-        output=place,
-        continues=None,
-    )
+    files = {name: Path(named[name]) if name in named else None for name in ("dataset", "camera", "gps")}
+    words = {name: named.get(name) for name in ("sequence", "frames")}
+    weights = provenance["weights"] if request.weights == "default" else request.weights
+    seed = request.seed or provenance["seed"]
+    same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
     job = _prepare(same, place)
-    folder = RunFolder.resume(place)
-    logger.info("the run in %s goes on after frame %d", place, job.pipeline.first - 1)
-    return job, folder
+    logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
+    return job, RunFolder.resume(place)
 
 
 def _prepare(request: RunRequest, resumes: Path | None = None) -> _Job:
@@ -226,9 +223,8 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> _Job:
             "same --weights and depth.source"
         )
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
-    pipeline = SlamPipeline(
-        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
-    )
+    rest = get_or_compute, checkpoint, request.seed, None if request.gps is None else read_gps(request.gps)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     provenance = _provenance(request, networks, recording, source)
     return _Job(request, settings, recording, pipeline, provenance, sha256, checkpoint)
@@ -271,7 +267,7 @@ def _provenance(
 
 def _recording(request: RunRequest) -> dict[str, str]:
     """The options that name the recording; files by their whole paths, for it may be opened from another folder."""
-    files = {"dataset": request.dataset, "camera": request.camera}
+    files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
     named = {name: Path(path) for name, path in files.items() if path is not None}
     places = {name: str(path.absolute() if path.exists() else path) for name, path in named.items()}
     words = {"sequence": request.sequence, "frames": request.frames}
@@ -284,7 +280,7 @@ def _run(job: _Job, folder: RunFolder) -> None:
     estimate = job.pipeline.estimate(_journal(job, folder.path))
     _write_estimate(folder, estimate, job)
     clear_journal(folder.path)
-    metrics = estimate_metrics(estimate, job.recording, job.provenance)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
@@ -317,6 +313,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
+    write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("trajectory_lidar", lidar)

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from slam.config import ScaleMode
+
 Count = Annotated[int, Field(ge=0)]
 
 
@@ -60,7 +62,7 @@ class SequenceRecord(_Part):
 class ScaleRecord(_Part):
     """Unit of length."""
 
-    mode: Literal["none", "camera-height", "lidar", "reference"] | None = None
+    mode: ScaleMode | None = None
     value: float | None = None
 
 

@@ -81,6 +81,7 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
     ] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -108,6 +109,7 @@ def run(
             cache=cache,
             rerun=rerun,
             continues=continues,
+            gps=gps,
         )
     metrics = folder.metrics()
     if as_json:

@@ -28,6 +28,10 @@ class CalibrationError(SlamError):
     """Images of a board do not give a camera."""
 
 
+class DownloadError(SlamError):
+    """A data set cannot be fetched from its server."""
+
+
 class TrajectoryError(SlamError):
     """A trajectory file cannot be read, or two trajectories do not match."""
 

@@ -16,6 +16,7 @@ import typer
 from erfsfm import __version__
 from erfsfm.cli_pack import pack
 from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
+from erfsfm.signals import Terminated
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,6 +26,8 @@ app = typer.Typer(
 )
 evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
 app.add_typer(evaluate_app, name="evaluate")
+
+_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
 Seed = Annotated[int, typer.Option(help="seed of the random numbers")]
@@ -343,6 +346,8 @@ def main() -> None:
     except MemoryError:
         typer.echo(f"erfsfm: {OUT_OF_MEMORY}", err=True)
         sys.exit(1)
-    except KeyboardInterrupt:
-        typer.echo("erfsfm: interrupted; what was written stays", err=True)
-        sys.exit(1)
+    except SystemExit as end:
+        if end.code == _INTERRUPTED or isinstance(end, Terminated):
+            why = str(end) if isinstance(end, Terminated) else "interrupted"
+            typer.echo(f"erfsfm: {why}; what was written stays", err=True)
+        raise

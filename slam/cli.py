@@ -14,12 +14,12 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
+from erfsfm.signals import Terminated
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
 from slam.runtime.progress import progress_bar
-from slam.runtime.signals import Terminated
 from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 if TYPE_CHECKING:

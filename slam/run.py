@@ -14,6 +14,7 @@ import numpy as np
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, commit
+from erfsfm.signals import Terminated, raising_on_termination
 from erfsfm.threads import limit_library_threads
 from slam.config import SlamConfig, dump_yaml, load_config
 from slam.continuation import (
@@ -47,7 +48,6 @@ from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog, run_log
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.imports import import_rerun
-from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.continued import Continued
 from slam.sequences.excerpt import Excerpt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 import warnings
 from datetime import timedelta
@@ -25,10 +26,11 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
-from erfsfm.errors import ConfigError, DataError, TrainingError
+from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
+from erfsfm.signals import Terminated, raising_on_termination
 from erfsfm.threads import single_threaded_opencv
 from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
@@ -92,7 +94,8 @@ def train(
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if rank == 0:
         folder.write_config(config)
-    _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
+    with raising_on_termination():
+        _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
     if not trainer.is_global_zero:
         sys.exit()
     keeper.save(module, trainer.global_step)
@@ -140,8 +143,8 @@ def _fit(
         # an error of a worker process has its traceback before the message, its last line
         raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.errors.DataError: ")) from error
     except SystemExit as error:
-        # Lightning turns Ctrl-C into an exit
-        raise TrainingError(f"interrupted at step {trainer.global_step}: continue with --resume") from error
+        number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
+        raise Terminated(number, f" at step {trainer.global_step}: continue with --resume") from error
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:

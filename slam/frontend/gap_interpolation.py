@@ -19,6 +19,8 @@ INTERPOLATED_SOURCE = "interpolated"
 _STEPS_OF_A_MOTION = 3
 # the first step of a camera that stood, in steps before it stood
 _LONGEST_START = 2.0
+# frames that the gate may refuse after a frozen video, whose first new image is of another place
+_LONGEST_DOUBT = 2
 _SIGMA_FLOOR = 1e-6
 
 
@@ -46,6 +48,7 @@ def interpolate_gaps(
     unusable: Mapping[int, str],
     repeated: Collection[int],
     config: GapsConfig,
+    cuts: Collection[int] = (),
 ) -> InterpolatedGaps:
     """Interpolate the gaps of a run.
 
@@ -57,6 +60,7 @@ def interpolate_gaps(
         unusable: frames without a measurement, and why.
         repeated: frames whose image repeats that of the frame before.
         config: noise of an interpolated step.
+        cuts: frames that show another place than the one before: no snippet measures across them.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
@@ -68,7 +72,8 @@ def interpolate_gaps(
     by_network = network_steps(snippets)
     frozen, steps = _without_frozen(by_network, steps, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
-    trusted = [s for s in snippets if not frozen.intersection((s.target, *s.sources))]
+    spans = ((s, {s.target, *s.sources}) for s in snippets)
+    trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
     filled = _filled(snippets, _completed(by_network, range(count - 1)), count, sources)
     by_image = {m.ends[0]: m.relative_pose.T_from_to for m in steps if m.ends == (m.ends[0], m.ends[0] + 1)}
     # snippets of frozen images alone are still the best estimate available
@@ -100,18 +105,19 @@ def _without_frozen(
 
     The length of the step to the next new image decides: short if the camera stood; the length of as many steps as
     images were repeated if it moved. A length between the two is a failed match over a wide baseline and is not used.
-    Without a next new image the camera is assumed to stand.
+    Without a new image soon after the camera is assumed to stand.
     """
     frozen: set[int] = set()
     for first, last in runs(repeated):
         before = [T for k, T in by_network.items() if first - 1 - _STEPS_OF_A_MOTION <= k < first - 1]
-        if not before or last + 1 not in new:
+        following = next((k for k in range(last + 1, last + 2 + _LONGEST_DOUBT) if k in new), None)
+        if not before or following is None:
             continue
         expected = float(np.median([np.linalg.norm(T[:3, 3]) for T in before]))
-        jump = steps.motions.get((last, last + 1))
-        repeats = last - first + 1
-        halfway = (1 + repeats / 2) * expected
-        if jump is not None and jump.length_unscaled <= min(halfway, _LONGEST_START * expected):
+        jump = steps.motions.get((last, following))
+        repeats, onward = last - first + 1, following - last
+        halfway = (onward + repeats / 2) * expected
+        if jump is not None and jump.length_unscaled <= min(halfway, onward * _LONGEST_START * expected):
             continue
         frozen |= set(range(first, last + 1))
         steps = steps.without_frames(range(first, last + 1))

@@ -29,7 +29,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place
+from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place, warn_of_segments
 from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.observations import ClosedObservations
@@ -152,6 +152,7 @@ class SlamPipeline:
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
+        warn_of_segments(observations)
         warn_of_a_frozen_end(len(self._sequence), observations, state)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)

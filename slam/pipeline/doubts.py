@@ -25,6 +25,16 @@ def warn_of_a_frozen_end(frames: int, seen: ClosedObservations, state: ObserverS
             )
 
 
+def warn_of_segments(seen: ClosedObservations) -> None:
+    """Where a segment begins, its place relative to the ones before is a guess."""
+    for segment in seen.segments[1:]:
+        logger.warning(
+            "a new segment of the drive begins at frame %d (%s): its place relative to the frames before is a guess",
+            segment.first,
+            segment.reason,
+        )
+
+
 def warn_of_another_place(seen: ClosedObservations, first: int) -> None:
     """Copies of other recordings under the same name, and folders, are known by their first image alone."""
     for start, end, reason in seen.failures:

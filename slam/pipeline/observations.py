@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import cv2
@@ -13,6 +14,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import InterpolatedGaps
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.segments import Segment, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
@@ -85,9 +87,10 @@ class ClosedObservations:
     examples: list[tuple[int, Image, DepthMap]]
     failures: list[tuple[int, int, str]]
     gaps: InterpolatedGaps
+    segments: list[Segment]
 
     @classmethod
-    def of(cls, seen: Observations, gaps: InterpolatedGaps) -> ClosedObservations:
+    def of(cls, seen: Observations, gaps: InterpolatedGaps, cuts: Collection[int] = ()) -> ClosedObservations:
         """Leave out views and keyframes of interpolated frames."""
         return cls(
             seen.roads,
@@ -98,6 +101,7 @@ class ClosedObservations:
             seen.examples,
             seen.failures,
             gaps,
+            find_segments(len(seen.roads), cuts, gaps.frames),
         )
 
     @property

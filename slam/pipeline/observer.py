@@ -19,6 +19,7 @@ from slam.frontend.gap_interpolation import interpolate_gaps
 from slam.frontend.image_gate import GateState, ImageGate
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
+from slam.frontend.segments import find_cuts
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
@@ -210,6 +211,8 @@ class Observer:
         """
         self.flush()
         seen = self._seen
+        measured = [motion.ends for motion in seen.motions]
+        cuts = find_cuts(seen.failures, measured, {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(
             len(seen.roads),
             self._predictor.sources,
@@ -218,8 +221,9 @@ class Observer:
             seen.unusable,
             seen.repeated,
             self._config.gaps,
+            cuts,
         )
-        return ClosedObservations.of(seen, gaps)
+        return ClosedObservations.of(seen, gaps, cuts)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

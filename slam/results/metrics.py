@@ -60,7 +60,8 @@ def estimate_metrics(
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
-            | {"continued_at": result.first},
+            | {"continued_at": result.first}
+            | {"segments": [asdict(segment) for segment in result.observations.segments]},
             "timing": describe_timing(result.stopwatch, len(sequence) - result.first),
             "scale": _scale(result),
             "trajectories": trajectories,

@@ -57,6 +57,7 @@ class SequenceRecord(_Part):
     bridged_frames: Count | None = None
     bridged: list[Gap] | None = None
     continued_at: Count | None = None
+    segments: list[Gap] | None = None
 
 
 class ScaleRecord(_Part):

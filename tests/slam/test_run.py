@@ -16,13 +16,13 @@ import yaml
 
 import slam.results.metrics
 import slam.run
+from erfsfm.signals import Terminated
 from slam import run_slam
 from slam.config import PoseGraphConfig, load_config
 from slam.errors import RunError, SlamError
 from slam.pipeline.batch import SlamPipeline
 from slam.pose_graph import PoseGraph
 from slam.results.folder import RunFolder
-from slam.runtime.signals import Terminated
 
 CheckRun = Callable[[Path], dict[str, Any]]
 CopyRoot = Callable[[], Path]

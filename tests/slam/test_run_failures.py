@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from erfsfm.signals import Terminated
 from slam import run_slam
 from slam.cli import main
 from slam.errors import RunError, SlamError
@@ -23,7 +24,6 @@ from slam.formats.ply import read_ply
 from slam.pipeline.batch import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.run import RunOptions, RunRequest
-from slam.runtime.signals import Terminated
 from slam.trajectory import read_trajectory
 
 CopyRoot = Callable[[], Path]

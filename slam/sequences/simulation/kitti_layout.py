@@ -37,8 +37,8 @@ def write_lines(path: Path, lines: list[str]) -> None:
 
 
 def _write_png(path: Path, pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"cannot write {path}")
+    _, content = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    path.write_bytes(content.tobytes())  # OpenCV's writer does not say why it fails
 
 
 def _row(matrix: FloatArray) -> str:

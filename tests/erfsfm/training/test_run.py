@@ -27,6 +27,7 @@ from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.errors import CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.signals import Terminated
 from erfsfm.training.keeper import decisive, licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.run import train
@@ -488,13 +489,22 @@ def test_a_depth_that_stays_constant_stops_the_run(
     assert load_model(tmp_path / "run" / "last").record.step == 3
 
 
-def test_ctrl_c_is_one_line(small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def pressed(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_ends_a_training_in_order(
+    small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, code: int
+) -> None:
+    original = SelfSupervision.training_step
 
-    monkeypatch.setattr(SelfSupervision, "training_step", pressed)
-    with pytest.raises(TrainingError, match="interrupted at step 0"):
+    def signalled(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
+        if self.global_step == 1:
+            os.kill(os.getpid(), getattr(signal, name))
+        return original(self, batch, index)
+
+    monkeypatch.setattr(SelfSupervision, "training_step", signalled)
+    with pytest.raises(Terminated, match=f"ended by {name} at step 1: continue with --resume") as ended:
         train(configure(small, [world]), tmp_path / "run", device="cpu")
+    assert ended.value.code == code
+    assert load_model(tmp_path / "run" / "last").record.step == 1
 
 
 # refusals

@@ -8,7 +8,7 @@ from threading import Thread
 
 import pytest
 
-from slam.runtime.signals import Terminated, raising_on_termination
+from erfsfm.signals import Terminated, raising_on_termination
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])

@@ -13,12 +13,12 @@ _NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 class Terminated(SystemExit):
     """The process was terminated by a signal; the exit code is 128 plus the signal's number."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, place: str = "") -> None:
         super().__init__(128 + number)
-        self.signal_name = signal.Signals(number).name
+        self.number, self.place = number, place
 
     def __str__(self) -> str:
-        return f"ended by {self.signal_name}"
+        return f"ended by {signal.Signals(self.number).name}{self.place}"
 
 
 @contextmanager
@@ -37,6 +37,7 @@ def raising_on_termination() -> Iterator[Callable[[], None]]:
         numbers = [number for number in known if signal.getsignal(number) is signal.SIG_DFL]
 
     def end(number: int, _: object) -> None:
+        ignore()
         raise Terminated(number)
 
     def ignore() -> None:

@@ -1,0 +1,51 @@
+"""Segments of a drive: where one ends, no measurement relates the frames after to those before."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from slam.frames import Ends, runs
+
+_LONGEST_GAP = 30  # interpolated frames, after which the place is only guessed
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Frames ``first`` to ``last``; ``reason`` says why it begins, of the first nothing."""
+
+    first: int
+    last: int
+    reason: str
+
+
+def find_cuts(
+    failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
+) -> list[int]:
+    """Frames that show another place than the one before: their step failed, those before and after did not.
+
+    Args:
+        failures: steps that image geometry could not measure, and why.
+        measured: steps that it measured.
+        doubtful: frames that are unusable or repeat the one before.
+    """
+    ends = set(measured)
+    longer = [(a, b) for a, b in ends if b - a > 1]
+    cuts = []
+    for first, last, _ in failures:
+        around = {first - 1, first, last, last + 1}
+        alone = last == first + 1 and (first - 1, first) in ends and (last, last + 1) in ends
+        if alone and around.isdisjoint(doubtful) and not any(a < last <= b for a, b in longer):
+            cuts.append(last)
+    return sorted(set(cuts))
+
+
+def find_segments(count: int, cuts: Collection[int], interpolated: Mapping[int, str]) -> list[Segment]:
+    """The segments of a drive of so many frames, by its cuts and its long gaps."""
+    begins = {0: ""} | dict.fromkeys(cuts, "it shows another place than the frame before")
+    ends = {count - 1} | {cut - 1 for cut in cuts}
+    for first, last in runs(interpolated):
+        if last - first + 1 > _LONGEST_GAP and first > 0 and last + 1 < count:
+            ends.add(first - 1)
+            begins[last + 1] = f"{last - first + 1} frames before it are interpolated: {interpolated[first]}"
+    return [Segment(first, last, begins[first]) for first, last in zip(sorted(begins), sorted(ends), strict=True)]

@@ -226,4 +226,5 @@ def _corrected(seen: Tensor, answer: Tensor, scale: float) -> tuple[Tensor, Tens
 def _vectors(motion: tuple[Tensor, Tensor], count: int) -> Tensor:
     """Rotations and translations ``(B * N, ...)`` as pose vectors ``(B, N, 6)``."""
     R, t = motion
-    return torch.cat([t, rotation_to_euler(R)], dim=-1).unflatten(0, (-1, count))
+    vectors = torch.cat([t, rotation_to_euler(R)], dim=-1)
+    return vectors.reshape(-1, count, 6)

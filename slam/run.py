@@ -261,8 +261,8 @@ def _run(job: _Job, folder: RunFolder) -> None:
     folder.write_metrics(metrics)
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
-    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
-    surface = write_map(folder, result, job.recording)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    surface = write_map(folder, result, job.recording, job.request.progress)
     depth = quality.summary(job.settings.depth.refine != "none")
     folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
     if job.settings.output.report:

@@ -9,14 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import SlamError
+from slam.errors import EmptyMapError
+from slam.evaluation.double_walls import double_wall_share
 from slam.frames import Sequence
-from slam.pipeline.batch import SlamResult
+from slam.mapping.submap import FOLDER as SUBMAPS
+from slam.mapping.submap import remove_submaps
+from slam.mapping.surface import MapSurface, colours, positions
+from slam.pipeline.batch import Progress, SlamResult
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
 
 logger = logging.getLogger(__name__)
+
+_MOST_DRAWN = 500_000
 
 
 @dataclass(frozen=True)
@@ -28,26 +34,39 @@ class Surface:
     colours: NDArray[np.float64] | None = None
 
 
-def write_map(folder: RunFolder, result: SlamResult, sequence: Sequence) -> Surface:
-    """Write mesh and cloud; an empty map gives a reason and no error.
+def write_map(folder: RunFolder, result: SlamResult, sequence: Sequence, progress: Progress | None = None) -> Surface:
+    """Merge the submaps, write mesh and cloud, remove the submaps; an empty map gives a reason and no error.
 
     Raises:
-        RunError: a file cannot be written.
+        SlamError: a file cannot be written; finished submaps stay.
     """
     if result.map is None:
         return Surface(_no_map("fusion is switched off (mapping.enabled)"))
     try:
-        result.map.mesh(), result.map.cloud()
-    except SlamError as error:
+        with result.stopwatch.stage("mesh"):
+            surface = result.map.surface(progress)
+    except EmptyMapError as error:
         logger.warning("no map: %s", error)
+        remove_submaps(folder.path / SUBMAPS)
         return Surface(_no_map(str(error)))
-    result.map.write_mesh(folder.path / "map_mesh.ply")
-    result.map.write_cloud(folder.path / "map_cloud.ply")
-    cloud = result.map.cloud()
-    errors = map_errors(cloud.points_world, result, sequence)
-    return Surface(asdict(result.map.statistics()) | errors, cloud.points_world, cloud.colours)
+    with result.stopwatch.stage("mesh"):
+        surface.write_mesh(folder.path / "map_mesh.ply")
+        surface.write_cloud(folder.path / "map_cloud.ply")
+    remove_submaps(folder.path / SUBMAPS)
+    walls = {"double_wall_share": double_wall_share(surface.meshes())}
+    errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, sequence)
+    points, colours = _thinned(surface)
+    return Surface(asdict(result.map.statistics()) | walls | errors, points, colours)
+
+
+def _thinned(surface: MapSurface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Some of the points for pictures, with their colours."""
+    step = -(-surface.points // _MOST_DRAWN)
+    drawn = np.concatenate([piece[::step] for piece in surface.cloud_pieces()])
+    return positions(drawn), colours(drawn)
 
 
 def _no_map(reason: str) -> dict[str, Any]:
-    sizes = {key: value for name in ("triangles", "points", "blocks") for key, value in null(name, reason).items()}
+    names = ("triangles", "points", "blocks", "submaps", "filters", "floater_share", "double_wall_share")
+    sizes = {key: value for name in names for key, value in null(name, reason).items()}
     return sizes | no_map_errors(reason)

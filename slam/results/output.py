@@ -17,6 +17,8 @@ from typing import Any
 
 from erfsfm.files import unfinished_name, write_atomically
 from slam.errors import RunError
+from slam.mapping.submap import FOLDER as SUBMAPS
+from slam.mapping.submap import remove_submaps
 
 logger = logging.getLogger(__name__)
 
@@ -79,6 +81,7 @@ def replace_run(output: Path, place: Path) -> None:
     next run recognises them as runs and replaces them, wherever this was interrupted.
     """
     write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
+    remove_submaps(output / SUBMAPS)
     for path in _files(output):
         if path.name != METRICS:
             path.unlink()
@@ -136,6 +139,7 @@ def _files(folder: Path) -> list[Path]:
 def _clear(folder: Path) -> None:
     """Remove an earlier run with its partial files; other files stay."""
     check_output(folder / UNFINISHED)
+    remove_submaps(folder / SUBMAPS)
     for path in _files(folder):
         path.unlink()
     if (folder / UNFINISHED).is_dir():

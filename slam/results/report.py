@@ -20,7 +20,7 @@ from slam.frames import DepthMap, Image
 from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
-from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_sizes
+from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_filters, map_sizes
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -122,6 +122,7 @@ def write_report(
         depth=_depth_picture(examples),
         map_picture=_map_picture(trajectories.get("optimised"), unit, map_points, map_colours),
         map=map_sizes(metrics),
+        map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
         map_curve=_map_curve(metrics),
         no_map=_absence(metrics, "map"),

@@ -58,10 +58,15 @@ def _options_of_all_verbs(
 @app.command()
 def run(
     dataset: Annotated[
-        str | None, typer.Option(help="KITTI odometry root, KITTI raw drive, TUM folder, image folder or video")
+        str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
-    sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of a folder or video")] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+    ] = None,
     weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,

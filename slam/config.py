@@ -234,6 +234,9 @@ class OutputConfig(Section):
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
+    viewer_triangles: int = Field(
+        default=60_000, ge=0, description="most triangles of the map that turns in the report; 0 for pictures alone"
+    )
     keep: Literal["nothing", "drive", "keyframes"] = Field(
         default="drive",
         description="for run --continue: nothing, the measurements of the drive, or also the keyframes of the map",

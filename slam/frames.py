@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Collection, Hashable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import cv2
@@ -107,8 +106,12 @@ class Sequence(Protocol):
         """Read one frame; ``SequenceError`` where its image cannot be read."""
         ...
 
-    def scan_path(self, index: int) -> Path | None:
-        """The Velodyne ``.bin`` file taken with a frame, or None."""
+    def has_scan(self, index: int) -> bool:
+        """Whether a LiDAR scan was taken with a frame."""
+        ...
+
+    def scan(self, index: int) -> FloatArray:
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR; ``SequenceError`` where unreadable."""
         ...
 
     def provenance(self) -> tuple[str, ...]:

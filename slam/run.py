@@ -27,6 +27,7 @@ from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
+from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
 from slam.results.output import UNFINISHED, check_output
 from slam.results.report import DepthExample, write_report
@@ -65,10 +66,10 @@ class RunRequest:
     """All inputs of a run.
 
     Attributes:
-        dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
+        dataset: a recording of a kind that ``docs/recordings.md`` lists; None with no
             ``sequence`` is the embedded simulated street.
         sequence: name inside the data set.
-        camera: ``camera.yaml`` of a folder or video, where none lies beside it.
+        camera: ``camera.yaml`` in place of the one beside the images or their calibration, or ``fov=DEGREES``.
         weights: a shipped name or a training output folder.
         config: a YAML file or a shipped name; None for the defaults.
         overrides: ``section.key=value`` each.
@@ -262,12 +263,13 @@ def _run(job: _Job, folder: RunFolder) -> None:
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
-    surface = write_map(folder, result, job.recording, job.request.progress)
+    numbers = write_map(folder, result, job.recording, job.request.progress)
     depth = quality.summary(job.settings.depth.refine != "none")
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    views = write_map_views(folder, job.settings.output.viewer_triangles)
     if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
-        write_report(folder, examples, surface.points, surface.colours)
+        write_report(folder, examples, views)
     if job.request.rerun is not None:
         write_rerun(job.request.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
 
@@ -307,4 +309,4 @@ def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseExce
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
         if report:
-            write_report(folder, [], None, None)
+            write_report(folder, [], None)

@@ -251,8 +251,13 @@ class LiveSequence:
         """Always ``SlamError``: images are not kept."""
         raise SlamError(f"frame {index} of a live drive is not kept")
 
-    def scan_path(self, index: int) -> None:
-        """None: there are no scans."""
+    def has_scan(self, index: int) -> bool:
+        """False: there are no scans."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SlamError``: there are no scans."""
+        raise SlamError(f"frame {index} of a live drive has no scan")
 
     def provenance(self) -> tuple[str, ...]:
         """Unknown."""

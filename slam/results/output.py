@@ -37,6 +37,8 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
     "keyframes.npz",
     "map_mesh.ply",
     "map_cloud.ply",
+    "map_above.png",
+    "map_driver.png",
     "report.html",
     "run.log",
 }

@@ -57,8 +57,11 @@ class LevelRoad:
         self.frames_read += 1
         return Frame(index, float(self.stamps[index]), self._image)
 
-    def scan_path(self, index: int) -> Path | None:
-        return None
+    def has_scan(self, index: int) -> bool:
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        raise AssertionError("no scans")
 
     def provenance(self) -> tuple[str, ...]:
         return ()
@@ -293,8 +296,8 @@ def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
             write_tum(folder / f"{stem}.tum.txt", getattr(result, stem))
         result.graph.write_g2o(folder / "graph.g2o")
         assert result.map is not None
-        result.map.write_mesh(folder / "mesh.ply")
-        result.map.write_cloud(folder / "cloud.ply")
+        result.map.surface().write_mesh(folder / "mesh.ply")
+        result.map.surface().write_cloud(folder / "cloud.ply")
     for path in sorted((tmp_path / "first").iterdir()):
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 

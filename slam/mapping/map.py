@@ -15,7 +15,7 @@ from slam.errors import EmptyMapError
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
-from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, submap_path, submap_paths
+from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
 from slam.mapping.surface import MapSurface, Progress, colours, normals, positions
 from slam.mapping.views import ViewChooser
 from slam.se3 import FloatArray, invert, rotation_angle
@@ -96,6 +96,7 @@ class TsdfMap:
         self._views = ViewChooser(self._filters)
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
+        remove_submaps(self._folder)  # of a run that was killed here
         self._previous: DepthView | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from slam.errors import RunError
 from slam.results.comparison import (
     ALIGNED_ATE,
     EVO_DIFFERENCE,
@@ -24,6 +24,8 @@ from slam.results.comparison import (
     written,
 )
 from slam.results.folder import TRAJECTORIES
+from slam.results.schema import LoopsFile
+from slam.storage.json_file import read_json
 
 Metrics = Mapping[str, Any]
 
@@ -110,6 +112,21 @@ def what_ran(metrics: Metrics) -> Table:
     ]
     recorded = [row for row in rows if NOT_RECORDED not in row[1]] if failure(metrics) else rows
     return Table((), _texts(recorded), "words")
+
+
+def gps(metrics: Metrics) -> Table | None:
+    """Distances from the GPS track; None without one."""
+    if lookup(metrics, "gps")[0] is None:
+        return None
+    columns = ("horizontal_rmse_m", "horizontal_median_m", "vertical_rmse_m")
+    rows = [
+        [Cell(name), *(number(metrics, "gps", name, column, decimals=2) for column in columns)]
+        for name in ("odometry", "optimised")
+    ]
+    fixes, in_graph = lookup(metrics, "gps", "fixes")[0], lookup(metrics, "gps", "in_graph")[0]
+    use = "factors of the pose graph: the optimised row is no independent test" if in_graph else "not in the pose graph"
+    notes = [f"{fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    return Table(("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m"), rows, notes=notes)
 
 
 def no_errors(metrics: Metrics) -> str:
@@ -267,11 +284,9 @@ def notes_on(reasons: Iterable[str]) -> list[str]:
 def _details(loops_file: Path, verdict: str) -> list[Any]:
     """One list of ``loops.json``; empty where the file is missing or damaged."""
     try:
-        tree = json.loads(loops_file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return list(read_json(loops_file, LoopsFile).get(verdict, []))
+    except (OSError, RunError):
         return []
-    entries = tree.get(verdict) if isinstance(tree, dict) else None
-    return entries if isinstance(entries, list) else []
 
 
 def _depth_source(metrics: Metrics) -> str:

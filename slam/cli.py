@@ -14,6 +14,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
+from slam.batch.cli import verbs as batch_verbs
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
@@ -146,6 +147,7 @@ def evaluate(
 
 
 app.add_typer(export_verbs)
+app.add_typer(batch_verbs)
 app.add_typer(calibration_verbs)
 
 

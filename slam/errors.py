@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from erfsfm.errors import DataError
+from erfsfm.errors import DataError, OneLineError
 
 
-class SlamError(Exception):
+class SlamError(OneLineError):
     """Base of every known error of the SLAM package."""
 
 
@@ -26,6 +26,10 @@ class MissingFrameError(SequenceError):
 
 class CalibrationError(SlamError):
     """Images of a board do not give a camera."""
+
+
+class DownloadError(SlamError):
+    """A data set cannot be fetched from its server."""
 
 
 class TrajectoryError(SlamError):

@@ -24,6 +24,7 @@ from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, invert, rotation_angle
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
+from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
 from slam.sequences.undistortion import Undistortion
 
@@ -42,18 +43,31 @@ class Localisation:
     reason: str = ""
 
 
-def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterator[Localisation]:
+def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
+    """Numbers of the images to localise, from 0: every n-th of ``A:B``, half-open.
+
+    Raises:
+        SequenceError: no images, or the range is empty or reaches beyond them.
+    """
+    first, last = frame_range(frames or ":", len(image_paths(images)))
+    return range(first, last, every)
+
+
+def localise(
+    images: Path, run: RunFolder, camera: Path | None = None, numbers: range | None = None
+) -> Iterator[Localisation]:
     """Localise images in the map of a run, one after the other.
 
     Args:
         images: an image or a folder of images.
         run: a finished run with loops switched on.
         camera: their ``camera.yaml``; None for the one beside them, or else the camera of the run.
+        numbers: of the images to localise; None for all of them.
 
     Raises:
         SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
     """
-    paths = _image_paths(images)
+    paths = image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
@@ -62,7 +76,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
         places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
-    for path in paths:
+    for path in paths if numbers is None else [paths[number] for number in numbers]:
         try:
             image = read_image(path)
             if undistortion is not None:
@@ -160,7 +174,12 @@ class _PoseHypothesis:
     depth: float
 
 
-def _image_paths(images: Path) -> list[Path]:
+def image_paths(images: Path) -> list[Path]:
+    """An image, or those of a folder in their order.
+
+    Raises:
+        SequenceError: there are none.
+    """
     if images.is_file():
         return [images]
     folder = image_folder(images) if images.is_dir() else None

@@ -164,20 +164,20 @@ def localize(
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
-    from slam.localisation.accuracy import map_to_truth, pose_errors, summary, summary_line, true_poses
+    from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
     from slam.localisation.localiser import image_numbers, localise
     from slam.localisation.tables import localisation_json, localisation_table, write_localisations
     from slam.results.folder import RunFolder
 
     run_folder = RunFolder.open(map)
     numbers = image_numbers(images, frames, every)
-    known = None if truth is None else (true_poses(truth, images, numbers), map_to_truth(run_folder))
+    known = None if truth is None else (MapTruth.of(run_folder), true_poses(truth, images, numbers))
     with progress_bar() as progress:
         found = []
         for localisation in localise(images, run_folder, camera, numbers):
             found.append(localisation)
             progress("images", len(found), len(numbers))
-    errors = None if known is None else pose_errors(found, *known)
+    errors = None if known is None else [known[0].error(*pair) for pair in zip(found, known[1], strict=True)]
     if as_json:
         typer.echo(json.dumps(localisation_json(found, errors), indent=2))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def localisation_table(found: Sequence[Localisation], errors: Sequence[PoseError] | None = None) -> Table:
+def localisation_table(found: Sequence[Localisation], errors: Sequence[PoseError | None] | None = None) -> Table:
     """One row an image: position in the map, nearest frame of the run, inliers, errors if known, or why not found."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -31,11 +32,8 @@ def localisation_table(found: Sequence[Localisation], errors: Sequence[PoseError
     for name in ("x", "y", "z", "nearest frame", "inliers", *of_error):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("", overflow="fold")
-    for each, error in zip(found, errors or [PoseError()] * len(found), strict=True):
-        if error.distance_m is None or error.angle_deg is None:
-            sizes = [""] * len(of_error)
-        else:
-            sizes = [f"{error.distance_m:.3f}", f"{error.angle_deg:.3f}"]
+    for each, error in zip(found, errors or [None] * len(found), strict=True):
+        sizes = [""] * len(of_error) if error is None else [f"{error.error_m:.3f}", f"{error.error_deg:.3f}"]
         if each.T_world_camera is None:
             table.add_row(Text(each.image), "", "", "", "", "", *sizes, Text(f"not found: {each.reason}"))
         else:
@@ -45,15 +43,15 @@ def localisation_table(found: Sequence[Localisation], errors: Sequence[PoseError
 
 
 def localisation_json(
-    found: Sequence[Localisation], errors: Sequence[PoseError] | None = None
+    found: Sequence[Localisation], errors: Sequence[PoseError | None] | None = None
 ) -> list[dict[str, Any]] | dict[str, Any]:
     """One object an image; unknown values are null with a reason. With errors, a summary and these objects."""
     entries = [_entry(each) for each in found]
     if errors is None:
         return entries
-    keys = ("error_m", "error_deg", "success")
+    unknown = {field.name: None for field in fields(PoseError)}
     for entry, error in zip(entries, errors, strict=True):
-        entry |= dict(zip(keys, (error.distance_m, error.angle_deg, error.success), strict=True))
+        entry |= {**(unknown if error is None else asdict(error)), "success": error is not None and error.success}
     return {"summary": summary(errors), "images": entries}
 
 

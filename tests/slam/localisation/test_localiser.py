@@ -14,13 +14,13 @@ import pytest
 from slam.config import LoopsConfig, dump_yaml, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image
-from slam.localisation.accuracy import map_to_truth, pose_errors, summary, summary_line, true_poses
+from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
 from slam.localisation.localiser import Localiser, image_numbers, localise
 from slam.localisation.tables import localisation_json, localisation_table, write_localisations
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import PLACES, Places
 from slam.results.folder import RunFolder
-from slam.se3 import FloatArray, Similarity, invert, rotation_angle
+from slam.se3 import FloatArray, invert, rotation_angle
 from slam.sequences.simulation.sequence import SimulatedSequence
 from slam.sequences.simulation.street import SimulationOptions
 from slam.trajectory import Trajectory, read_trajectory, write_kitti
@@ -180,12 +180,14 @@ def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, al
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))
     numbers = image_numbers(album, "0:4")
     found = list(localise(album, run, numbers=numbers))
-    errors = pose_errors(found, true_poses(tmp_path / "truth.txt", album, numbers), map_to_truth(run))
+    truth, known = MapTruth.of(run), true_poses(tmp_path / "truth.txt", album, numbers)
+    errors = [truth.error(each, T_true) for each, T_true in zip(found, known, strict=True)]
     whole = localisation_json(found, errors)
     assert isinstance(whole, dict)
     numbers_of = whole["summary"]
     assert (numbers_of["images"], numbers_of["found"], numbers_of["success_rate"]) == (4, 3, 0.5)
-    assert numbers_of["median_m"] < 0.5 and 1.0 < numbers_of["90_m"] < 3.5 and numbers_of["90_deg"] < 1.0
+    assert numbers_of["median_error_m"] < 0.5 and numbers_of["median_error_deg"] < 1.0
+    assert numbers_of["median_world_error_m"] == pytest.approx(numbers_of["median_error_m"], abs=1e-6)
     assert [entry["success"] for entry in whole["images"]] == [True, False, True, False]
     assert whole["images"][1]["error_m"] == pytest.approx(3.0, abs=0.5) and whole["images"][3]["error_m"] is None
     assert "50% of 4 images within 0.5 m and 2 deg" in summary_line(numbers_of)
@@ -209,7 +211,7 @@ def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp
     for path in run.path.glob("reference.*"):
         path.unlink()
     with pytest.raises(RunError, match="has no reference, so that no error can be computed"):
-        map_to_truth(run)
+        MapTruth.of(run)
 
 
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
@@ -217,7 +219,12 @@ def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path:
     with pytest.raises(RunError, match="none of 1 images was found"):
         write_localisations(tmp_path / "found.tum", found)
     assert not (tmp_path / "found.tum").exists()
-    assert summary(pose_errors(found, np.eye(4)[None], Similarity(1.0, np.eye(3), np.zeros(3))))["median_m"] is None
+    numbers = summary([None])
+    assert (
+        numbers["success_rate"] == 0.0
+        and numbers["median_error_m"] is None
+        and "none was found" in summary_line(numbers)
+    )
 
 
 def test_missing_parts_are_named(run: RunFolder, album: Path, tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
+from slam.calibration.cli import verbs as calibration_verbs
+from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
 from slam.runtime.progress import progress_bar
@@ -79,6 +81,7 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
     ] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -106,6 +109,7 @@ def run(
             cache=cache,
             rerun=rerun,
             continues=continues,
+            gps=gps,
         )
     metrics = folder.metrics()
     if as_json:
@@ -143,6 +147,8 @@ def evaluate(
 
 
 app.add_typer(export_verbs)
+app.add_typer(calibration_verbs)
+app.add_typer(download_verbs)
 
 
 @app.command()

@@ -18,6 +18,7 @@ from slam.config_frontend import (
     FrontendConfig,
     GapsConfig,
     GeometryConfig,
+    GpsConfig,
     LengthConfig,
     LidarConfig,
     RoadConfig,
@@ -30,6 +31,7 @@ __all__ = [
     "FrontendConfig",
     "GapsConfig",
     "GeometryConfig",
+    "GpsConfig",
     "LengthConfig",
     "LidarConfig",
     "LoopsConfig",
@@ -236,6 +238,7 @@ class SlamConfig(Section):
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()
     lidar: LidarConfig = LidarConfig()
+    gps: GpsConfig = GpsConfig()
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()

@@ -76,11 +76,11 @@ def _sequence(root: Path, name: str, kind: str) -> str:
     try:
         sequence = open_sequence(root, name)
     except SlamError as error:
-        return f"missing  sequence {name} ({kind}): {error}"
+        return f"missing  sequence {name}: {error} ({kind})"
     truth = "true poses" if sequence.reference is not None else "no true poses"
     height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
     scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
     return (
-        f"ok       sequence {name} ({kind}): {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans"
+        f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"
     )

@@ -195,6 +195,19 @@ class RelativePose:
         return self.sigmas if self.correlated_sigmas is None else self.correlated_sigmas
 
 
+@dataclass(frozen=True)
+class MeasuredPosition:
+    """A measured ``position`` ``(3,)`` of a point of the camera at a frame, in axes of its own, metres.
+
+    ``sigmas`` ``(3,)`` are along these axes, ``lever_arm`` ``(3,)`` is the point in the camera.
+    """
+
+    index: int
+    position: FloatArray
+    sigmas: FloatArray
+    lever_arm: FloatArray
+
+
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     """Unbroken runs of frame numbers as (first, last)."""
     found: list[tuple[int, int]] = []

@@ -26,6 +26,7 @@ from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
+from slam.results.gps import write_places
 from slam.results.map import write_map
 from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
@@ -38,6 +39,7 @@ from slam.runtime.imports import import_rerun
 from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.gps import read_gps
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
 _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
@@ -59,6 +61,7 @@ class RunOptions(TypedDict, total=False):
     cache: Path | None
     rerun: Path | None
     continues: Path | None
+    gps: Path | None
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class RunRequest:
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
             configuration is used, and the new folder has the whole drive.
+        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``.
     """
 
     dataset: str | Path | None = None
@@ -100,6 +104,7 @@ class RunRequest:
     cache: Path | None = None
     rerun: Path | None = None
     continues: Path | None = None
+    gps: Path | None = None
 
 
 def run_slam(
@@ -176,9 +181,8 @@ def _prepare(request: RunRequest) -> _Job:
             "--weights and depth.source"
         )
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
-    pipeline = SlamPipeline(
-        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
-    )
+    rest = get_or_compute, checkpoint, request.seed, None if request.gps is None else read_gps(request.gps)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording, source), sha256)
 
@@ -258,7 +262,7 @@ def _run(job: _Job, folder: RunFolder) -> None:
     folder.write_text("config.yaml", dump_yaml(job.settings))
     estimate = job.pipeline.estimate()
     _write_estimate(folder, estimate, job)
-    metrics = estimate_metrics(estimate, job.recording, job.provenance)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
@@ -280,6 +284,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
+    write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("trajectory_lidar", lidar)

@@ -48,6 +48,7 @@ class VideoFrames:
             raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
         if 0 < announced != self._frames:
             logger.warning("video %s announces %d frames and has %d: it may be cut off", path, announced, self._frames)
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = self._cached(0).shape[:2]
 

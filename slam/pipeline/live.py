@@ -64,7 +64,7 @@ class Slam:
         """
         config = config or SlamConfig()
         self._mode = resolve_mode(config.scale, camera_height_m)
-        if self._mode in ("reference", "lidar"):
+        if self._mode in ("reference", "lidar", "known", "gps"):
             raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
         if config.lidar.factors:
             raise SlamError("lidar.factors=true needs a whole sequence with LiDAR scans: leave the setting out")

@@ -31,6 +31,8 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
     "graph.g2o",
     "loops.json",
     "places.npz",
+    "trajectory_optimised.geojson",
+    "trajectory_optimised.kml",
     "drive.zip",
     "keyframes.npz",
     "map_mesh.ply",

@@ -50,6 +50,8 @@ _TEMPLATES = Environment(
 _MEANINGS = {
     "config.yaml": "resolved configuration",
     "metrics.json": "every number of this page",
+    "trajectory_optimised.geojson": "optimised trajectory on the earth",
+    "trajectory_optimised.kml": "the same for Google Earth",
     "trajectory_network": "raw network poses, chained",
     "trajectory_odometry": "front end fused, no loops",
     "trajectory_optimised": "after the pose graph",
@@ -115,6 +117,7 @@ def write_report(
         what_ran=report_tables.what_ran(metrics),
         trajectories=_trajectory_picture(trajectories, unit),
         errors=report_tables.errors(metrics),
+        gps=report_tables.gps(metrics),
         no_errors=report_tables.no_errors(metrics),
         error_pictures=list(_error_pictures(trajectories)),
         depth=_depth_picture(examples),

@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Thread
 from types import ModuleType
 
-from slam.errors import SequenceError, SlamError
+from slam.errors import DownloadError, SequenceError, SlamError
 
 
 @functools.cache
@@ -101,6 +101,22 @@ def import_feather() -> ModuleType:
         return importlib.import_module("pyarrow.feather")
     except (ImportError, OSError) as error:
         raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
+
+
+def import_remotezip() -> tuple[ModuleType, ModuleType, ModuleType]:
+    """Import remotezip, requests and the exceptions of urllib3 below them, an optional extra.
+
+    Raises:
+        DownloadError: if one is not installed or cannot be loaded.
+    """
+    try:
+        names = ("remotezip", "requests", "urllib3.exceptions")
+        remotezip, requests, exceptions = (importlib.import_module(name) for name in names)
+    except (ImportError, OSError) as error:
+        raise DownloadError(
+            f"download needs remotezip and requests ({error}): pip install 'erfsfm-slam[download]'"
+        ) from error
+    return remotezip, requests, exceptions
 
 
 def import_open3d_beside() -> None:

@@ -46,7 +46,7 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
         assert np.array_equal(sequence.frame(k).image, np.repeat(picture(k)[:, :, None], 3, axis=2))
     assert sequence_names(path) == ["/cam0/image_raw"]
     line = examine(path)[-1]
-    assert line.startswith("ok       sequence /cam0/image_raw (ROS bag): 6 frames of 40x24")
+    assert line.startswith("ok       sequence /cam0/image_raw: 6 frames of 40x24") and line.endswith("(ROS bag)")
     assert open_sequence(path.parent, frames="1:3").name == "walk"
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from erfsfm import __version__
-from erfsfm.errors import ErfsfmError
+from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
@@ -79,7 +79,7 @@ def run(
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
     gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
@@ -342,7 +342,10 @@ def main() -> None:
     try:
         app(prog_name="erfsfm-slam")
     except (SlamError, ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm-slam: {' '.join(str(error).splitlines())}", err=True)
+        typer.echo(f"erfsfm-slam: {one_line(str(error))}", err=True)
+        sys.exit(1)
+    except MemoryError:
+        typer.echo(f"erfsfm-slam: {OUT_OF_MEMORY}", err=True)
         sys.exit(1)
     except SystemExit as end:
         if end.code == _INTERRUPTED:

@@ -184,7 +184,7 @@ class MappingConfig(Section):
         default=3.0, ge=0, description="or rotation after which a frame is fused, degrees"
     )
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
-    voxel_size_m: float = Field(default=0.2, gt=0, description="side of a voxel")
+    voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
     truncation_voxels: float = Field(
         default=4.5, ge=1, description="truncation distance of the signed distance, voxels"
     )

@@ -84,6 +84,7 @@ def read_ply(path: Path) -> Ply:
     try:
         with path.open("rb") as file:
             is_text, elements = _header(file)
+            _require_size(path.stat().st_size - file.tell(), elements, is_text)
             read = _read_text if is_text else _read_binary
             parts = {element.name: read(file, element) for element in elements}
             if file.read(1).strip():
@@ -224,6 +225,18 @@ def _header(file: BinaryIO) -> tuple[bool, list[_Element]]:
     if not elements or elements[0].name != "vertex":
         raise ValueError("its vertices do not come first")
     return form == "ascii", elements
+
+
+def _require_size(size: int, elements: list[_Element], is_text: bool) -> None:
+    """Refuse a body that is shorter than announced, before any memory is taken for it."""
+    for element in elements:
+        fields = [kind for _, kind in element.fields]
+        if element.list_types is not None:
+            fields += [element.list_types[0], *[element.list_types[1]] * 3]
+        each = 2 * len(fields) if is_text else sum(np.dtype(kind).itemsize for kind in fields)
+        if element.count < 0 or element.count * each > size:
+            raise ValueError(f"it announces {element.count} elements '{element.name}', more than it holds")
+        size -= element.count * each
 
 
 def _words(file: BinaryIO) -> Iterator[list[str]]:

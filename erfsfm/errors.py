@@ -1,6 +1,5 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
-
 _LONGEST = 700
 _LAST = 200
 

@@ -49,7 +49,7 @@ def kill(kitti_root: Path, tiny_weights: Path) -> Callable[..., Path]:
     def killed(output: Path, frame: int, name: str = "SIGKILL", *overrides: str) -> Path:
         words = [kitti_root, tiny_weights, output, frame, name, *OVERRIDES, *overrides]
         ended = subprocess.run([sys.executable, "-c", KILLED, *map(str, words)], check=False, capture_output=True)
-        expected = {"SIGKILL": -signal.SIGKILL, "SIGINT": -signal.SIGINT}
+        expected = {"SIGKILL": -signal.SIGKILL, "SIGTERM": 143}
         assert ended.returncode == expected[name], ended.stderr.decode()
         return output
 
@@ -106,7 +106,7 @@ def test_it_can_be_killed_again_or_have_kept_nothing_yet(
 
 
 def test_a_run_that_was_asked_to_end_goes_on(kill: Callable[..., Path], tmp_path: Path) -> None:
-    output = kill(tmp_path / "run", 9, "SIGINT", "mapping.enabled=false")
+    output = kill(tmp_path / "run", 9, "SIGTERM", "mapping.enabled=false")
     assert RunFolder.open(output).metrics()["status"] == "failed"
     metrics = run_slam(continues=output).metrics()
     assert (metrics["status"], metrics["sequence"]["continued_at"]) == ("ok", 8)

@@ -188,9 +188,11 @@ def damaged(draw: st.DrawFn, content: bytes) -> bytes:
         case "cut":
             return content[:place]
         case "flip":
-            return content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :] if (
-                place < size
-            ) else content
+            return (
+                content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+                if (place < size)
+                else content
+            )
         case "overwrite":
             new = draw(st.binary(min_size=1, max_size=16))
             return content[:place] + new + content[place + len(new) :]

@@ -40,6 +40,10 @@ class RunError(SlamError):
     """A run folder is missing or incomplete."""
 
 
+class EmptyMapError(SlamError):
+    """A map without any surface."""
+
+
 @contextmanager
 def sequence_errors() -> Iterator[None]:
     """Raise what the readers of `erfsfm.readers` refuse as a `SequenceError`; also a decorator."""

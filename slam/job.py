@@ -16,7 +16,7 @@ from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
 from slam.pipeline.journal import Journal, clear_journal
 from slam.pipeline.observer import Observer, ObserverState
@@ -57,6 +57,7 @@ class Job:
     predictors_sha256: str
     checkpoint: SessionCheckpoint | None
     rerun: Path | None = None
+    progress: Progress | None = None
     stream: Stream | None = None
 
     def checkpoint_of(self, state: ObserverState) -> SessionCheckpoint:
@@ -99,8 +100,8 @@ def _run(job: Job, folder: RunFolder) -> None:
     if stream is not None:
         stream.finish(estimate, folder.path)
     quality = DepthQuality(job.recording, estimate.scale.mode)
-    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
-    numbers = write_map(folder, result, job.recording)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    numbers = write_map(folder, result, job.recording, job.progress)
     depth = quality.summary(job.settings.depth.refine != "none")
     folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
     views = write_map_views(folder, job.settings.output.viewer_triangles)

@@ -180,7 +180,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
-    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun)
+    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress)
 
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:

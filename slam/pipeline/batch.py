@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from slam.frontend.scale.scale_estimate import (
 from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
-from slam.mapping import TsdfMap
+from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place
 from slam.pipeline.journal import EVERY_FRAMES, Journal
@@ -201,10 +202,16 @@ class SlamPipeline:
             intrinsics, config = self._sequence.intrinsics, self._config.loops
             return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
 
-    def fuse(self, estimate: SlamResult, compare: Callable[[KeyframeDepth], None] | None = None) -> TsdfMap | None:
+    def fuse(
+        self,
+        estimate: SlamResult,
+        compare: Callable[[KeyframeDepth], None] | None = None,
+        folder: Path | None = None,
+    ) -> TsdfMap | None:
         """Learned depth at the optimised poses, refined and fused into one surface; None where mapping is switched off.
 
-        ``compare`` is called with the depth of each keyframe that is far enough from the one before.
+        ``compare`` is called with the depth of each keyframe that is far enough from the one before; ``folder`` is
+        where finished submaps go, a temporary folder where it is None.
         """
         keyframes = estimate.observations.keyframes
         if not self._config.mapping.enabled or not keyframes:
@@ -213,7 +220,7 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        tsdf_map = TsdfMap(config.mapping, intrinsics)
+        tsdf_map = TsdfMap(config.mapping, intrinsics, folder)
         depths = KeyframeDepths(
             estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
         )
@@ -225,8 +232,8 @@ class SlamPipeline:
             if compare is not None:
                 compare(keyframe)
             with self._watch.stage("map"):
-                depth = keyframe.trusted(config.mapping.max_relative_sigma)
-                tsdf_map.integrate(depth, keyframe.image, T_world_camera[keyframe.index])
+                pose, number = T_world_camera[keyframe.index], keyframe.index
+                tsdf_map.integrate(keyframe.best, keyframe.image, pose, keyframe.relative_sigma, number)
             self._progress("map", done + 1, len(moved))
         return tsdf_map
 

@@ -15,6 +15,8 @@ from pathlib import Path
 
 from erfsfm.files import unfinished_name, write_atomically
 from slam.errors import RunError
+from slam.mapping.submap import FOLDER as SUBMAPS
+from slam.mapping.submap import remove_submaps
 from slam.results.schema import MetricsFile
 from slam.storage.files import JOURNAL_FILE
 from slam.storage.json_file import read_json
@@ -91,6 +93,7 @@ def replace_run(output: Path, place: Path) -> None:
     next run recognises them as runs and replaces them, wherever this was interrupted.
     """
     write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
+    remove_submaps(output / SUBMAPS)
     for path in _files(output):
         if path.name != METRICS:
             path.unlink()
@@ -153,6 +156,7 @@ def _is_own(name: str) -> bool:
 def _clear(folder: Path) -> None:
     """Remove an earlier run with its partial files; other files stay."""
     check_output(folder / UNFINISHED)
+    remove_submaps(folder / SUBMAPS)
     for path in _files(folder):
         path.unlink()
     if (folder / UNFINISHED).is_dir():

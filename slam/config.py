@@ -23,6 +23,7 @@ from slam.config_frontend import (
     RoadConfig,
     ScaleConfig,
     ScaleMode,
+    WindowConfig,
 )
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "ScaleConfig",
     "ScaleMode",
     "SlamConfig",
+    "WindowConfig",
     "dump_yaml",
     "load_config",
 ]
@@ -229,6 +231,7 @@ class SlamConfig(Section):
     depth: DepthConfig = DepthConfig()
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
+    window: WindowConfig = WindowConfig()
     gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()

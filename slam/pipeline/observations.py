@@ -16,6 +16,7 @@ from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.window.relative_poses import WindowPoses
 from slam.loops.descriptors import View
 from slam.storage.spill import SpilledArray, SpillFile
 
@@ -85,9 +86,10 @@ class ClosedObservations:
     examples: list[tuple[int, Image, DepthMap]]
     failures: list[tuple[int, int, str]]
     gaps: InterpolatedGaps
+    window: WindowPoses
 
     @classmethod
-    def of(cls, seen: Observations, gaps: InterpolatedGaps) -> ClosedObservations:
+    def of(cls, seen: Observations, gaps: InterpolatedGaps, window: WindowPoses) -> ClosedObservations:
         """Leave out views and keyframes of interpolated frames."""
         return cls(
             seen.roads,
@@ -98,6 +100,7 @@ class ClosedObservations:
             seen.examples,
             seen.failures,
             gaps,
+            window,
         )
 
     @property

@@ -22,7 +22,9 @@ from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
+from slam.frontend.window.odometry import WindowState
 from slam.loops.descriptors import FeatureExtractor
+from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray, chain
@@ -53,11 +55,12 @@ class RecentFrame:
 
 @dataclass(frozen=True)
 class ObserverState:
-    """State of an observer after a frame."""
+    """State of an observer after a frame; ``keyframes`` is None where the drive is measured by steps alone."""
 
     seen: Observations
     gate: GateState
     odometry: OdometryState
+    keyframes: WindowState | None
     road_directions: tuple[FloatArray, ...]
     window: tuple[Frame, ...]
     recent: tuple[RecentFrame, ...]
@@ -122,6 +125,8 @@ class Observer:
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
+        keyframes = WindowState() if state is None else state.keyframes
+        self._keyframes = KeyframeTracking(config.window, intrinsics, seed, keyframes)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
@@ -186,6 +191,7 @@ class Observer:
             self._seen,
             self._gate.state(),
             self._odometry.state(),
+            self._keyframes.state(),
             self._road.state(),
             self._window,
             self._recent,
@@ -219,7 +225,7 @@ class Observer:
             seen.repeated,
             self._config.gaps,
         )
-        return ClosedObservations.of(seen, gaps)
+        return ClosedObservations.of(seen, gaps, self._keyframes.poses(seen))
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -266,6 +272,7 @@ class Observer:
             steps = self._measure_steps(frame)
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
+        self._keyframes.decide(self._seen)
         if pending.snippet is not None:
             self._tasks.append(PendingTask("pose network", pending.snippet, self._seen.snippets.append))
         if rotation is not None:
@@ -277,6 +284,8 @@ class Observer:
         with self._stopwatch.stage("road"):
             road = self._plane.fit(depth)
         self._seen.roads.append(road)
+        with self._stopwatch.stage("keyframes"):
+            self._keyframes.add(frame, depth)
         height = road.height_unscaled if isinstance(road, GroundPlane) else None
         self._recent = (*self._recent, RecentFrame(frame, depth, height))[-self._frames_kept :]
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:

@@ -14,6 +14,8 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
+from slam.calibration.cli import verbs as calibration_verbs
+from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
 from slam.runtime.progress import progress_bar
@@ -58,10 +60,15 @@ def _options_of_all_verbs(
 @app.command()
 def run(
     dataset: Annotated[
-        str | None, typer.Option(help="KITTI odometry root, KITTI raw drive, TUM folder, image folder or video")
+        str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
     ] = None,
-    sequence: Annotated[str | None, typer.Option("--sequence", "-s", help="name inside the data set, e.g. 09")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of a folder or video")] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+    ] = None,
     weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
@@ -74,6 +81,7 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
     ] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
     device: Device = "auto",
     as_json: Json = False,
@@ -101,6 +109,7 @@ def run(
             cache=cache,
             rerun=rerun,
             continues=continues,
+            gps=gps,
         )
     metrics = folder.metrics()
     if as_json:
@@ -138,6 +147,8 @@ def evaluate(
 
 
 app.add_typer(export_verbs)
+app.add_typer(calibration_verbs)
+app.add_typer(download_verbs)
 
 
 @app.command()

@@ -18,6 +18,7 @@ from slam.config_frontend import (
     FrontendConfig,
     GapsConfig,
     GeometryConfig,
+    GpsConfig,
     LengthConfig,
     LidarConfig,
     RoadConfig,
@@ -31,6 +32,7 @@ __all__ = [
     "FrontendConfig",
     "GapsConfig",
     "GeometryConfig",
+    "GpsConfig",
     "LengthConfig",
     "LidarConfig",
     "LoopsConfig",
@@ -219,6 +221,9 @@ class OutputConfig(Section):
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
+    viewer_triangles: int = Field(
+        default=60_000, ge=0, description="most triangles of the map that turns in the report; 0 for pictures alone"
+    )
     keep: Literal["nothing", "drive", "keyframes"] = Field(
         default="drive",
         description="for run --continue: nothing, the measurements of the drive, or also the keyframes of the map",
@@ -236,6 +241,7 @@ class SlamConfig(Section):
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()
     lidar: LidarConfig = LidarConfig()
+    gps: GpsConfig = GpsConfig()
     scale: ScaleConfig = ScaleConfig()
     loops: LoopsConfig = LoopsConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()

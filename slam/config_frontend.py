@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal, Self
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from erfsfm.config_tree import Section
 
-ScaleMode = Literal["none", "camera-height", "lidar", "reference"]
+ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps"]
 
 
 class FrontendConfig(Section):
@@ -274,11 +275,28 @@ class LidarConfig(Section):
     translation_sigma_m: float = Field(default=0.03, gt=0, description="translation sigma of a step, metres")
 
 
+class GpsConfig(Section):
+    """A GPS track beside the images, see ``docs/gps.md``."""
+
+    factors: bool = Field(default=True, description="add its positions to the pose graph; false: only for comparison")
+    sigma_m: float = Field(default=2.5, gt=0, description="sigma of a fix east and north where its HDOP is 1, metres")
+    vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of its height, metres")
+    correlation_s: float = Field(default=10.0, ge=0, description="time for which fixes share their error, seconds")
+    offset_s: float = Field(default=0.0, description="added to the stamps of the fixes, seconds")
+    lever_arm_m: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="the antenna from the camera: x right, y down, z ahead, metres"
+    )
+
+
 class ScaleConfig(Section):
     """Metric scale, see ``frontend/scale/road_plane.py``."""
 
-    mode: Literal["auto", "none", "camera-height", "lidar", "reference"] = Field(
-        default="auto", description="auto: camera-height where a height is known, else none"
+    mode: Literal["auto", "none", "camera-height", "lidar", "reference", "known", "gps"] = Field(
+        default="auto", description="auto: camera-height where a height is known, else gps with --gps, else none"
+    )
+    known_m: float | None = Field(default=None, gt=0, description="mode known: distance of the two frames, metres")
+    known_between: tuple[int | str, int | str] | None = Field(
+        default=None, description="mode known: two frames of the run, or stamps in seconds such as 12.5s"
     )
     reference_frames: int = Field(default=50, ge=2, description="number of first frames that mode reference compares")
     min_frames: int = Field(default=5, ge=1, description="least number of usable frames of a scale")
@@ -313,6 +331,20 @@ class ScaleConfig(Section):
         default=0.05, gt=0, lt=1, description="largest relative depth error of a plane inlier"
     )
     min_inlier_ratio: float = Field(default=0.5, gt=0, le=1, description="least inlier ratio of a usable frame")
+
+    @field_validator("known_between")
+    @classmethod
+    def _frames_or_stamps(cls, ends: tuple[int | str, int | str] | None) -> tuple[int | str, int | str] | None:
+        for end in ends or ():
+            if (end < 0) if isinstance(end, int) else not re.fullmatch(r"-?\d+(\.\d*)?s", end):
+                raise ValueError("two frame numbers, or stamps in seconds such as 12.5s")
+        return ends
+
+    @model_validator(mode="after")
+    def _known_is_given(self) -> Self:
+        if self.mode == "known" and (self.known_m is None or self.known_between is None):
+            raise ValueError("known_m and known_between beside mode known")
+        return self
 
     @model_validator(mode="after")
     def _top_above_bottom(self) -> Self:

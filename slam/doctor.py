@@ -12,7 +12,7 @@ from erfsfm.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
 from slam.errors import SlamError
 from slam.runtime.imports import import_open3d
-from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_names
+from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
 
 PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
@@ -64,21 +64,23 @@ def _weights(name: str) -> str:
 
 def _dataset(root: Path) -> list[str]:
     try:
-        names = sequence_names(root)
+        kinds = sequence_kinds(root)
     except SlamError as error:
         return [f"missing  {error}"]
-    if not names:
-        return [f"missing  {root} is not a data set of a kind that 'erfsfm-slam run --help' lists"]
-    return [_sequence(root, name) for name in names]
+    if not kinds:
+        return [f"missing  {root} is not a data set of a kind that docs/recordings.md lists"]
+    return [_sequence(root, name, kind) for name, kind in kinds.items()]
 
 
-def _sequence(root: Path, name: str) -> str:
+def _sequence(root: Path, name: str, kind: str) -> str:
     try:
         sequence = open_sequence(root, name)
     except SlamError as error:
-        return f"missing  sequence {name}: {error}"
+        return f"missing  sequence {name}: {error} ({kind})"
     truth = "true poses" if sequence.reference is not None else "no true poses"
     height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
-    scans = sum(sequence.scan_path(k) is not None for k in range(len(sequence)))
+    scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
-    return f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans"
+    return (
+        f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"
+    )

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Collection, Hashable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import cv2
@@ -107,8 +106,12 @@ class Sequence(Protocol):
         """Read one frame; ``SequenceError`` where its image cannot be read."""
         ...
 
-    def scan_path(self, index: int) -> Path | None:
-        """The Velodyne ``.bin`` file taken with a frame, or None."""
+    def has_scan(self, index: int) -> bool:
+        """Whether a LiDAR scan was taken with a frame."""
+        ...
+
+    def scan(self, index: int) -> FloatArray:
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR; ``SequenceError`` where unreadable."""
         ...
 
     def provenance(self) -> tuple[str, ...]:
@@ -190,6 +193,19 @@ class RelativePose:
     def graph_sigmas(self) -> FloatArray:
         """Sigmas ``(6,)`` for a graph, which assumes independent errors of its factors."""
         return self.sigmas if self.correlated_sigmas is None else self.correlated_sigmas
+
+
+@dataclass(frozen=True)
+class MeasuredPosition:
+    """A measured ``position`` ``(3,)`` of a point of the camera at a frame, in axes of its own, metres.
+
+    ``sigmas`` ``(3,)`` are along these axes, ``lever_arm`` ``(3,)`` is the point in the camera.
+    """
+
+    index: int
+    position: FloatArray
+    sigmas: FloatArray
+    lever_arm: FloatArray
 
 
 def runs(frames: Collection[int]) -> list[tuple[int, int]]:

@@ -21,10 +21,11 @@ from scipy.spatial.transform import Rotation
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
 from slam.formats.g2o import write_g2o
-from slam.frames import LOOP_SOURCE, RelativePose
+from slam.frames import LOOP_SOURCE, MeasuredPosition, RelativePose
 from slam.se3 import FloatArray, invert, is_se3
 
 _ANCHOR_SIGMA = 1e-6
+_LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
 _OUTLYING = 3.0
 # iSAM2: threshold of relinearisation, and of convergence
 _RELINEARISE = 1e-3
@@ -43,6 +44,13 @@ class PoseGraph:
         self._relative_poses: list[RelativePose] = []
         self._dropped: list[RelativePose] = []
         self._T_world_camera: FloatArray | None = None
+        self._positions: tuple[MeasuredPosition, ...] = ()
+        self._T_fixed_world: FloatArray = np.eye(4)
+
+    @property
+    def T_fixed_world(self) -> FloatArray:
+        """``(4, 4)``: the world in the axes of the measured positions; the identity without any."""
+        return self._T_fixed_world.copy()
 
     @property
     def relative_poses(self) -> tuple[RelativePose, ...]:
@@ -68,6 +76,10 @@ class PoseGraph:
         for relative_pose in relative_poses:
             _check(relative_pose)
         self._relative_poses += relative_poses
+
+    def add_positions(self, positions: Sequence[MeasuredPosition], T_fixed_world_initial: FloatArray) -> None:
+        """Add positions measured in axes in which the world lies about at ``T_fixed_world_initial`` ``(4, 4)``."""
+        self._positions, self._T_fixed_world = tuple(positions), T_fixed_world_initial
 
     def optimise(self, T_world_camera_initial: FloatArray) -> FloatArray:
         """Solve for all poses from an initial trajectory; the first pose is fixed.
@@ -126,24 +138,28 @@ class PoseGraph:
 
     def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
         values = gtsam.Values()
-        for k, T in enumerate(T_world_camera_initial):
+        for k, T in enumerate(self._T_fixed_world @ T_world_camera_initial):
             values.insert(k, _pose3(T))
         stages = {"none": ["none"], "huber": ["huber"], "huber-cauchy": ["huber", "cauchy"]}
         for kernel in stages[self._config.kernel]:
             values = self._minimise(values, kernel)
-        T_world_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
-        if not np.isfinite(T_world_camera).all():
+        T_fixed_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
+        if not np.isfinite(T_fixed_camera).all():
             raise RuntimeError("the solution is not finite")
-        T_world_camera[:, :3, :3] = Rotation.from_matrix(T_world_camera[:, :3, :3]).as_matrix()
-        rebased: FloatArray = T_world_camera_initial[0] @ invert(T_world_camera[0]) @ T_world_camera
+        T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
+        rebased: FloatArray = T_world_camera_initial[0] @ invert(T_fixed_camera[0]) @ T_fixed_camera
+        if self._positions:
+            self._T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
         rebased[0] = T_world_camera_initial[0]
         return rebased
 
     def _minimise(self, values: Any, kernel: str) -> Any:
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(_anchor(values.atPose3(0)))
+        graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
         for edge in self._relative_poses:
             graph.add(_between(edge, kernel, self._config))
+        for position in self._positions:
+            graph.add(_position(position, kernel, self._config))
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self._config.max_iterations)
         parameters.setRelativeErrorTol(self._config.relative_tolerance)
@@ -285,18 +301,29 @@ def _first_line(error: RuntimeError) -> str:
     return str(error).strip().partition("\n")[0]
 
 
-def _anchor(pose: Any) -> Any:
-    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA))
+def _anchor(pose: Any, is_loose: bool = False) -> Any:
+    sigmas = _LOOSE_SIGMAS if is_loose else np.full(6, _ANCHOR_SIGMA)
+    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 def _between(edge: RelativePose, kernel: str, config: PoseGraphConfig) -> Any:
-    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(edge.graph_sigmas, dtype=np.float64))
-    if kernel != "none":
-        estimators = gtsam.noiseModel.mEstimator
-        huber = kernel == "huber"
-        estimator = estimators.Huber.Create(config.huber_k) if huber else estimators.Cauchy.Create(config.cauchy_k)
-        noise = gtsam.noiseModel.Robust.Create(estimator, noise)
+    noise = _noise(edge.graph_sigmas, kernel, config)
     return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
+
+
+def _position(measured: MeasuredPosition, kernel: str, config: PoseGraphConfig) -> Any:
+    noise = _noise(measured.sigmas, kernel, config)
+    return gtsam.GPSFactorArm(measured.index, measured.position, measured.lever_arm, noise)
+
+
+def _noise(sigmas: FloatArray, kernel: str, config: PoseGraphConfig) -> Any:
+    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
+    if kernel == "none":
+        return noise
+    estimators = gtsam.noiseModel.mEstimator
+    huber = kernel == "huber"
+    estimator = estimators.Huber.Create(config.huber_k) if huber else estimators.Cauchy.Create(config.cauchy_k)
+    return gtsam.noiseModel.Robust.Create(estimator, noise)
 
 
 def _check(edge: RelativePose) -> None:

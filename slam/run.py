@@ -26,7 +26,9 @@ from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
+from slam.results.gps import write_places
 from slam.results.map import write_map
+from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
 from slam.results.output import UNFINISHED, check_output
 from slam.results.report import DepthExample, write_report
@@ -37,6 +39,7 @@ from slam.runtime.imports import import_rerun
 from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.gps import read_gps
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
 _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
@@ -58,6 +61,7 @@ class RunOptions(TypedDict, total=False):
     cache: Path | None
     rerun: Path | None
     continues: Path | None
+    gps: Path | None
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,10 @@ class RunRequest:
     """All inputs of a run.
 
     Attributes:
-        dataset: KITTI odometry root, KITTI raw drive, TUM folder, image folder or video; None with no
+        dataset: a recording of a kind that ``docs/recordings.md`` lists; None with no
             ``sequence`` is the embedded simulated street.
         sequence: name inside the data set.
-        camera: ``camera.yaml`` of a folder or video, where none lies beside it.
+        camera: ``camera.yaml`` in place of the one beside the images or their calibration, or ``fov=DEGREES``.
         weights: a shipped name or a training output folder.
         config: a YAML file or a shipped name; None for the defaults.
         overrides: ``section.key=value`` each.
@@ -82,6 +86,7 @@ class RunRequest:
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
             configuration is used, and the new folder has the whole drive.
+        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``.
     """
 
     dataset: str | Path | None = None
@@ -99,6 +104,7 @@ class RunRequest:
     cache: Path | None = None
     rerun: Path | None = None
     continues: Path | None = None
+    gps: Path | None = None
 
 
 def run_slam(
@@ -175,9 +181,8 @@ def _prepare(request: RunRequest) -> _Job:
             "--weights and depth.source"
         )
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
-    pipeline = SlamPipeline(
-        recording, predictor, settings, request.progress, networks.noise, get_or_compute, checkpoint, request.seed
-    )
+    rest = get_or_compute, checkpoint, request.seed, None if request.gps is None else read_gps(request.gps)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording, source), sha256)
 
@@ -257,17 +262,18 @@ def _run(job: _Job, folder: RunFolder) -> None:
     folder.write_text("config.yaml", dump_yaml(job.settings))
     estimate = job.pipeline.estimate()
     _write_estimate(folder, estimate, job)
-    metrics = estimate_metrics(estimate, job.recording, job.provenance)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
-    surface = write_map(folder, result, job.recording)
+    numbers = write_map(folder, result, job.recording)
     depth = quality.summary(job.settings.depth.refine != "none")
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, surface.summary, depth))
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    views = write_map_views(folder, job.settings.output.viewer_triangles)
     if job.settings.output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
-        write_report(folder, examples, surface.points, surface.colours)
+        write_report(folder, examples, views)
     if job.request.rerun is not None:
         write_rerun(job.request.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
 
@@ -278,6 +284,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
+    write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
         folder.write_trajectory("trajectory_lidar", lidar)
@@ -307,4 +314,4 @@ def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseExce
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
         if report:
-            write_report(folder, [], None, None)
+            write_report(folder, [], None)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor
 from slam.results.folder import RunFolder
+from slam.results.map_mesh import MapMeshFile
+from slam.results.map_picture import MapScene
 from slam.results.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
-from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600
@@ -40,10 +41,10 @@ def main() -> None:
     images = [sequence.frame(int(k)).image for k in chosen]
     depths = [predictor.depth(image) for image in images]
     trajectories = trajectories_of(folder)
-    cloud = import_open3d().io.read_point_cloud(str(folder.require("map_cloud.ply")))
+    scene = MapScene(MapMeshFile(folder.require("map_mesh.ply")).reduced(1_000_000))
     top = _raster(depth_figure(images, depths, [f"frame {k}" for k in chosen]), WIDTH_PX)
     left = _raster(trajectory_figure(trajectories, title="trajectories"), WIDTH_PX // 2)
-    map_picture = map_figure(np.asarray(cloud.points), np.asarray(cloud.colors), trajectories["optimised"])
+    map_picture = map_figure(scene.from_above(trajectories["optimised"].positions), trajectories["optimised"])
     right = _raster(map_picture, WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
     bottom = np.concatenate([_padded(left, height), _padded(right, height)], axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -12,7 +12,7 @@ from erfsfm.readers.pinhole import Pinhole, impossible, require_plausible
 from erfsfm.yaml_file import read_yaml
 
 CAMERA_FILE = "camera.yaml"
-_COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,)}
+_COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
 
 class CameraFile(BaseModel):
@@ -30,9 +30,10 @@ class CameraFile(BaseModel):
     camera_height_m: float | Literal["unknown"] | None = Field(
         default=None, description="height of the camera above the road, metres, or unknown"
     )
-    model: Literal["pinhole", "opencv", "fisheye"] = "pinhole"
+    model: Literal["pinhole", "opencv", "fisheye", "fov"] = "pinhole"
     distortion: tuple[float, ...] = Field(
-        default=(), description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4"
+        default=(),
+        description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4; fov: the angle",
     )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
 
@@ -45,7 +46,7 @@ class CameraFile(BaseModel):
             raise ValueError(problem)
         allowed = _COEFFICIENTS.get(self.model)
         if allowed is None and any(self.distortion):
-            raise ValueError("distortion: needs model opencv or fisheye; a pinhole has none")
+            raise ValueError("distortion: needs model opencv, fisheye or fov; a pinhole has none")
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
             raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
@@ -81,11 +82,20 @@ def read_camera_file(path: Path) -> CameraFile:
     if not isinstance(content, dict):
         keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
         raise DataError(f"{path} holds no keys: a camera file needs {keys}")
+    return camera_of(content, str(path))
+
+
+def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
+    """The camera of the keys of a camera file, found at ``where``; an unlikely camera is logged as a warning.
+
+    Raises:
+        DataError: naming the key that is missing, unknown or wrong.
+    """
     try:
-        camera = CameraFile.model_validate(content)
+        camera = CameraFile.model_validate(keys)
     except ValidationError as error:
-        raise DataError(f"{path}: {_complaints(error)}") from error
-    require_plausible(camera.pinhole, str(path))
+        raise DataError(f"{where}: {_complaints(error)}") from error
+    require_plausible(camera.pinhole, where)
     return camera
 
 

@@ -15,7 +15,7 @@ from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES
 
 EVERYTHING = 10**9
 _RANGED = re.compile(r"(?P<base>.+)\[(?P<start>\d*):(?P<stop>\d*)\]")
-_PLAIN = re.compile(r"[^\[\]]+|(?:folder|tum)/.+")  # users name their own folders as they like
+_PLAIN = re.compile(r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+")  # users name their own folders as they like
 
 
 @dataclass(frozen=True)

@@ -56,15 +56,29 @@ def read_image(path: Path) -> Image:
     Raises:
         DataError: missing, empty, truncated, no image, or 12-bit data in 16 bits; one line.
     """
-    data = _complete_bytes(path)
+    return decode_image(_file_bytes(path), f"image {path}")
+
+
+def decode_image(data: bytes, where: str) -> Image:
+    """As `read_image`, of the bytes of a file; ``where`` they come from is for messages.
+
+    Raises:
+        DataError: empty, truncated, no image, or 12-bit data in 16 bits; one line.
+    """
+    _require_complete(data, where)
     if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH] == 16:
-        most = int(_decode(path, data, cv2.IMREAD_UNCHANGED).max())
-        if 0 < most < _TWELVE_BITS:
-            raise DataError(
-                f"image {path} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
-                f"8 bits; convert the images to 8 bits, or multiply their values by 16"
-            )
-    return np.asarray(cv2.cvtColor(_decode(path, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        _require_sixteen_bits(_decode(where, data, cv2.IMREAD_UNCHANGED), where)
+    return np.asarray(cv2.cvtColor(_decode(where, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def eight_bits(values: NDArray[np.uint16], where: str) -> NDArray[np.uint8]:
+    """The upper eight bits of 16-bit values.
+
+    Raises:
+        DataError: they look like 12-bit data; one line.
+    """
+    _require_sixteen_bits(values, where)
+    return (values >> 8).astype(np.uint8)
 
 
 def read_values(path: Path) -> NDArray[Any]:
@@ -73,7 +87,9 @@ def read_values(path: Path) -> NDArray[Any]:
     Raises:
         DataError: missing, empty, truncated or no image; one line.
     """
-    return _decode(path, _complete_bytes(path), cv2.IMREAD_UNCHANGED)
+    data = _file_bytes(path)
+    _require_complete(data, f"image {path}")
+    return _decode(f"image {path}", data, cv2.IMREAD_UNCHANGED)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -95,16 +111,27 @@ def _is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
-def _complete_bytes(path: Path) -> bytes:
+def _file_bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise DataError(f"cannot read image {path}: {error.strerror}") from error
+
+
+def _require_complete(data: bytes, where: str) -> None:
     if not data:
-        raise DataError(f"image {path} is empty: copy it again")
+        raise DataError(f"{where} is empty: copy it again")
     if not _is_complete(data):
-        raise DataError(f"image {path} is truncated at {len(data)} bytes: copy it again")
-    return data
+        raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
+
+
+def _require_sixteen_bits(values: NDArray[Any], where: str) -> None:
+    most = int(values.max())
+    if 0 < most < _TWELVE_BITS:
+        raise DataError(
+            f"{where} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
+            f"8 bits; convert the images to 8 bits, or multiply their values by 16"
+        )
 
 
 def _is_complete(data: bytes) -> bool:
@@ -116,11 +143,11 @@ def _is_complete(data: bytes) -> bool:
     return True
 
 
-def _decode(path: Path, data: bytes, flags: int) -> NDArray[Any]:
+def _decode(where: str, data: bytes, flags: int) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise DataError(f"image {path} cannot be decoded: {error.err or error}") from error
+        raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
     if image is None:
-        raise DataError(f"image {path} cannot be decoded: it is damaged or not an image; copy it again")
+        raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
     return np.asarray(image)

@@ -25,11 +25,13 @@ class NumberedFiles:
         paths: the N files that exist, at least one.
         rows: ``(N,)``, increasing from 0, the row of each.
         first: number of row 0, by which files beside these are indexed (times, poses, packets).
+        names: of all rows, where a table gives them.
     """
 
     paths: tuple[Path, ...]
     rows: tuple[int, ...]
     first: int = 0
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Number of rows, those without a file among them."""
@@ -46,6 +48,8 @@ class NumberedFiles:
 
     def file_name(self, row: int) -> str:
         """The name that the file of a row has or would have."""
+        if self.names:
+            return self.names[row]
         position = max(int(np.searchsorted(self.rows, row, side="right")) - 1, 0)
         path = self.paths[position]
         match = _NUMBERED.fullmatch(path.stem)
@@ -105,6 +109,21 @@ def by_name(paths: list[Path]) -> NumberedFiles:
         return NumberedFiles(tuple(paths), tuple(range(len(paths))))
     frames = _numbered(paths, numbers)
     return NumberedFiles(frames.paths, frames.rows)
+
+
+def by_table(listed: list[Path], table: Path) -> NumberedFiles:
+    """The files that a table lists in the order of time; those that are not there are gaps.
+
+    Rows before the first file and after the last are left out; ``first`` is the number of those before.
+
+    Raises:
+        DataError: none of them is there.
+    """
+    there = [row for row, path in enumerate(listed) if path.is_file()]
+    if not there:
+        raise DataError(f"none of the {len(listed)} images that {table} names is there: unpack them")
+    names = tuple(path.name for path in listed[there[0] : there[-1] + 1])
+    return NumberedFiles(tuple(listed[row] for row in there), tuple(row - there[0] for row in there), there[0], names)
 
 
 def _numbered(paths: list[Path], numbers: list[int]) -> NumberedFiles:

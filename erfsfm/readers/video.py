@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import logging
 import os
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
 from erfsfm.readers.images import Image
@@ -46,6 +48,7 @@ class VideoFrames:
             raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
         if 0 < announced != self._frames:
             logger.warning("video %s announces %d frames and has %d: it may be cut off", path, announced, self._frames)
+        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = self._cached(0).shape[:2]
 
@@ -60,6 +63,18 @@ class VideoFrames:
             DataError: the video breaks off before it.
         """
         return self._cached(index).copy()
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """When each frame is shown, seconds ``(N,)``; None where the file does not say.
+
+        Of a long video, which was not decoded to count its frames, the packets are read by PyAV, an optional extra.
+
+        Raises:
+            DataError: the video is long and PyAV is not installed.
+        """
+        is_counted = len(self._times_ms) == self._frames
+        times = np.array(self._times_ms) / 1000 if is_counted else _packet_times(self._path)
+        return times if len(times) == self._frames and (np.diff(times) > 0).all() else None
 
     def _count(self) -> int:
         while self._grab():
@@ -102,6 +117,23 @@ class VideoFrames:
     def _rewind(self) -> None:
         self._capture.release()
         self._capture, self._next = _capture(self._path), 0
+
+
+def _packet_times(path: Path) -> NDArray[np.float64]:
+    """Of the first video stream, in the order of time, without decoding."""
+    try:
+        av = importlib.import_module("av")
+    except ImportError as error:
+        raise DataError(
+            f"the frame times of {path} need PyAV, for it is long ({error}): pip install 'erfsfm-slam[video]'"
+        ) from error
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            shown = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
+            return np.array(shown, dtype=np.float64) * float(stream.time_base)
+    except (av.error.FFmpegError, IndexError, TypeError) as error:
+        raise DataError(f"video {path} cannot be read: {error}; copy it again") from error
 
 
 def list_videos(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ from slam.loops.places import PLACES, Places
 from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray
+from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory
@@ -110,7 +111,8 @@ def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
         place = Path(recorded["dataset"]) if "dataset" in recorded else None
     else:
         place = dataset
-        camera = camera if camera is not None and camera.exists() else None  # it may have moved with the images
+        if camera is not None and not (camera.exists() or is_field_of_view(camera)):
+            camera = None  # it may have moved with the images
     return {"dataset": place, "name": recorded.get("sequence"), "camera": camera}
 
 

@@ -96,6 +96,32 @@ def read_ply(path: Path) -> Ply:
         raise RunError(f"{path} is no PLY that can be read ({reason}): run the sequence again") from error
 
 
+def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    """Vertices ``(V,)`` and triangles ``(T,)`` of a binary mesh, mapped into memory and not checked.
+
+    Returns:
+        Structured arrays; the field ``vertices`` of a triangle has its three corners.
+
+    Raises:
+        RunError: it is no binary mesh of triangles, or is cut short.
+    """
+    try:
+        with path.open("rb") as file:
+            is_text, elements = _header(file)
+            vertex, face = elements
+            if is_text or face.list_types is None:
+                raise ValueError("it is no binary mesh")
+            count, index = face.list_types
+            start = file.tell()
+        of_vertex = np.dtype(vertex.fields)
+        of_face = np.dtype([("count", count), ("vertices", index, (3,))])
+        vertices = _mapped(path, start, vertex.count, of_vertex)
+        return vertices, _mapped(path, start + vertex.count * of_vertex.itemsize, face.count, of_face)
+    except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
+        reason = str(error) or "it ends within its header"
+        raise RunError(f"{path} is no mesh that can be read ({reason}): run the sequence again") from error
+
+
 def read_ply_points(path: Path) -> tuple[FloatArray, NDArray[np.uint8]]:
     """Vertices ``(P, 3)`` and their RGB colours ``(P, 3)``, grey where the file has none; raises as `read_ply`."""
     ply = read_ply(path)
@@ -225,6 +251,10 @@ def _read_binary(file: BinaryIO, element: _Element) -> NDArray[Any]:
         raise ValueError(f"each {element.name} must have 3 vertices")
     vertices: NDArray[Any] = faces["vertices"]
     return vertices
+
+
+def _mapped(path: Path, start: int, count: int, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
 
 
 def _records(file: BinaryIO, element: _Element, dtype: np.dtype[np.void]) -> NDArray[np.void]:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import LidarConfig
-from slam.errors import SlamError
 from slam.frames import RelativePose, Sequence
 from slam.se3 import FloatArray, invert
 
@@ -30,7 +29,7 @@ class LidarPath:
 
 def has_scans(sequence: Sequence) -> bool:
     """Whether two neighbouring frames have a scan each and the LiDAR's extrinsics are known."""
-    scanned = [sequence.scan_path(k) is not None for k in range(len(sequence))]
+    scanned = [sequence.has_scan(k) for k in range(len(sequence))]
     return sequence.T_camera_lidar is not None and any(map(all, itertools.pairwise(scanned)))
 
 
@@ -40,7 +39,7 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     Raises:
         SlamError: a scan cannot be read.
     """
-    frames = [k for k in range(len(sequence)) if sequence.scan_path(k) is not None]
+    frames = [k for k in range(len(sequence)) if sequence.has_scan(k)]
     T_camera_lidar = sequence.T_camera_lidar
     if len(frames) < LEAST_SCANS or T_camera_lidar is None:
         return None
@@ -54,7 +53,7 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     odometry = KissICP(settings)
     T_first_lidar = []
     for frame in frames:
-        odometry.register_frame(scan_points(sequence, frame), np.array([]))
+        odometry.register_frame(sequence.scan(frame), np.array([]))
         T_first_lidar.append(odometry.last_pose.copy())
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
@@ -71,16 +70,3 @@ def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:
         for first, second, T in zip(path.frames[:-1], path.frames[1:], T_previous_current, strict=True)
         if second == first + 1
     ]
-
-
-def scan_points(sequence: Sequence, frame: int) -> FloatArray:
-    """The points of a Velodyne file ``(P, 3)``, metres, in the LiDAR frame."""
-    path = sequence.scan_path(frame)
-    assert path is not None
-    try:
-        values = np.fromfile(path, dtype=np.float32)
-    except OSError as error:
-        raise SlamError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
-    if len(values) == 0 or len(values) % 4:
-        raise SlamError(f"{path} is no Velodyne scan: wanted four float32 a point; got {values.nbytes} bytes")
-    return values.reshape(-1, 4)[:, :3].astype(np.float64)

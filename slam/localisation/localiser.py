@@ -13,6 +13,7 @@ from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images, read_image
+from erfsfm.readers.numbering import by_name
 from slam.config import LoopsConfig, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
@@ -22,7 +23,8 @@ from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, invert, rotation_angle
-from slam.sequences.camera_file import beside, read_explicit
+from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
+from slam.sequences.images import ImageFiles
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
@@ -55,7 +57,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
-    own_camera = _camera_file(camera, paths[0].parent)
+    own_camera = _camera_file(camera, paths)
     localiser = Localiser(
         places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
     )
@@ -168,8 +170,12 @@ def _image_paths(images: Path) -> list[Path]:
     return list_images(folder)
 
 
-def _camera_file(explicit: Path | None, folder: Path) -> CameraFile | None:
-    return beside(folder) if explicit is None else read_explicit(explicit)
+def _camera_file(explicit: Path | None, paths: list[Path]) -> CameraFile | None:
+    if explicit is None:
+        return beside(paths[0].parent)
+    if is_field_of_view(explicit):
+        return explicit_camera(explicit, ImageFiles(by_name(paths)))
+    return read_explicit(explicit)
 
 
 def _pinhole(camera: CameraFile) -> Intrinsics:

@@ -11,15 +11,20 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
-from slam.errors import SlamError
 from slam.frames import Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors
-from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
-from slam.frontend.scale.scale_estimate import resolve_mode, scale_from_reference
+from slam.frontend.scale.scale_estimate import (
+    ScaleEstimate,
+    scale_from_distance,
+    scale_from_reference,
+)
+from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping import TsdfMap
@@ -28,6 +33,8 @@ from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
+from slam.pipeline.positioning import Location, Positioning
+from slam.pipeline.requirements import require_possible
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -57,7 +64,8 @@ class Measurements:
 class SlamResult:
     """Trajectories with one row a frame, the graph, the map and the measurements.
 
-    ``state`` is that of the observer, for a run that continues this one.
+    ``state`` is that of the observer, for a run that continues this one; ``location`` is None
+    without a GPS track, and the reason where the track cannot be used.
     """
 
     network: Trajectory
@@ -73,6 +81,7 @@ class SlamResult:
     graph: PoseGraph
     map: TsdfMap | None
     stopwatch: Stopwatch
+    location: Location | MeasurementFailure | None = None
 
 
 class SlamPipeline:
@@ -88,6 +97,7 @@ class SlamPipeline:
         get_or_compute: GetOrCompute = without_cache,
         checkpoint: SessionCheckpoint | None = None,
         seed: int = 0,
+        gps_track: GpsTrack | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -100,6 +110,7 @@ class SlamPipeline:
             get_or_compute: a cache of image measurements.
             checkpoint: measurements of the first frames of the sequence, whose images are then not read.
             seed: of all RANSAC draws.
+            gps_track: positions of the drive.
         """
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
@@ -111,6 +122,7 @@ class SlamPipeline:
         self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
         self._seed = seed
+        self._gps_track = gps_track
         self._watch = Stopwatch()
 
     def run(self) -> SlamResult:
@@ -135,7 +147,7 @@ class SlamPipeline:
         self._warn_of_a_frozen_end(observations, state)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
-        graph, T_optimised = self._optimise(measured.factors, loops, measured.T_odometry)
+        graph, T_optimised, location = self._optimise(measured, loops)
         return SlamResult(
             network=self._trajectory(measured.T_network),
             odometry=self._trajectory(measured.T_odometry),
@@ -150,6 +162,7 @@ class SlamPipeline:
             graph=graph,
             map=None,
             stopwatch=self._watch,
+            location=location,
         )
 
     def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
@@ -200,34 +213,16 @@ class SlamPipeline:
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed.
-
-        Raises:
-            SlamError: too few frames, or the sequence lacks what the configuration needs.
-        """
-        sequence, shortest = self._sequence, self._predictor.sources + 1
-        if len(sequence) < shortest:
-            raise SlamError(
-                f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
-                "choose a longer range"
-            )
-        mode = resolve_mode(self._config.scale, sequence.camera_height_m)
-        wants_lidar = {"scale.mode=lidar": mode == "lidar", "lidar.factors=true": self._config.lidar.factors}
-        for setting in (name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)):
-            raise SlamError(
-                f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
-                "leave the setting out or give a sequence with scans"
-            )
-        if mode == "reference" and sequence.reference is None:
-            raise SlamError(
-                f"scale mode reference needs true poses; {sequence.name} has none: choose camera-height or none"
-            )
-        if mode == "camera-height" and sequence.camera_height_m is None:
-            raise SlamError(
-                f"scale mode camera-height needs a known height; {sequence.name} has none: add camera_height_m "
-                "to camera.yaml or choose scale.mode=none"
-            )
+        """The scale mode of this run, after checks that it can succeed; raises as `require_possible`."""
+        shortest = self._predictor.sources + 1
+        mode = require_possible(self._sequence, shortest, self._config, self._gps_track is not None)
+        self._positioning(mode)
         return mode
+
+    def _positioning(self, mode: ScaleMode) -> Positioning | None:
+        """The GPS track matched to the drive, None without one."""
+        track = self._gps_track
+        return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, mode)
 
     def _observe(self) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
@@ -299,25 +294,46 @@ class SlamPipeline:
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
         with self._watch.stage("scale"):
             scale = find_scale(mode, sequence.camera_height_m, measured, config.scale, config.lengths, config.lidar)
-            if mode != "reference" or sequence.reference is None:
+            if mode not in ("reference", "known", "gps"):
                 return scale
             T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)
-            return scale.in_unit_of(scale_from_reference(T_odometry, sequence.reference, config.scale))
+            return scale.in_unit_of(self._unit(mode, T_odometry))
+
+    def _unit(self, mode: ScaleMode, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+        """Metres per unit of an odometry, by what the mode knows of the drive; a failure is logged."""
+        sequence, config = self._sequence, self._config.scale
+        unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
+        positioning = self._positioning(mode)
+        if mode == "reference" and sequence.reference is not None:
+            unit = scale_from_reference(T_odometry, sequence.reference, config)
+        elif mode == "known":
+            unit = scale_from_distance(T_odometry, sequence.stamps, config)
+        elif positioning is not None:
+            unit = positioning.scale(T_odometry, config)
+        if isinstance(unit, MeasurementFailure):
+            logger.warning("no scale (%s): lengths stay in camera heights", unit.reason)
+        return unit
 
     def _factors(self, unscaled: Unscaled, scale: Scale, by_lidar: Sequence[RelativePose]) -> list[RelativePose]:
         return make_factors(unscaled, scale, by_lidar, self._noise, self._config.frontend, self._config.geometry)
 
     def _optimise(
-        self, factors: Sequence[RelativePose], loops: LoopClosures, T_odometry: FloatArray
-    ) -> tuple[PoseGraph, FloatArray]:
-        """The optimised trajectory, without the loops that contradict it."""
-        graph = PoseGraph(self._config.pose_graph)
-        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
+        self, measured: Measurements, loops: LoopClosures
+    ) -> tuple[PoseGraph, FloatArray, Location | MeasurementFailure | None]:
+        """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
+        graph, T_odometry = PoseGraph(self._config.pose_graph), measured.T_odometry
+        graph.add_relative(*measured.factors, *(loop.measured for loop in loops.accepted))
+        positioning = self._positioning(measured.scale.mode)
+        location = None if positioning is None else positioning.locate(T_odometry)
+        if positioning is not None and isinstance(location, Location):
+            positioning.add_factors(graph, location, T_odometry)
         with self._watch.stage("graph"):
             T_optimised = graph.optimise(T_odometry)
             while graph.drop_contradicted_loops():
                 T_optimised = graph.optimise(T_odometry)
-        return graph, T_optimised
+        if positioning is not None and isinstance(location, Location):
+            location = positioning.relocated(location, graph, T_optimised)
+        return graph, T_optimised, location
 
     def _register_lidar(self) -> LidarPath | None:
         """LiDAR odometry, where the sequence has scans."""

@@ -65,7 +65,7 @@ class Slam:
         """
         config = config or SlamConfig()
         self._mode = resolve_mode(config.scale, camera_height_m)
-        if self._mode in ("reference", "lidar"):
+        if self._mode in ("reference", "lidar", "known", "gps"):
             raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
         if config.lidar.factors:
             raise SlamError("lidar.factors=true needs a whole sequence with LiDAR scans: leave the setting out")
@@ -252,8 +252,13 @@ class LiveSequence:
         """Always ``SlamError``: images are not kept."""
         raise SlamError(f"frame {index} of a live drive is not kept")
 
-    def scan_path(self, index: int) -> None:
-        """None: there are no scans."""
+    def has_scan(self, index: int) -> bool:
+        """False: there are no scans."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SlamError``: there are no scans."""
+        raise SlamError(f"frame {index} of a live drive has no scan")
 
     def provenance(self) -> tuple[str, ...]:
         """Unknown."""

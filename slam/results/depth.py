@@ -8,7 +8,6 @@ import numpy as np
 
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
-from slam.frontend.lidar_odometry import scan_points
 from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.map_error import HasTrueDepth
 from slam.results.summary import null
@@ -71,9 +70,9 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
         return None
     if isinstance(base, HasTrueDepth) and frame in base.true_depth_frames():
         return np.asarray(base.true_depth(frame), np.float32)
-    if sequence.T_camera_lidar is None or sequence.scan_path(index) is None:
+    if sequence.T_camera_lidar is None or not sequence.has_scan(index):
         return None
-    return projected(scan_points(sequence, index), sequence.T_camera_lidar, sequence.intrinsics)
+    return projected(sequence.scan(index), sequence.T_camera_lidar, sequence.intrinsics)
 
 
 def projected(points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics) -> DepthMap:

@@ -13,7 +13,6 @@ from slam.evaluation.map import compare, pose_similarity, statistics
 from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import scan_points
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply, invert
@@ -85,7 +84,7 @@ class LidarTruth:
     def __init__(self, sequence: Sequence) -> None:
         """The scans of a sequence with true poses."""
         self._sequence = sequence
-        scanned = [k for k in range(len(sequence)) if sequence.scan_path(k) is not None]
+        scanned = [k for k in range(len(sequence)) if sequence.has_scan(k)]
         self.frames: Indices = np.array(scanned, dtype=np.int64)
         self._limits: dict[int, tuple[float, float]] = {}
 
@@ -93,7 +92,7 @@ class LidarTruth:
         """The points of one scan; those that project into its image are in the image."""
         sequence = self._sequence
         assert sequence.reference is not None and sequence.T_camera_lidar is not None
-        points = scan_points(sequence, frame)
+        points = sequence.scan(frame)
         ranges = np.linalg.norm(points, axis=1)
         self._limits[frame] = _elevations(points, ranges)
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])

@@ -19,6 +19,7 @@ from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.pipeline.batch import SlamResult
 from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.gps import gps_metrics
 from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
 from slam.se3 import umeyama
 from slam.sequences.continued import Continued
@@ -41,7 +42,9 @@ def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
     return {"lidar": trajectory_metrics(lidar, reference)}
 
 
-def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provenance) -> dict[str, Any]:
+def estimate_metrics(
+    result: SlamResult, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
+) -> dict[str, Any]:
     """All metrics before the map is fused; a missing number is null with its reason."""
     reference = result.reference
     trajectories = {
@@ -62,6 +65,7 @@ def estimate_metrics(result: SlamResult, sequence: Sequence, provenance: Provena
             "timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)),
             "scale": _scale(result),
             "trajectories": trajectories,
+            **gps_metrics(result, gps_in_graph),
             "graph": _graph(result),
             "loops": result.loops.summary(),
             **null("depth", "the run ended before its map was whole"),

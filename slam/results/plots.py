@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.errors import RunError
 from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.frames import DepthMap, Image
 from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.map_picture import AerialView
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, associate
 
@@ -178,45 +178,27 @@ def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Se
     return figure
 
 
-def map_figure(
-    points: NDArray[np.floating],
-    colours: NDArray[np.floating],
-    trajectory: Trajectory | None = None,
-    unit: str = "m",
-    most: int = 150_000,
-) -> Figure:
-    """The map from above in its colours, highest points drawn last, with the trajectory over it.
+def map_figure(view: AerialView, trajectory: Trajectory | None = None, unit: str = "m") -> Figure:
+    """The map from above in its colours, with the trajectory over it.
 
     Args:
-        points: ``(P, 3)`` in the world, y down.
-        colours: ``(P, 3)`` RGB in [0, 1].
+        view: the map as an image.
         trajectory: camera poses in the same world.
         unit: of all lengths.
-        most: points drawn; a larger map is thinned evenly.
     """
-    chosen = np.linspace(0, len(points) - 1, min(most, len(points))).astype(np.intp)
-    chosen = chosen[np.isfinite(points[chosen]).all(axis=1)]
-    # y points down: from the lowest to the highest
-    chosen = chosen[np.argsort(-points[chosen, 1], kind="stable")]
-    ground = points[chosen][:, [0, 2]]
-    path = trajectory.positions[:, [0, 2]] if trajectory else np.empty((0, 2))
-    corners = np.concatenate([np.percentile(ground, [0.5, 99.5], axis=0) if len(ground) else np.zeros((1, 2)), path])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = 0.04 * float((high - low).max()) or 1.0
     with figure_style() as new_figure:
-        share = float((high - low + margin)[1] / (high - low + margin)[0])
+        share = (view.z[1] - view.z[0]) / (view.x[1] - view.x[0])
         figure = new_figure(figsize=(7.4, np.clip(6.4 * share + 1.0, 2.6, 7.0)), layout="constrained")
         axes = figure.subplots()
-        rgb = np.clip(colours[chosen], 0.0, 1.0)
-        size = float(np.clip(60_000 / max(len(chosen), 1), 0.25, 4.0))
-        axes.scatter(ground[:, 0], ground[:, 1], s=size, c=rgb, linewidths=0, rasterized=True)
+        axes.imshow(view.image, extent=(*view.x, *view.z), interpolation="antialiased", zorder=2)
         if trajectory:
-            axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.2)
-            axes.plot(path[:, 0], path[:, 1], **_LOOKS["optimised"][1], label="Optimised trajectory")
+            path = trajectory.positions[:, [0, 2]]
+            look = _LOOKS["optimised"][1] | {"linewidth": 1.2, "zorder": 4}
+            axes.plot(path[:, 0], path[:, 1], color="white", linewidth=2.6, zorder=3)
+            axes.plot(path[:, 0], path[:, 1], **look, label="Optimised trajectory")
             figure.legend(loc="outside upper center")
         axes.set_aspect("equal")
-        axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
-        axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+        axes.set(xlim=view.x, ylim=view.z, xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     return figure
 
 

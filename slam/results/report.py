@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from numpy.typing import NDArray
 
 from slam.errors import SlamError
 from slam.evaluation.drift import REFERENCE
@@ -21,12 +19,12 @@ from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
 from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_sizes
+from slam.results.map_view import MAP_ABOVE, MAP_DRIVER, MapViews
 from slam.results.plots import (
     depth_figure,
     drift_figure,
     errors_figure,
     length_unit,
-    map_figure,
     trajectories_of,
     trajectory_figure,
 )
@@ -52,6 +50,8 @@ _TEMPLATES = Environment(
 _MEANINGS = {
     "config.yaml": "resolved configuration",
     "metrics.json": "every number of this page",
+    "trajectory_optimised.geojson": "optimised trajectory on the earth",
+    "trajectory_optimised.kml": "the same for Google Earth",
     "trajectory_network": "raw network poses, chained",
     "trajectory_odometry": "front end fused, no loops",
     "trajectory_optimised": "after the pose graph",
@@ -64,6 +64,8 @@ _MEANINGS = {
     "keyframes.npz": "keyframes of the map, for run --continue",
     "map_mesh.ply": "map as a mesh, y down",
     "map_cloud.ply": "map as a coloured cloud, y down",
+    MAP_ABOVE: "the map from above",
+    MAP_DRIVER: "the map from the driver's seat",
     "run.log": "log of the run",
 }
 
@@ -90,16 +92,14 @@ class Picture:
 def write_report(
     folder: RunFolder,
     examples: Sequence[DepthExample],
-    map_points: NDArray[np.floating] | None,
-    map_colours: NDArray[np.floating] | None,
+    views: MapViews | None,
 ) -> None:
     """Write ``report.html`` from the files of a folder; also for a failed run.
 
     Args:
         folder: the run, with its ``metrics.json`` and trajectories written.
         examples: frames to show with their depth.
-        map_points: ``(P, 3)`` in the world of the optimised trajectory, y down, or None without a map.
-        map_colours: ``(P, 3)`` RGB in [0, 1], or None.
+        views: of the map, or None without one.
 
     Raises:
         RunError: ``metrics.json`` is damaged.
@@ -117,10 +117,13 @@ def write_report(
         what_ran=report_tables.what_ran(metrics),
         trajectories=_trajectory_picture(trajectories, unit),
         errors=report_tables.errors(metrics),
+        gps=report_tables.gps(metrics),
         no_errors=report_tables.no_errors(metrics),
         error_pictures=list(_error_pictures(trajectories)),
         depth=_depth_picture(examples),
-        map_picture=_map_picture(trajectories.get("optimised"), unit, map_points, map_colours),
+        map_picture=_map_picture(views),
+        driver=_driver_picture(views),
+        viewer=None if views is None else views.viewer,
         map=map_sizes(metrics),
         map_errors=map_errors_table(metrics),
         map_curve=_map_curve(metrics),
@@ -171,16 +174,17 @@ def _depth_picture(examples: Sequence[DepthExample]) -> Picture | None:
     return _drawn(lambda: depth_figure(images, depths, labels), "Depth maps", caption)
 
 
-def _map_picture(
-    optimised: Trajectory | None,
-    unit: str,
-    points: NDArray[np.floating] | None,
-    colours: NDArray[np.floating] | None,
-) -> Picture | None:
-    if points is None or colours is None or not len(points):
+def _map_picture(views: MapViews | None) -> Picture | None:
+    if views is None:
         return None
-    caption = "The map from above in its own colours."
-    return _drawn(lambda: map_figure(points, colours, optimised, unit), "Map from above", caption)
+    return Picture("Map from above", "The map from above in its own colours.", _encoded(views.above))
+
+
+def _driver_picture(views: MapViews | None) -> Picture | None:
+    if views is None:
+        return None
+    caption = f"The map from the driver's seat at frame {views.frame}."
+    return Picture("Map from the driver's seat", caption, _encoded(views.driver))
 
 
 def _map_curve(metrics: Metrics) -> Picture | None:
@@ -217,7 +221,11 @@ def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
         draw().savefig(buffer, format="png", dpi=160, metadata={"Software": None})
     except SlamError as error:
         return Picture(title, caption, reason=str(error))
-    return Picture(title, caption, base64.b64encode(buffer.getvalue()).decode("ascii"))
+    return Picture(title, caption, _encoded(buffer.getvalue()))
+
+
+def _encoded(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def _size(count: int) -> str:

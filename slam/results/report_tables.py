@@ -112,6 +112,21 @@ def what_ran(metrics: Metrics) -> Table:
     return Table((), _texts(recorded), "words")
 
 
+def gps(metrics: Metrics) -> Table | None:
+    """Distances from the GPS track; None without one."""
+    if lookup(metrics, "gps")[0] is None:
+        return None
+    columns = ("horizontal_rmse_m", "horizontal_median_m", "vertical_rmse_m")
+    rows = [
+        [Cell(name), *(number(metrics, "gps", name, column, decimals=2) for column in columns)]
+        for name in ("odometry", "optimised")
+    ]
+    fixes, in_graph = lookup(metrics, "gps", "fixes")[0], lookup(metrics, "gps", "in_graph")[0]
+    use = "factors of the pose graph: the optimised row is no independent test" if in_graph else "not in the pose graph"
+    notes = [f"{fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    return Table(("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m"), rows, notes=notes)
+
+
 def no_errors(metrics: Metrics) -> str:
     """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
     places = [("trajectories", name, *each.path) for each in STATISTICS for name in _evaluated(metrics)]

@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Thread
 from types import ModuleType
 
-from slam.errors import SlamError
+from slam.errors import DownloadError, SequenceError, SlamError
 
 
 @functools.cache
@@ -74,6 +74,49 @@ def import_rasterio() -> ModuleType:
         return importlib.import_module("rasterio")
     except (ImportError, OSError) as error:
         raise SlamError(f"GeoTIFF needs rasterio ({error}): pip install 'erfsfm-slam[geotiff]'") from error
+
+
+def import_rosbags() -> tuple[ModuleType, ModuleType, ModuleType]:
+    """Import the readers of ROS 1 and ROS 2 bags and the message types of rosbags, an optional extra.
+
+    Raises:
+        SequenceError: if it is not installed or cannot be loaded.
+    """
+    try:
+        rosbag1, rosbag2, typesys = (
+            importlib.import_module(f"rosbags.{name}") for name in ("rosbag1", "rosbag2", "typesys")
+        )
+    except (ImportError, OSError) as error:
+        raise SequenceError(f"bags need rosbags ({error}): pip install 'erfsfm-slam[ros]'") from error
+    return rosbag1, rosbag2, typesys
+
+
+def import_feather() -> ModuleType:
+    """Import pyarrow's reader of feather files, an optional extra.
+
+    Raises:
+        SequenceError: if it is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("pyarrow.feather")
+    except (ImportError, OSError) as error:
+        raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
+
+
+def import_remotezip() -> tuple[ModuleType, ModuleType, ModuleType]:
+    """Import remotezip, requests and the exceptions of urllib3 below them, an optional extra.
+
+    Raises:
+        DownloadError: if one is not installed or cannot be loaded.
+    """
+    try:
+        names = ("remotezip", "requests", "urllib3.exceptions")
+        remotezip, requests, exceptions = (importlib.import_module(name) for name in names)
+    except (ImportError, OSError) as error:
+        raise DownloadError(
+            f"download needs remotezip and requests ({error}): pip install 'erfsfm-slam[download]'"
+        ) from error
+    return remotezip, requests, exceptions
 
 
 def import_open3d_beside() -> None:

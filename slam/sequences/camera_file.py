@@ -1,30 +1,75 @@
-"""Search for the ``camera.yaml`` of a sequence; its keys are described in `erfsfm.readers.camera_file`."""
+"""Which camera a sequence has: a ``camera.yaml`` or a field of view given by the user, or the recording's own.
+
+The keys of ``camera.yaml`` are described in `erfsfm.readers.camera_file`.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
+from typing import Protocol
 
 from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile, read_camera_file
 from slam.errors import SequenceError, sequence_errors
 
+DEFAULT_FPS = 10.0
+_FOV = re.compile(r"fov=(?P<fov>[\d.]+)(?:,fps=(?P<fps>[\d.]+))?")
+_FOV_LIMITS_DEG = (3.0, 150.0)
+
+
+class Sized(Protocol):
+    """Images of one size, pixels."""
+
+    @property
+    def width(self) -> int:
+        """Of an image."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Of an image."""
+        ...
+
 
 @sequence_errors()
-def find_camera_file(explicit: Path | None, *folders: Path, wanted_by: str) -> CameraFile:
-    """The camera file given by the user, or else the first ``camera.yaml`` found in ``folders``.
+def find_camera_file(
+    explicit: Path | None, *folders: Path, wanted_by: str, images: Sized, fps: float | None = None
+) -> CameraFile:
+    """The camera given by the user, or else the first ``camera.yaml`` found in ``folders``.
+
+    Args:
+        explicit: a ``camera.yaml``, or ``fov=DEGREES[,fps=RATE]``.
+        folders: where a ``camera.yaml`` may lie.
+        wanted_by: what needs it, for the message.
+        images: the images that it took, for a camera by its field of view.
+        fps: their rate where known, for the same; 10 a second otherwise.
 
     Raises:
         SequenceError: if there is none, or it is wrong.
     """
     if explicit is not None:
-        return read_explicit(explicit)
+        return explicit_camera(explicit, images, fps)
     found = beside(*folders)
     if found is not None:
         return found
     places = " and ".join(dict.fromkeys(str(folder) for folder in folders))
     raise SequenceError(
         f"no {CAMERA_FILE} for {wanted_by}: looked in {places}; put one there or give it with --camera "
-        f"(width, height, fx, fy, cx, cy, fps)"
+        f"(width, height, fx, fy, cx, cy, fps), or give the horizontal field of view in degrees, --camera fov=70"
     )
+
+
+@sequence_errors()
+def explicit_camera(given: Path, images: Sized, fps: float | None = None) -> CameraFile:
+    """The camera that the user named; arguments as in `find_camera_file`.
+
+    Raises:
+        SequenceError: a file that does not exist or is wrong, or a field of view that no lens has.
+    """
+    if is_field_of_view(given):
+        return _of_field_of_view(str(given), images, fps or DEFAULT_FPS)
+    return read_explicit(given)
 
 
 @sequence_errors()
@@ -35,8 +80,26 @@ def read_explicit(path: Path) -> CameraFile:
         SequenceError: if it does not exist or is wrong.
     """
     if not path.is_file():
-        raise SequenceError(f"no camera file {path}: --camera needs a {CAMERA_FILE}")
+        raise SequenceError(f"no camera file {path}: --camera needs a {CAMERA_FILE}, or fov=DEGREES")
     return read_camera_file(path)
+
+
+def own_camera(own: CameraFile, asked: Path | None, images: Sized, *folders: Path) -> CameraFile:
+    """The camera of a recording with a calibration of its own.
+
+    Args:
+        own: that calibration.
+        asked: what the user gave in its place.
+        images: the images.
+        folders: where a ``camera.yaml`` may lie; it gives the height of the camera alone.
+
+    Raises:
+        SequenceError: if a camera file is wrong.
+    """
+    if asked is not None:
+        return explicit_camera(asked, images, own.fps)
+    height = beside(*folders)
+    return own if height is None else own.model_copy(update={"camera_height_m": height.camera_height_m})
 
 
 @sequence_errors()
@@ -48,3 +111,35 @@ def beside(*folders: Path) -> CameraFile | None:
     """
     path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).is_file()), None)
     return None if path is None else read_camera_file(path)
+
+
+def is_field_of_view(given: Path) -> bool:
+    """Whether ``--camera`` names a field of view, not a file."""
+    return str(given).startswith("fov=")
+
+
+def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
+    """A pinhole with square pixels and the principal point in the middle; the field is that of the whole width."""
+    match = _FOV.fullmatch(text)
+    try:
+        fov_deg = float(match["fov"]) if match else math.nan
+        fps = float(match["fps"]) if match and match["fps"] else fps
+    except ValueError:
+        fov_deg = math.nan
+    least, most = _FOV_LIMITS_DEG
+    if not (least <= fov_deg <= most and fps > 0):
+        raise SequenceError(
+            f"--camera {text} is no field of view: write fov=70 for 70 degrees from the left edge of the image to the "
+            f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
+        )
+    focal_px = images.width / 2 / math.tan(math.radians(fov_deg) / 2)
+    return CameraFile(
+        width=images.width,
+        height=images.height,
+        fx=focal_px,
+        fy=focal_px,
+        cx=(images.width - 1) / 2,
+        cy=(images.height - 1) / 2,
+        fps=fps,
+        source=f"a horizontal field of view of {fov_deg:g} degrees",
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from slam.sequences.recording import MAX_GAP_S, require_frame
 logger = logging.getLogger(__name__)
 
 _ROUNDING_PX = 0.01
-_OWN = ("folder/", "tum/")  # names of recordings that the user gave
+_NUMBERED = ("kitti_", "simulated/")  # of names whose frame numbers are those of the recording
 
 
 class Continued:
@@ -82,9 +81,13 @@ class Continued:
             raise MissingFrameError(f"frame {index} of {self.name} is missing between two runs")
         return Frame(index, float(self.stamps[index]), self._following.frame(index - first).image)
 
-    def scan_path(self, index: int) -> Path | None:
-        """None: scans of earlier frames are not kept."""
-        return None
+    def has_scan(self, index: int) -> bool:
+        """False: scans of earlier frames are not kept."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SequenceError``: scans of earlier frames are not kept."""
+        raise SequenceError(f"frame {index} of {self.name} has no scan: those of earlier frames are not kept")
 
     def provenance(self) -> tuple[str, ...]:
         """Names of all parts, as in the leak record of a checkpoint."""
@@ -121,7 +124,7 @@ def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
             return 0
         ends += [(wanted.start - span.stop, name) for span in same if span is not None]
     if not ends:
-        if all(name.startswith(_OWN) for name in following):
+        if not any(name.startswith(_NUMBERED) for name in following):
             logger.warning("%s is assumed to follow %s without a gap", ", ".join(following), ", ".join(before))
             return 0
         raise SequenceError(

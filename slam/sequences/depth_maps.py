@@ -17,10 +17,11 @@ KITTI_PER_METRE = 256.0
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Files by frame, and the stored value of one metre."""
+    """Files by frame, the stored value of one metre, and perhaps a value other than 0 where depth is unknown."""
 
     paths: dict[int, Path]
     per_metre: float = KITTI_PER_METRE
+    unknown: int = 0
 
     def read(self, index: int) -> FloatArray:
         """The depth map ``(h, w)`` of a frame in metres.
@@ -32,7 +33,7 @@ class DepthMaps:
         values = read_values(path)
         if values.ndim != 2 or values.dtype != np.uint16:
             raise DataError(f"depth map {path} is no 16-bit grey PNG: write it again, or remove the folder")
-        return values.astype(np.float64) / self.per_metre
+        return np.where(values == self.unknown, 0, values) / self.per_metre
 
 
 def depth_maps_in(folder: Path, images: NumberedFiles) -> DepthMaps | None:

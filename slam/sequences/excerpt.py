@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Protocol
 
 from slam.errors import SequenceError
 from slam.frames import Frame, Sequence
-from slam.sequences.recording import Source, labels, rebased, require_frame
+from slam.se3 import FloatArray
+from slam.sequences.recording import Source, labels, require_frame
 
 
 class SourcedSequence(Sequence, Protocol):
     """A sequence with the recordings that it was cut from."""
 
     sources: tuple[Source, ...]
+
+    def true_poses(self, start: int, stop: int) -> FloatArray | None:
+        """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
+        ...
 
 
 class Excerpt:
@@ -31,7 +35,7 @@ class Excerpt:
         self.name = base.name
         self.intrinsics = base.intrinsics
         self.stamps = base.stamps[start:stop]
-        self.reference = None if base.reference is None else rebased(base.reference[start:stop])
+        self.reference = base.true_poses(start, stop)
         self.camera_height_m = base.camera_height_m
         self.T_camera_lidar = base.T_camera_lidar
         self.sources = tuple(source.shifted(start) for source in base.sources)
@@ -46,9 +50,17 @@ class Excerpt:
         frame = self.base.frame(self.start + index)
         return Frame(index, frame.stamp, frame.image)
 
-    def scan_path(self, index: int) -> Path | None:
-        """The Velodyne ``.bin`` file taken with a frame, or None."""
-        return self.base.scan_path(self.start + index)
+    def has_scan(self, index: int) -> bool:
+        """Whether a LiDAR scan was taken with a frame."""
+        return self.base.has_scan(self.start + index)
+
+    def scan(self, index: int) -> FloatArray:
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR."""
+        return self.base.scan(self.start + index)
+
+    def true_poses(self, start: int, stop: int) -> FloatArray | None:
+        """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
+        return self.base.true_poses(self.start + start, self.start + stop)
 
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""

@@ -1,21 +1,26 @@
-"""A folder of images with a ``camera.yaml``."""
+"""A folder of images with a ``camera.yaml`` and perhaps a ``times.txt``."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
-from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.folder import image_folder, recording_name
 from erfsfm.readers.images import list_images
-from erfsfm.readers.numbering import by_name
+from erfsfm.readers.numbering import NumberedFiles, by_name
 from slam.errors import SequenceError
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import find_camera_file
 from slam.sequences.images import ImageFiles
-from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, uniform_stamps
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.recording import RecordedSequence, Source, read_stamps, require_short_gaps, uniform_stamps
 from slam.sequences.undistortion import calibrated
 
+TIMES = "times.txt"
 
-def open_folder(folder: Path, camera: CameraFile) -> RecordedSequence:
-    """Open a folder of images, in natural order at the camera file's frame rate.
+
+def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
+    """Open a folder of images in natural order, at the stamps of its ``times.txt`` or the camera's frame rate.
 
     Raises:
         SequenceError: if it holds none, the gaps between them are too long, or they do not fit the camera.
@@ -25,8 +30,11 @@ def open_folder(folder: Path, camera: CameraFile) -> RecordedSequence:
     if where is None:
         raise SequenceError(f"no images in {folder}: looked for png, jpg, bmp there and in its sub-folders")
     files = by_name(list_images(where))
-    images, intrinsics = calibrated(ImageFiles(files), camera, str(where))
-    stamps = uniform_stamps(len(files), camera.fps)
+    stored = ImageFiles(files)
+    places = (where, folder, folder.absolute().parent)
+    camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
+    images, intrinsics = calibrated(stored, camera, str(where))
+    stamps = _stamps((where / TIMES, folder / TIMES), files, camera.fps)
     require_short_gaps(files, stamps)
     name = recording_name(folder)
     return RecordedSequence(
@@ -37,3 +45,17 @@ def open_folder(folder: Path, camera: CameraFile) -> RecordedSequence:
         sources=(Source(f"folder/{name}"),),
         camera_height_m=camera.height_or(None),
     )
+
+
+def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> FloatArray:
+    path = next((path for path in places if path.is_file()), None)
+    return uniform_stamps(len(files), fps) if path is None else read_stamps(path, files)
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    if image_folder(path) is None:
+        return {}
+    return {path.absolute().name: partial(open_folder, path, asked.camera)}
+
+
+LOADER = Loader("images", "images/*.png", _find)

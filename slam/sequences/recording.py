@@ -7,26 +7,27 @@ Every kind of data set is opened by a function that returns a ``RecordedSequence
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from erfsfm.readers.numbering import NumberedFiles
-from slam import se3
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray
+from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import too_long
+from slam.sequences.poses import known_poses, rebased
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_FPS = 10.0
 MAX_GAP_S = 10.0
+ScanReader = Callable[[], FloatArray]  # the points (P, 3) of a LiDAR scan, metres, in the LiDAR
 
 
 class ImageSource(Protocol):
@@ -80,7 +81,8 @@ def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
 class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
 
-    ``depth_maps`` are the true depth beside the images, where there is any.
+    ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown; ``reference`` follows from them where
+    all are known. ``depth_maps`` are the true depth beside the images, where there is any.
     """
 
     name: str
@@ -88,11 +90,16 @@ class RecordedSequence:
     intrinsics: Intrinsics
     stamps: FloatArray
     sources: tuple[Source, ...]
-    reference: FloatArray | None = None
+    T_any_camera: FloatArray | None = None
     camera_height_m: float | None = None
     T_camera_lidar: FloatArray | None = None
-    scans: dict[int, Path] = field(default_factory=dict)
+    scans: dict[int, ScanReader] = field(default_factory=dict)
     depth_maps: DepthMaps | None = None
+    reference: FloatArray | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Rebase the poses."""
+        self.reference = self.true_poses(0, len(self))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -109,9 +116,27 @@ class RecordedSequence:
         with sequence_errors():
             return Frame(index, float(self.stamps[index]), self.images.read(index))
 
-    def scan_path(self, index: int) -> Path | None:
-        """The Velodyne ``.bin`` file taken with a frame, or None."""
-        return self.scans.get(index)
+    def has_scan(self, index: int) -> bool:
+        """Whether a LiDAR scan was taken with a frame."""
+        return index in self.scans
+
+    def scan(self, index: int) -> FloatArray:
+        """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR.
+
+        Raises:
+            SequenceError: there is none, or it cannot be read.
+        """
+        if index not in self.scans:
+            raise SequenceError(f"frame {index} of {self.name} has no scan")
+        with sequence_errors():
+            return self.scans[index]()
+
+    def true_poses(self, start: int, stop: int) -> FloatArray | None:
+        """``T_world_camera`` of the frames [start, stop), their first the world; None unless all are known."""
+        poses = self.T_any_camera if self.reference is None else self.reference
+        if poses is None or not known_poses(poses[start:stop]).all():
+            return None
+        return rebased(poses[start:stop])
 
     def true_depth_frames(self) -> list[int]:
         """Frames with a depth map beside their image."""
@@ -143,15 +168,6 @@ def require_frame(name: str, index: int, frames: int) -> None:
         raise SequenceError(f"no frame {index} in sequence {name}: it has frames 0 to {frames - 1}")
 
 
-def rebased(T_any_camera: FloatArray) -> FloatArray:
-    """Poses ``T_world_camera`` ``(N, 4, 4)`` whose world is the first camera; the first is the identity."""
-    T_any_first = T_any_camera[0].copy()
-    T_any_first[:3, :3] = se3.nearest_rotation(T_any_first[:3, :3])
-    T_world_camera: FloatArray = se3.invert(T_any_first) @ T_any_camera
-    T_world_camera[0] = np.eye(4)
-    return T_world_camera
-
-
 def uniform_stamps(frames: int, fps: float) -> FloatArray:
     """Seconds from the first frame at a steady rate ``(frames,)``."""
     return np.arange(frames, dtype=np.float64) / fps
@@ -161,6 +177,19 @@ def fallback_stamps(path: Path, frames: int) -> FloatArray:
     """Uniform stamps in place of a missing file of stamps, with a warning."""
     logger.warning("no %s: %g frames a second are assumed", path, DEFAULT_FPS)
     return uniform_stamps(frames, DEFAULT_FPS)
+
+
+def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
+    """A file with one time in seconds a row, checked by `require_stamps`.
+
+    Raises:
+        SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
+    """
+    try:
+        stamps = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
+    return require_stamps(stamps, path, files)
 
 
 def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> FloatArray:
@@ -202,11 +231,3 @@ def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:
             raise too_long(files, first, last)
     if files.gaps():
         logger.warning("%s: %s; the motion across gaps is interpolated", files.paths[0].parent, files.describe_gaps())
-
-
-def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
-    """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
-    times = np.clip(stamps, known[0], known[-1])
-    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
-    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
-    return se3.make(R, t)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import logging
+import re
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -11,23 +13,40 @@ from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
+from slam.sequences.camera_file import beside, find_camera_file
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles
-from slam.sequences.recording import RecordedSequence, Source, interpolated_poses, rebased, require_stamps
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import describe_unknown, poses_near
+from slam.sequences.recording import RecordedSequence, Source, require_stamps
 from slam.sequences.undistortion import calibrated
 from slam.trajectory import read_trajectory
 
-logger = logging.getLogger(__name__)
-
 INDEX_FILE = "rgb.txt"
-_MAX_GAP_S = 0.1
 _DEPTH_INDEX = "depth.txt"
 _DEPTH_PER_METRE = 5000.0
 _MAX_DEPTH_DELAY_S = 0.02
+_PUBLISHED_NAME = re.compile(r"freiburg(?P<camera>[123])")
 
 
-def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
+def _published(focal: tuple[float, float], centre: tuple[float, float], *distortion: float) -> CameraFile:
+    (fx, fy), (cx, cy) = focal, centre
+    model: Literal["opencv", "pinhole"] = "opencv" if distortion else "pinhole"
+    return CameraFile(width=640, height=480, fx=fx, fy=fy, cx=cx, cy=cy, fps=30.0, model=model, distortion=distortion)
+
+
+# the benchmark's table of its three cameras; images of freiburg3 are undistorted
+_PUBLISHED = {
+    "1": _published((517.3, 516.5), (318.6, 255.3), 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "2": _published((520.9, 521.0), (325.1, 249.7), 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "3": _published((535.4, 539.2), (320.1, 247.6)),
+}
+
+
+def open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     """Open a TUM folder; poses of the ground truth are interpolated.
+
+    Without a ``camera.yaml``, sequences of the benchmark have the published camera by the name of their folder.
 
     Raises:
         SequenceError: if ``rgb.txt`` is malformed or names images that are missing.
@@ -35,6 +54,7 @@ def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
     stamps, paths = _read_index(folder / INDEX_FILE)
     files = NumberedFiles(tuple(paths), tuple(range(len(paths))))
     stored = ImageFiles(files)
+    camera = _camera(folder, stored, asked)
     images, intrinsics = calibrated(stored, camera, str(folder))
     name = folder.absolute().name
     return RecordedSequence(
@@ -43,10 +63,18 @@ def open_tum(folder: Path, camera: CameraFile) -> RecordedSequence:
         intrinsics=intrinsics,
         stamps=require_stamps(stamps, folder / INDEX_FILE, files),
         sources=(Source(f"tum/{name}"),),
-        reference=_reference(folder / "groundtruth.txt", stamps),
+        T_any_camera=_true_poses(folder / "groundtruth.txt", stamps),
         camera_height_m=camera.height_or(None),
         depth_maps=_depth_maps(folder, stamps) if images is stored else None,
     )
+
+
+def _camera(folder: Path, images: ImageFiles, asked: Path | None) -> CameraFile:
+    match = _PUBLISHED_NAME.search(folder.absolute().name)
+    places = (folder, folder.absolute().parent)
+    if match is None or asked is not None or beside(*places) is not None:
+        return find_camera_file(asked, *places, wanted_by=f"TUM folder {folder}", images=images)
+    return _PUBLISHED[match["camera"]]
 
 
 def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
@@ -80,24 +108,20 @@ def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
     return DepthMaps({int(k): paths[nearest[k]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
 
 
-def _reference(path: Path, stamps: FloatArray) -> FloatArray | None:
-    """``T_world_camera`` at the images' stamps, or None where the ground truth does not cover them."""
+def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
+    """``T_any_camera`` at the images' stamps, NaN where the ground truth does not cover them; None without it."""
     if not path.is_file():
         return None
     truth = read_trajectory(path, format="tum")
-    known, T_any_camera = truth.stamps, truth.T_world_camera
-    if len(known) < 2:
-        return None
-    before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
-    gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
-    if (gap > _MAX_GAP_S).any():
-        bad = int(np.argmax(gap > _MAX_GAP_S))
-        logger.warning(
-            "%s has no pose within %g s of image %d (stamp %.6f): the sequence has no reference",
-            path,
-            _MAX_GAP_S,
-            bad,
-            stamps[bad],
-        )
-        return None
-    return rebased(interpolated_poses(T_any_camera, known, stamps))
+    T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps)
+    describe_unknown(T_any_camera, path)
+    return T_any_camera
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    if not (path / INDEX_FILE).is_file():
+        return {}
+    return {path.absolute().name: partial(open_tum, path, asked.camera)}
+
+
+LOADER = Loader("TUM RGB-D", INDEX_FILE, _find)

@@ -32,16 +32,12 @@ class Undistortion:
         """
         self._K = Intrinsics.of(camera.pinhole).K
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
-        self._is_fisheye = camera.model == "fisheye"
+        self._model = camera.model
         zoom = self._shortest_zoom(camera.width, camera.height)
         self.intrinsics = Intrinsics(
             camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
         )
-        build = cv2.fisheye.initUndistortRectifyMap if self._is_fisheye else cv2.initUndistortRectifyMap
-        size = (camera.width, camera.height)
-        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] = build(
-            self._K, self._coefficients, np.eye(3), self.intrinsics.K, size, cv2.CV_32FC1
-        )
+        self._maps = self._look_up()
 
     def apply(self, image: Image) -> Image:
         """Undistort an image ``(H, W, 3)``."""
@@ -51,13 +47,34 @@ class Undistortion:
     def distort(self, pixels: FloatArray, K: FloatArray) -> FloatArray:
         """Distorted pixels of the ``pixels`` ``(N, 2)`` of a pinhole ``K`` ``(3, 3)``."""
         rays = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
-        if self._is_fisheye:
+        if self._model == "fov":
+            distorted = self._bend(rays) * self._K[[0, 1], [0, 1]] + self._K[:2, 2]
+        elif self._model == "fisheye":
             distorted = cv2.fisheye.distortPoints(rays[:, None], self._K, self._coefficients)
         else:
             points = np.column_stack([rays, np.ones(len(rays))])
             distorted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self._K, self._coefficients)
         seen: FloatArray = np.asarray(distorted, dtype=np.float64).reshape(-1, 2)
         return seen
+
+    def _bend(self, rays: FloatArray) -> FloatArray:
+        """The FOV lens (Devernay and Faugeras 2001): radii in the image grow with the angle of a ray."""
+        (angle,) = self._coefficients
+        radius = np.linalg.norm(rays, axis=1, keepdims=True)
+        bent = np.arctan(2 * radius * np.tan(angle / 2)) / angle
+        return np.asarray(rays * bent / np.maximum(radius, 1e-12))
+
+    def _look_up(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The distorted u and v ``(H, W)`` of each pixel of the pinhole image."""
+        camera = self.intrinsics
+        size = (camera.width, camera.height)
+        if self._model == "fov":
+            seen = self.distort(camera.pixel_grid().reshape(-1, 2), camera.K).astype(np.float32)
+            u, v = np.moveaxis(seen.reshape(camera.height, camera.width, 2), -1, 0)
+            return np.ascontiguousarray(u), np.ascontiguousarray(v)
+        build = cv2.fisheye.initUndistortRectifyMap if self._model == "fisheye" else cv2.initUndistortRectifyMap
+        u, v = build(self._K, self._coefficients, np.eye(3), camera.K, size, cv2.CV_32FC1)
+        return u, v
 
     def _shortest_zoom(self, width: int, height: int) -> float:
         """Zoom out from the centre until the border of the pinhole image meets that of the lens's image."""

@@ -74,6 +74,8 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         r"--config lite0-gpu ",
         "it wants hours of labels, and a GPU; tests/erfsfm/training/test_pack.py packs small data",
     ),
+    (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),
+    (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/calibration renders them"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
 if importlib.util.find_spec("onnxruntime") is None:

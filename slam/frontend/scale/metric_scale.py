@@ -78,7 +78,7 @@ def find_scale(
     lengths: LengthConfig,
     lidar: LidarConfig,
 ) -> Scale:
-    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference)."""
+    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps)."""
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in measured.lidar_steps}
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":

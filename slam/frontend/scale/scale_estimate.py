@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.config import ScaleConfig, ScaleMode
+from slam.errors import SlamError
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.robust import mad_sigma
@@ -26,11 +27,13 @@ class ScaleEstimate:
     frames_used: int
 
 
-def resolve_mode(config: ScaleConfig, camera_height_m: float | None) -> ScaleMode:
-    """The mode, with ``auto`` resolved: camera-height where the height is known, else none."""
+def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bool = False) -> ScaleMode:
+    """The mode, with ``auto`` resolved: camera-height where the height is known, else gps where there is, else none."""
     if config.mode != "auto":
         return config.mode
-    return "none" if camera_height_m is None else "camera-height"
+    if camera_height_m is not None:
+        return "camera-height"
+    return "gps" if has_gps else "none"
 
 
 def scale_from_road(
@@ -56,6 +59,44 @@ def scale_from_reference(
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
     return ScaleEstimate(value, spread, len(estimated) + 1)
+
+
+def known_frames(config: ScaleConfig, stamps: FloatArray) -> tuple[int, int]:
+    """The two frames of mode known, at the frames' ``stamps`` ``(N,)``.
+
+    Raises:
+        SlamError: a frame or stamp outside the drive, or twice the same frame.
+    """
+    found = []
+    for end in config.known_between or ():
+        if isinstance(end, int):
+            index, inside = end, end < len(stamps)
+        else:
+            stamp = float(end.removesuffix("s"))
+            index, inside = int(np.abs(stamps - stamp).argmin()), bool(stamps[0] <= stamp <= stamps[-1])
+        if not inside:
+            raise SlamError(
+                f"scale.known_between names {end}, but the drive has frames 0 to {len(stamps) - 1} "
+                f"at {stamps[0]:.3f} to {stamps[-1]:.3f} s: choose two of these"
+            )
+        found.append(index)
+    first, second = found
+    if first == second:
+        raise SlamError(
+            f"scale.known_between names frame {first} twice: choose two frames with a distance between them"
+        )
+    return first, second
+
+
+def scale_from_distance(
+    T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
+) -> ScaleEstimate | MeasurementFailure:
+    """The known distance of two frames over their estimated distance; raises as `known_frames`."""
+    first, second = known_frames(config, stamps)
+    apart = np.linalg.norm(T_world_camera_unscaled[second, :3, 3] - T_world_camera_unscaled[first, :3, 3])
+    if config.known_m is None or not apart > 0:
+        return MeasurementFailure(f"the camera does not move between frames {first} and {second}")
+    return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
 def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:

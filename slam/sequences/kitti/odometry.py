@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,33 +13,34 @@ import numpy as np
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.images import list_images
 from erfsfm.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CALIBRATION, CalibrationFile
-from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, odometry_camera
+from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_odometry_root, odometry_camera
 from erfsfm.readers.numbering import NumberedFiles, by_number
+from erfsfm.readers.scan import read_velodyne
 from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import beside
+from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti.calibration import moved_to_camera
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     ImageSource,
     RecordedSequence,
     Source,
     fallback_stamps,
-    interpolated_poses,
-    rebased,
+    read_stamps,
     require_short_gaps,
-    require_stamps,
 )
 from slam.sequences.undistortion import calibrated
 from slam.trajectory import read_trajectory
 
 
-def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None) -> RecordedSequence:
+def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:
     """Open one sequence of an odometry root.
 
-    ``camera``, where given, replaces the root's calibration and camera height.
+    The camera that was ``asked`` for, if any, replaces the root's calibration and camera height.
 
     Raises:
         SequenceError, DataError: if images, ``calib.txt``, ``times.txt`` or the poses are missing or do not match.
@@ -54,6 +56,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
     calibration = CalibrationFile(folder / ODOMETRY_CALIBRATION)
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
     images: ImageSource = stored
+    camera = None if asked is None else explicit_camera(asked, stored)
     if camera is None:
         intrinsics = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
     else:
@@ -65,10 +68,10 @@ def open_kitti_odometry(root: OdometryRoot, name: str, camera: CameraFile | None
         intrinsics=intrinsics,
         stamps=stamps,
         sources=(_source(root, name, files.first),),
-        reference=_reference(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
+        T_any_camera=_true_poses(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
         camera_height_m=_camera_height(root, camera),
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
-        scans={int(path.stem) - files.first: path for path in scans},
+        scans={int(path.stem) - files.first: partial(read_velodyne, path) for path in scans},
         depth_maps=depth_maps_in(folder / f"depth_{number}", files) if images is stored else None,
     )
 
@@ -82,14 +85,10 @@ def _no_images(folder: Path) -> str:
 def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
     if not path.is_file():
         return fallback_stamps(path, len(files))
-    try:
-        stamps = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
-    return require_stamps(stamps, path, files)
+    return read_stamps(path, files)
 
 
-def _reference(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_cam0: FloatArray) -> FloatArray | None:
+def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_cam0: FloatArray) -> FloatArray | None:
     """Poses of the camera in use from poses of camera 0; None where the root has no poses."""
     if not path.is_file():
         return None
@@ -104,7 +103,7 @@ def _reference(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_ca
     T_world_camera = moved_to_camera(T_world_cam0[skipped:], T_camera_cam0)
     if len(rows) < len(files):
         T_world_camera = interpolated_poses(T_world_camera, stamps[rows], stamps)
-    return rebased(T_world_camera)
+    return T_world_camera
 
 
 def _camera_height(root: OdometryRoot, camera: CameraFile | None) -> float | None:
@@ -125,3 +124,21 @@ def _T_camera_lidar(calibration: CalibrationFile, T_camera_cam0: FloatArray) -> 
 def _source(root: OdometryRoot, name: str, first: int) -> Source:
     simulated = root.simulation_seed() is not None
     return Source(root.recording_name(name), first=None if simulated else first)
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    """The sequences of a root, or the one whose own folder is given."""
+    root = find_odometry_root(path)
+    if root is not None:
+        names = root.names()
+        if asked.name is not None and asked.name not in names and (root.sequences / asked.name).is_dir():
+            names.append(asked.name)  # for the error about what it lacks
+        return {name: partial(open_kitti_odometry, root, name, asked.camera) for name in names}
+    where = path.absolute()
+    above = find_odometry_root(where.parent) if where.parent.name == "sequences" else None
+    if above is None or odometry_camera(path) is None:
+        return {}
+    return {where.name: partial(open_kitti_odometry, above, where.name, asked.camera)}
+
+
+LOADER = Loader("KITTI odometry", "sequences/NN/image_2", _find)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +11,26 @@ import numpy as np
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.images import has_images, list_images
 from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CAMERA_HEIGHT_M, IMU_TO_VELO, VELO_TO_CAM, CalibrationFile
-from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name
+from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name, find_drives
 from erfsfm.readers.kitti_oxts import read_packet
 from erfsfm.readers.numbering import NumberedFiles, by_number
+from erfsfm.readers.scan import read_velodyne
 from slam import se3
 from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import beside
+from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
 from slam.sequences.kitti.calibration import moved_to_camera
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
     ImageSource,
     RecordedSequence,
     Source,
     fallback_stamps,
-    interpolated_poses,
-    rebased,
     require_short_gaps,
     require_stamps,
 )
@@ -40,10 +42,10 @@ _DEPTH_MAPS = "proj_depth/groundtruth"  # of KITTI's depth benchmark
 _EPOCH = np.datetime64("2011-01-01", "ns")
 
 
-def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
+def open_kitti_raw(drive: Path, asked: Path | None) -> RecordedSequence:
     """Open one synced and rectified drive.
 
-    The calibration is scaled to the images' true size. ``camera``, where given, replaces it.
+    The calibration is scaled to the images' true size. The camera that was ``asked`` for, if any, replaces it.
 
     Raises:
         SequenceError, DataError: if images, calibration or stamps are missing or do not match.
@@ -58,6 +60,7 @@ def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
     images: ImageSource = stored
     cameras = CalibrationFile(drive.parent / CAM_TO_CAM)
     intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, images.width, images.height))
+    camera = None if asked is None else explicit_camera(asked, stored)
     if camera is not None:
         images, intrinsics = calibrated(images, camera, str(drive))
     times_path = drive / f"image_{number}" / "timestamps.txt"
@@ -73,10 +76,10 @@ def open_kitti_raw(drive: Path, camera: CameraFile | None) -> RecordedSequence:
         intrinsics=intrinsics,
         stamps=stamps,
         sources=tuple(source.shifted(files.first) for source in drive_sources(name)),
-        reference=_reference(drive, files, stamps, image_times, T_camera_lidar),
+        T_any_camera=_true_poses(drive, files, stamps, image_times, T_camera_lidar),
         camera_height_m=_camera_height(drive, camera),
         T_camera_lidar=T_camera_lidar,
-        scans={int(path.stem) - files.first: path for path in scans},
+        scans={int(path.stem) - files.first: partial(read_velodyne, path) for path in scans},
         depth_maps=depth_maps_in(drive / _DEPTH_MAPS / f"image_{number}", files) if images is stored else None,
     )
 
@@ -113,7 +116,7 @@ def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> Float
     return T_camera_lidar
 
 
-def _reference(
+def _true_poses(
     drive: Path,
     files: NumberedFiles,
     stamps: FloatArray,
@@ -146,10 +149,17 @@ def _reference(
     T_world_camera = moved_to_camera(oxts.T_world_imu(content, ages_s), T_camera_imu)
     if len(known) < len(files):
         T_world_camera = interpolated_poses(T_world_camera, stamps[known], stamps)
-    return rebased(T_world_camera)
+    return T_world_camera
 
 
 def _camera_height(drive: Path, camera: CameraFile | None) -> float | None:
     """By a camera file, given or in the drive, its date or the root; 1.65 m by default."""
     camera = camera or beside(drive, drive.parent, drive.parent.parent)
     return CAMERA_HEIGHT_M if camera is None else camera.height_or(CAMERA_HEIGHT_M)
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    return {name: partial(open_kitti_raw, drive, asked.camera) for name, drive in find_drives(path).items()}
+
+
+LOADER = Loader("KITTI raw", "DATE_drive_NNNN_sync", _find)

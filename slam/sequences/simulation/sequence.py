@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 
 import numpy as np
 
+from slam.errors import SequenceError
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray
-from slam.sequences.recording import Source, labels, rebased, require_frame, uniform_stamps
+from slam.sequences.poses import rebased
+from slam.sequences.recording import Source, labels, require_frame, uniform_stamps
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 FPS = 10.0
@@ -45,9 +46,17 @@ class SimulatedSequence:
         require_frame(self.name, index, len(self))
         return Frame(index, float(self.stamps[index]), self._cached(index).copy())
 
-    def scan_path(self, index: int) -> Path | None:
-        """None: scans are not on disk; ``street.scan(index)`` gives them."""
-        return None
+    def has_scan(self, index: int) -> bool:
+        """False: ``street.scan(index)`` gives scans, which are no part of the recording."""
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        """Always ``SequenceError``: see `has_scan`."""
+        raise SequenceError(f"frame {index} of {self.name} has no scan")
+
+    def true_poses(self, start: int, stop: int) -> FloatArray | None:
+        """``T_world_camera`` of the frames [start, stop), their first the world."""
+        return None if self.reference is None else rebased(self.reference[start:stop])
 
     def true_depth_frames(self) -> range:
         """All frames."""

@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from erfsfm.errors import DataError
+from erfsfm.readers.scan import read_velodyne
 from slam.config import LidarConfig
-from slam.errors import SlamError
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
@@ -23,8 +24,11 @@ class Scanned:
     def __len__(self) -> int:
         return FRAMES
 
-    def scan_path(self, index: int) -> Path | None:
-        return self.paths.get(index)
+    def has_scan(self, index: int) -> bool:
+        return index in self.paths
+
+    def scan(self, index: int) -> np.ndarray:
+        return read_velodyne(self.paths[index])
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +76,7 @@ def test_a_scan_cut_short_is_named(street, tmp_path):
     sequence = Scanned(street.T_camera_lidar, {k: tmp_path / f"{k}.bin" for k in range(2)})
     for path in sequence.paths.values():
         path.write_bytes(b"12345")
-    with pytest.raises(SlamError, match=r"0\.bin is no Velodyne scan.*; got [45] bytes"):
+    with pytest.raises(DataError, match=r"0\.bin is no Velodyne scan.*; got [45] bytes"):
         lidar_path(sequence)
 
 

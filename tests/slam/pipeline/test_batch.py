@@ -57,8 +57,11 @@ class LevelRoad:
         self.frames_read += 1
         return Frame(index, float(self.stamps[index]), self._image)
 
-    def scan_path(self, index: int) -> Path | None:
-        return None
+    def has_scan(self, index: int) -> bool:
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        raise AssertionError("no scans")
 
     def provenance(self) -> tuple[str, ...]:
         return ()

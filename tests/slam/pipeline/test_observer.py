@@ -25,6 +25,7 @@ from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.timing import Stopwatch
+from slam.se3 import FloatArray
 from slam.sequences.simulation.sequence import SimulatedSequence
 from slam.sequences.simulation.street import SimulationOptions
 
@@ -85,8 +86,11 @@ class Damaged:
     def frame(self, index: int) -> Frame:
         return (self._damage if index in self._bad else SimulatedSequence.frame)(self._sequence, index)
 
-    def scan_path(self, index: int) -> Path | None:
-        return None
+    def has_scan(self, index: int) -> bool:
+        return False
+
+    def scan(self, index: int) -> FloatArray:
+        raise AssertionError("no scans")
 
     def provenance(self) -> tuple[str, ...]:
         return ()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slam.errors import RunError
 from slam.evaluation.drift import aligned, segment_drifts
 from slam.results.folder import RunFolder
+from slam.results.map_picture import AerialView
 from slam.results.plots import (
     depth_figure,
     drift_figure,
@@ -172,18 +173,11 @@ def test_depth_without_a_single_value_still_draws() -> None:
     drawn(depth_figure([image], [depth], ["frame 0"]))
 
 
-def test_map_figure_is_thinned_clipped_and_ordered_by_height(make_run: MakeRun) -> None:
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(5000, 3)) * [20.0, 1.0, 20.0]
-    points[0] = [1e6, 0.0, 1e6]
-    points[1] = [np.nan, 0.0, 0.0]
-    figure = map_figure(points, rng.random((5000, 3)), make_run().trajectory("optimised"), most=2000)
+def test_map_figure_shows_the_picture_at_its_place_with_the_drive_over_it(make_run: MakeRun) -> None:
+    image = np.zeros((30, 40, 4), dtype=np.uint8)
+    image[:15] = [255, 0, 0, 255]
+    figure = map_figure(AerialView(image, (-60.0, 140.0), (-20.0, 130.0)), make_run().trajectory("optimised"))
     (axes,) = figure.axes
-    assert len(axes.collections[0].get_offsets()) <= 2000
-    assert axes.get_xlim()[1] < 1000.0
+    assert axes.get_xlim() == (-60.0, 140.0) and axes.get_ylim() == (-20.0, 130.0)
+    assert axes.lines[-1].get_zorder() > axes.images[0].get_zorder()
     assert not is_blank(drawn(figure))
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_tiny_map_does_not_break_the_figure(count: int) -> None:
-    drawn(map_figure(np.ones((count, 3)), np.ones((count, 3))))

@@ -39,7 +39,7 @@ def test_two_ranges_are_the_whole(whole: Sequence, parts: tuple[Sequence, Sequen
     frame = joined.frame(11)
     assert (frame.index, frame.stamp) == (11, whole.stamps[11])
     np.testing.assert_array_equal(frame.image, whole.frame(11).image)
-    assert joined.scan_path(11) is None and set(joined.provenance()) == set(whole.provenance())
+    assert not joined.has_scan(11) and set(joined.provenance()) == set(whole.provenance())
 
 
 def test_earlier_frames_are_not_kept(parts: tuple[Sequence, Sequence]) -> None:

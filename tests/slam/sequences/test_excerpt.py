@@ -6,7 +6,8 @@ import pytest
 from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt, frame_range
-from slam.sequences.recording import Source, rebased
+from slam.sequences.poses import rebased
+from slam.sequences.recording import Source
 
 
 @pytest.mark.parametrize(

@@ -55,16 +55,14 @@ def test_raw_drive_goes_forward_and_smoothly(data_root: Path) -> None:
     assert (t[:, 2] / np.linalg.norm(t, axis=1) > 0.995).all()
     speed = np.linalg.norm(t, axis=1) / np.diff(sequence.stamps)
     assert np.abs(np.diff(speed)).max() < 0.5  # m/s from one frame to the next
-    assert sequence.scan_path(47) is not None and sequence.scan_path(48) is None
+    assert sequence.has_scan(47) and not sequence.has_scan(48)
 
 
 def test_lidar_lands_on_the_image(data_root: Path) -> None:
     """Road points in front of the car project below the horizon, at the camera's height."""
     sequence = open_sequence(data_root / "kitti_raw", None, None, None)
-    path = sequence.scan_path(0)
-    assert path is not None and sequence.T_camera_lidar is not None
-    points_lidar = np.fromfile(path, np.float32).reshape(-1, 4)[:, :3].astype(np.float64)
-    points = se3.apply(sequence.T_camera_lidar, points_lidar)
+    assert sequence.T_camera_lidar is not None
+    points = se3.apply(sequence.T_camera_lidar, sequence.scan(0))
     road = points[(np.abs(points[:, 0]) < 2) & (points[:, 2] > 6) & (points[:, 2] < 12)]
     assert np.median(road[:, 1]) == pytest.approx(1.65, abs=0.15)
 

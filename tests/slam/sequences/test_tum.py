@@ -35,7 +35,7 @@ def test_opens(folder: Path) -> None:
     assert sequence.stamps.tolist() == STAMPS
     assert sequence.frame(2).image[0, 0, 0] == 20
     assert sequence.provenance() == ("tum/freiburg[0:3]",)
-    assert sequence.camera_height_m is None and sequence.scan_path(0) is None
+    assert sequence.camera_height_m is None and not sequence.has_scan(0)
 
 
 def test_truth_is_interpolated(folder: Path) -> None:

@@ -1,10 +1,16 @@
+import struct
+from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.readers import video as reader
+from erfsfm.readers.video import VideoFrames
 from slam.errors import SequenceError
+from slam.sequences import video
 from slam.sequences.catalogue import open_sequence
 
 
@@ -48,3 +54,76 @@ def test_errors(tmp_path: Path, camera_64: str, camera_yaml: str) -> None:
     path.write_bytes(b"not a video")
     with pytest.raises(SequenceError, match=r"drive\.avi cannot be opened"):
         open_sequence(path, None, None, None)
+
+
+def write_mp4(path: Path, times: list[int], rate: int = 30, rotated: bool = False) -> Path:
+    """Grey frames of 64x48 shown at ``times``, in units of 1/600 s; the left half of each is white."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=rate, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 600)
+        for time in times:
+            picture = np.full((48, 64, 3), 90, np.uint8)
+            picture[:, :32] = 255
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 600)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    if rotated:
+        turned = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 48 << 16, 0, 1 << 30)
+        straight = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+        data = path.read_bytes()
+        header = data.index(b"tkhd")
+        assert straight in data[header:]
+        path.write_bytes(data[:header] + data[header:].replace(straight, turned, 1))
+    return path
+
+
+UNEVEN = [0, 20, 40, 100, 120, 140, 160, 220, 240, 260]
+
+
+def test_uneven_frame_times_are_used(tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_mp4(tmp_path / "phone.mp4", UNEVEN)
+    camera = tmp_path / "camera.yaml"
+    camera.write_text(camera_64.replace("fps: 5", "fps: 20"))
+    assert open_sequence(path).stamps == pytest.approx(np.array(UNEVEN) / 600)
+    camera.write_text(camera_64)
+    assert open_sequence(path).stamps == pytest.approx(np.arange(10) / 5)
+    assert "has uneven frame times at 20.77 frames a second, the camera has 5: taken as even" in caplog.text
+
+
+def test_a_field_of_view_takes_the_rate_of_the_video(tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "phone.mp4", [24 * k for k in range(8)])
+    sequence = open_sequence(path, camera=Path("fov=90"))
+    assert sequence.intrinsics.fx == pytest.approx(32)
+    assert sequence.stamps == pytest.approx(np.arange(8) / 25)
+
+
+def test_times_of_a_long_video_are_read_from_its_packets(tmp_path: Path) -> None:
+    frames = VideoFrames(write_mp4(tmp_path / "long.mp4", UNEVEN), counted_frames=4)
+    assert frames.times_s() == pytest.approx(np.array(UNEVEN) / 600)
+
+
+def test_a_long_video_without_pyav_is_taken_as_even(
+    tmp_path: Path, camera_64: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_mp4(tmp_path / "long.mp4", UNEVEN)
+    (tmp_path / "camera.yaml").write_text(camera_64)
+
+    def absent(name: str) -> None:
+        raise ImportError(f"No module named {name}")
+
+    monkeypatch.setattr(reader.importlib, "import_module", absent)
+    monkeypatch.setattr(video, "VideoFrames", partial(VideoFrames, counted_frames=4))
+    assert open_sequence(path).stamps == pytest.approx(np.arange(10) / 5)
+    assert "erfsfm-slam[video]'; its frames are taken as even" in caplog.text
+
+
+def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:
+    """A phone held upright stores lying images and a flag: 90 degrees, so that left becomes top."""
+    path = write_mp4(tmp_path / "upright.mp4", [20 * k for k in range(4)], rotated=True)
+    sequence = open_sequence(path, camera=Path("fov=60"))
+    assert (sequence.intrinsics.width, sequence.intrinsics.height) == (48, 64)
+    image = sequence.frame(2).image
+    assert image[:28].mean() > 200 and image[36:].mean() < 130

@@ -59,10 +59,12 @@ def test_colour_is_preferred_to_grey(tmp_path: Path, odometry) -> None:
 def test_scans(tmp_path: Path, odometry) -> None:
     folder = odometry(tmp_path)
     (folder / "velodyne").mkdir()
-    (folder / "velodyne" / "000002.bin").write_bytes(b"")
+    (folder / "velodyne" / "000002.bin").write_bytes(np.array([7, 8, 9, 1], np.float32).tobytes())
     sequence = open_sequence(tmp_path, "00", None, "1:4")
-    assert sequence.scan_path(1) == folder / "velodyne" / "000002.bin"
-    assert sequence.scan_path(0) is None
+    assert sequence.has_scan(1) and not sequence.has_scan(0)
+    assert sequence.scan(1).tolist() == [[7, 8, 9]]
+    with pytest.raises(SequenceError, match="frame 1 of 00 has no scan"):
+        sequence.scan(0)
 
 
 def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture) -> None:
@@ -171,7 +173,7 @@ def gap(tmp_path: Path, odometry) -> Path:
     for number in (0, 3, 4, 8):
         (folder / f"image_2/{number:06d}.png").unlink()
     (folder / "velodyne").mkdir()
-    (folder / "velodyne/000005.bin").write_bytes(b"")
+    (folder / "velodyne/000005.bin").write_bytes(np.array([7, 8, 9, 1], np.float32).tobytes())
     return folder
 
 
@@ -197,7 +199,7 @@ def test_missing_numbers_are_missing_frames(
     assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(9), [0, 0, 1]), abs=1e-9)
     assert [sequence.frame(row).image[0, 0, 0] for row in (0, 1, 4, 8)] == [10, 20, 50, 90]
     assert sequence.provenance() == ("kitti_odometry/00[1:10]",)
-    assert sequence.scan_path(4) == gap / "velodyne/000005.bin"
+    assert sequence.scan(4).tolist() == [[7, 8, 9]]
     with pytest.raises(MissingFrameError, match=r"no image 000008\.png in .*image_2"):
         sequence.frame(7)
     said = [record.getMessage() for record in caplog.records if "no image" in record.getMessage()]

@@ -18,7 +18,7 @@ def test_is_a_sequence(sequence: SimulatedSequence) -> None:
     assert sequence.reference is not None and np.array_equal(sequence.reference[0], np.eye(4))
     assert sequence.reference[5, 2, 3] > 2.0  # forward is z
     assert sequence.camera_height_m == pytest.approx(sequence.street.camera_height_m)
-    assert sequence.scan_path(0) is None
+    assert not sequence.has_scan(0)
 
 
 def test_frames_are_those_of_the_street(sequence: SimulatedSequence) -> None:

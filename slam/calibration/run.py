@@ -1,0 +1,103 @@
+"""A calibration from start to end: images in, ``camera.yaml`` and a picture of the fit out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from erfsfm.errors import DataError
+from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.folder import image_folder
+from erfsfm.readers.images import list_images
+from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.readers.video import VideoFrames
+from slam.calibration.board import Board
+from slam.calibration.picture import write_picture
+from slam.calibration.solve import Calibration, Model, calibrate
+from slam.calibration.views import Progress, chosen, find_views
+from slam.errors import CalibrationError, sequence_errors
+from slam.sequences.camera_file import DEFAULT_FPS
+from slam.sequences.images import ImageFiles
+from slam.sequences.recording import ImageSource
+from slam.sequences.undistortion import Undistortion
+from slam.storage.files import write_atomically
+
+
+@dataclass(frozen=True)
+class CalibrationFiles:
+    """What a calibration wrote, and the fit."""
+
+    fit: Calibration
+    camera: CameraFile
+    camera_file: Path
+    picture: Path
+
+
+@sequence_errors()
+def calibrate_camera(
+    recording: Path, board: Board, model: Model, output: Path, fps: float | None, progress: Progress
+) -> CalibrationFiles:
+    """Calibrate a camera from a video or a folder of images of a board.
+
+    Args:
+        recording: a video, or a folder of images of one size.
+        board: the board.
+        model: of the lens.
+        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``.
+        fps: to write; None for the rate of the video, or 10.
+        progress: called with (stage, done, total).
+
+    Raises:
+        CalibrationError: the images do not give a camera; nothing is written.
+        SequenceError: the images cannot be read.
+    """
+    if output.suffix not in (".yaml", ".yml"):
+        raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+    images, own_fps = _open(recording)
+    views = chosen(find_views(images, board, progress))
+    fit = calibrate(views, images.width, images.height, model)
+    source = (
+        f"erfsfm-slam calibrate: {len(fit.views)} views of a {board.describe()}, reprojection error "
+        f"{fit.error_px:.3f} pixels"
+    )
+    camera = CameraFile(
+        width=fit.width,
+        height=fit.height,
+        fx=_rounded(fit.K[0, 0]),
+        fy=_rounded(fit.K[1, 1]),
+        cx=_rounded(fit.K[0, 2]),
+        cy=_rounded(fit.K[1, 2]),
+        fps=fps or _rounded(own_fps or DEFAULT_FPS),
+        camera_height_m="unknown",
+        model=model,
+        distortion=tuple(_rounded(value) for value in fit.distortion),
+        source=source,
+    )
+    Undistortion(camera)  # refuses a lens that cannot be undistorted
+    picture = output.with_suffix(".png")
+    text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
+    write_picture(picture, fit, camera, images)
+    write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
+    return CalibrationFiles(fit, camera, output, picture)
+
+
+def _open(recording: Path) -> tuple[ImageSource, float | None]:
+    """The images, and their rate where they are a video."""
+    if not recording.exists():
+        raise DataError(f"no video or folder at {recording}: check the path")
+    if recording.is_file():
+        video = VideoFrames(recording)
+        return video, video.fps
+    folder = image_folder(recording)
+    if folder is None:
+        raise DataError(f"no images in {recording}: give a folder of png, jpg or bmp images, or a video")
+    paths = tuple(list_images(folder))
+    return ImageFiles(NumberedFiles(paths, tuple(range(len(paths))))), None
+
+
+def _rounded(value: float) -> float:
+    """Six digits: far below what a calibration determines."""
+    return float(np.format_float_positional(value, precision=6, fractional=False))

@@ -1,0 +1,126 @@
+"""GPS beside the camera: where its axes east, north, up lie, the scale by it, and positions for the graph.
+
+Fixes of a receiver share most of their error for seconds to minutes. So their sigmas are widened as if only one fix in
+``correlation_s`` were independent.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam import se3
+from slam.config import GpsConfig, ScaleConfig
+from slam.frames import MeasuredPosition
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.geodesy import GpsTrack, LocalFrame
+from slam.robust import mad_sigma
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+_LEAST_FIXES = 3
+_CHORDS = 10  # the path is divided into about so many chords to compare lengths
+_LEAST_MOTION_SIGMAS = 5.0
+_UP_SIGMA = 0.2  # radians between the camera's own up and that of the earth
+_ROUNDS = 30
+_HUBER_K = 1.345
+
+
+@dataclass(frozen=True)
+class GpsFixes:
+    """The fixes taken during a drive.
+
+    Attributes:
+        stamps: seconds ``(M,)`` on the clock of the images.
+        points: east, north, up of the antenna ``(M, 3)``, metres.
+        sigmas: of single fixes ``(M, 3)``, metres.
+        widening: factor on the sigmas for a graph, which takes errors as independent.
+        lever_arm: the antenna ``(3,)`` in the camera, metres.
+        frame: where east, north, up begin.
+    """
+
+    stamps: FloatArray
+    points: FloatArray
+    sigmas: FloatArray
+    widening: float
+    lever_arm: FloatArray
+    frame: LocalFrame
+
+    def antenna(self, T_any_camera: FloatArray, stamps: FloatArray) -> FloatArray:
+        """Positions of the antenna ``(M, 3)`` at the fixes, from camera poses ``(N, 4, 4)`` at ``stamps`` ``(N,)``."""
+        positions = antenna_positions(T_any_camera, self.lever_arm)
+        return np.column_stack([np.interp(self.stamps, stamps, positions[:, axis]) for axis in range(3)])
+
+
+def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes | MeasurementFailure:
+    """The fixes of a track between the first and the last of the frames' ``stamps`` ``(N,)``."""
+    shifted = track.stamps + config.offset_s
+    inside = (shifted >= stamps[0]) & (shifted <= stamps[-1])
+    if inside.sum() < _LEAST_FIXES:
+        return MeasurementFailure(
+            f"{int(inside.sum())} GPS fixes lie between the first and the last frame: the track has stamps from "
+            f"{shifted[0]:.1f} to {shifted[-1]:.1f} s, the frames from {stamps[0]:.1f} to {stamps[-1]:.1f} s: set "
+            "gps.offset_s, or give the track of this drive"
+        )
+    times, dilution = shifted[inside], track.dilution[inside]
+    frame = LocalFrame(track.places[inside][0])
+    sigmas = np.array([config.sigma_m, config.sigma_m, config.vertical_sigma_m]) * dilution[:, None]
+    widening = float(np.sqrt(max(config.correlation_s / float(np.median(np.diff(times))), 1.0)))
+    points = frame.points(track.places[inside])
+    return GpsFixes(times, points, sigmas, widening, np.array(config.lever_arm_m), frame)
+
+
+def scale_by_gps(
+    fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
+) -> ScaleEstimate | MeasurementFailure:
+    """Chords by GPS over those of the estimate: the median, so that drift and outliers count little."""
+    estimated = fixes.antenna(T_world_camera_unscaled, stamps)
+    span = max(len(estimated) // _CHORDS, 1)
+    by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))
+    usable = (by_camera > 0) & (by_gps > _LEAST_MOTION_SIGMAS * np.median(fixes.sigmas[:, 0]))
+    if usable.sum() < config.min_frames:
+        return MeasurementFailure("the camera moves too little between GPS fixes to measure a scale")
+    ratios = by_gps[usable] / by_camera[usable]
+    value = float(np.median(ratios))
+    return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
+
+
+def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> FloatArray | MeasurementFailure:
+    """``T_enu_world`` ``(4, 4)`` by the fixes, robustly; about a straight path by the camera's own up."""
+    camera = fixes.antenna(T_world_camera, stamps)
+    sigma = fixes.sigmas * fixes.widening
+    if np.ptp(fixes.points[:, :2], axis=0).max() < _LEAST_MOTION_SIGMAS * np.median(sigma[:, 0]):
+        return MeasurementFailure("the camera moves too little for GPS to tell its heading")
+    up_world = -T_world_camera[:, :3, 1].mean(axis=0)
+    by_up = np.outer([0.0, 0.0, 1.0], up_world) / _UP_SIGMA**2
+    precision = 1.0 / (sigma**2).mean(axis=1)
+    weights = precision
+    for _ in range(_ROUNDS):
+        share = (weights / weights.sum())[:, None]
+        mean_enu, mean_world = (share * fixes.points).sum(axis=0), (share * camera).sum(axis=0)
+        spread = (fixes.points - mean_enu).T @ (weights[:, None] * (camera - mean_world))
+        R_enu_world = se3.nearest_rotation(spread + by_up)
+        T_enu_world = se3.make(R_enu_world, mean_enu - R_enu_world @ mean_world)
+        whitened = np.linalg.norm((se3.apply(T_enu_world, camera) - fixes.points) / sigma, axis=1)
+        weights = precision * np.minimum(1.0, _HUBER_K / np.maximum(whitened, 1e-9))
+    return T_enu_world
+
+
+def positions_at_frames(
+    fixes: GpsFixes, T_enu_world: FloatArray, T_world_camera: FloatArray, stamps: FloatArray
+) -> list[MeasuredPosition]:
+    """Every fix at the frame nearest in time, moved there by the camera's own motion."""
+    frames = np.abs(stamps[None, :] - fixes.stamps[:, None]).argmin(axis=1)
+    T_enu_camera = T_enu_world @ T_world_camera
+    moved = antenna_positions(T_enu_camera, fixes.lever_arm)[frames] - fixes.antenna(T_enu_camera, stamps)
+    rows = zip(frames.tolist(), fixes.points + moved, fixes.widening * fixes.sigmas, strict=True)
+    return [MeasuredPosition(index, point, sigmas, fixes.lever_arm) for index, point, sigmas in rows]
+
+
+def antenna_positions(T_any_camera: FloatArray, lever_arm: FloatArray) -> FloatArray:
+    """Positions ``(N, 3)`` of a point fixed to the camera, from its poses ``(N, 4, 4)``."""
+    return np.asarray(T_any_camera[:, :3, :3] @ lever_arm + T_any_camera[:, :3, 3])

@@ -1,0 +1,64 @@
+"""A drive on the earth, by its GPS track."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from slam.config import GpsConfig, ScaleConfig, ScaleMode
+from slam.errors import SlamError
+from slam.frontend import gps
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.geodesy import GpsTrack
+from slam.pose_graph import PoseGraph
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Location:
+    """The fixes of a drive, and ``T_enu_world`` ``(4, 4)``: the world in axes east, north, up."""
+
+    fixes: gps.GpsFixes
+    T_enu_world: FloatArray
+
+
+class Positioning:
+    """The GPS track of one drive; ``stamps`` ``(N,)`` are those of its frames."""
+
+    def __init__(self, track: GpsTrack, stamps: FloatArray, config: GpsConfig, mode: ScaleMode) -> None:
+        """Match a track to a drive.
+
+        Raises:
+            SlamError: lengths are not in metres, or fewer than three fixes were taken during the drive.
+        """
+        if mode == "none":
+            raise SlamError("a GPS track is in metres: choose scale.mode=gps with it, or another mode in metres")
+        fixes = gps.fixes_of(track, stamps, config)
+        if isinstance(fixes, MeasurementFailure):
+            raise SlamError(fixes.reason)
+        self._fixes, self._stamps, self._config = fixes, stamps, config
+
+    def scale(self, T_odometry: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
+        """Metres per unit of an odometry ``(N, 4, 4)``."""
+        return gps.scale_by_gps(self._fixes, T_odometry, self._stamps, config)
+
+    def locate(self, T_odometry: FloatArray) -> Location | MeasurementFailure:
+        """Where an odometry ``(N, 4, 4)`` in metres lies on the earth; a failure is logged."""
+        T_enu_world = gps.align(self._fixes, T_odometry, self._stamps)
+        if isinstance(T_enu_world, MeasurementFailure):
+            logger.warning("the GPS track is not used: %s", T_enu_world.reason)
+            return T_enu_world
+        return Location(self._fixes, T_enu_world)
+
+    def add_factors(self, graph: PoseGraph, location: Location, T_odometry: FloatArray) -> None:
+        """Add the fixes to a graph, unless they are only for comparison."""
+        if self._config.factors:
+            positions = gps.positions_at_frames(self._fixes, location.T_enu_world, T_odometry, self._stamps)
+            graph.add_positions(positions, location.T_enu_world)
+
+    def relocated(self, location: Location, graph: PoseGraph, T_optimised: FloatArray) -> Location | MeasurementFailure:
+        """The location of the optimised trajectory ``(N, 4, 4)``."""
+        return Location(location.fixes, graph.T_fixed_world) if self._config.factors else self.locate(T_optimised)

@@ -1,0 +1,49 @@
+"""What a configuration needs of a sequence, checked before the pass over its frames."""
+
+from __future__ import annotations
+
+from slam.config import ScaleMode, SlamConfig
+from slam.errors import SlamError
+from slam.frames import Sequence
+from slam.frontend.lidar_odometry import has_scans
+from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
+
+
+def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_gps: bool) -> ScaleMode:
+    """The scale mode of a run, after checks that it can succeed.
+
+    Args:
+        sequence: to run on.
+        shortest: number of frames of one snippet.
+        config: of the run.
+        has_gps: whether a GPS track was given.
+
+    Raises:
+        SlamError: too few frames, or the sequence lacks what the configuration needs.
+    """
+    if len(sequence) < shortest:
+        raise SlamError(
+            f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
+            "choose a longer range"
+        )
+    mode = resolve_mode(config.scale, sequence.camera_height_m, has_gps)
+    wants_lidar = {"scale.mode=lidar": mode == "lidar", "lidar.factors=true": config.lidar.factors}
+    for setting in (name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)):
+        raise SlamError(
+            f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
+            "leave the setting out or give a sequence with scans"
+        )
+    if mode == "reference" and sequence.reference is None:
+        raise SlamError(
+            f"scale mode reference needs true poses; {sequence.name} has none: choose camera-height or none"
+        )
+    if mode == "camera-height" and sequence.camera_height_m is None:
+        raise SlamError(
+            f"scale mode camera-height needs a known height; {sequence.name} has none: add camera_height_m "
+            "to camera.yaml or choose scale.mode=none"
+        )
+    if mode == "gps" and not has_gps:
+        raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")
+    if mode == "known":
+        known_frames(config.scale, sequence.stamps)
+    return mode

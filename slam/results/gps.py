@@ -1,0 +1,69 @@
+"""A run beside its GPS track: errors for ``metrics.json`` and paths on the earth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from slam.formats.geographic import write_geojson, write_kml
+from slam.frontend import gps
+from slam.frontend.failure import MeasurementFailure
+from slam.pipeline.batch import SlamResult
+from slam.pipeline.positioning import Location
+from slam.results.folder import RunFolder
+from slam.results.summary import null
+from slam.se3 import FloatArray
+from slam.trajectory import Trajectory
+
+GEOJSON = "trajectory_optimised.geojson"
+KML = "trajectory_optimised.kml"
+
+
+def gps_metrics(result: SlamResult, in_graph: bool) -> dict[str, Any]:
+    """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
+    location = result.location
+    if not isinstance(location, Location):
+        return null("gps", "no GPS track was given" if location is None else location.reason)
+    T_enu_first = location.T_enu_world @ result.optimised.T_world_camera[0]
+    latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
+    ahead = T_enu_first[:3, 2]
+    origin = {
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "altitude_m": height,
+        "heading_deg": float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0),
+    }
+    aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
+    alone = (
+        null("odometry", aligned.reason)
+        if isinstance(aligned, MeasurementFailure)
+        else {"odometry": _errors(location.fixes, aligned, result.odometry)}
+    )
+    beside = _errors(location.fixes, location.T_enu_world, result.optimised)
+    return {
+        "gps": {"fixes": len(location.fixes.stamps), "in_graph": in_graph, "origin": origin}
+        | alone
+        | {"optimised": beside}
+    }
+
+
+def write_places(folder: RunFolder, result: SlamResult, name: str) -> None:
+    """Write the optimised trajectory as paths on the earth, where a GPS track located it."""
+    if not isinstance(result.location, Location):
+        return
+    T_enu_camera = result.location.T_enu_world @ result.optimised.T_world_camera
+    places = result.location.fixes.frame.places(T_enu_camera[:, :3, 3])
+    write_geojson(folder.path / GEOJSON, name, places, result.optimised.stamps)
+    write_kml(folder.path / KML, name, places)
+
+
+def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> dict[str, float]:
+    antenna = fixes.antenna(T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
+    apart = antenna - fixes.points
+    level = np.linalg.norm(apart[:, :2], axis=1)
+    return {
+        "horizontal_rmse_m": float(np.sqrt((level**2).mean())),
+        "horizontal_median_m": float(np.median(level)),
+        "vertical_rmse_m": float(np.sqrt((apart[:, 2] ** 2).mean())),
+    }

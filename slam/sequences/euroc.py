@@ -1,0 +1,169 @@
+"""EuRoC's layout: ``mav0/cam0/{data.csv,sensor.yaml,data/STAMP.png}`` (Burri et al. 2016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from erfsfm.errors import ErfsfmError
+from erfsfm.readers.camera_file import CameraFile, camera_of
+from erfsfm.readers.numbering import by_table
+from erfsfm.yaml_file import parse_yaml
+from slam import se3
+from slam.errors import SequenceError
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import own_camera
+from slam.sequences.images import ImageFiles
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import describe_unknown, poses_near, poses_of
+from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, require_stamps
+from slam.sequences.undistortion import calibrated
+
+_CAMERAS = ("cam0", "cam1")
+_TRUTH = "state_groundtruth_estimate0"
+_NANOSECONDS = 10**9
+_MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
+    "radial-tangential": "opencv",
+    "radtan": "opencv",
+    "plumb_bob": "opencv",
+    "equidistant": "fisheye",
+    "none": "pinhole",
+}
+
+
+def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
+    """Open the left camera of a ``mav0`` folder, else the right one.
+
+    Rows of ``data.csv`` without an image are gaps in time. True poses are those of the body, moved to the camera.
+
+    Raises:
+        SequenceError, DataError: if images, ``data.csv``, ``sensor.yaml`` or the true poses are missing or malformed.
+    """
+    body = body.absolute()
+    folder = _camera_folder(body)
+    assert folder is not None
+    table = folder / "data.csv"
+    rows = _rows(table)
+    stamps = np.array([_stamp(row[0], table) for row in rows])
+    listed = [folder / "data" / row[-1].strip() for row in rows]
+    files = by_table(listed, table)
+    stored = ImageFiles(files)
+    sensor = _read_sensor(folder / "sensor.yaml")
+    camera = own_camera(sensor.camera(), asked, stored, body, body.parent)
+    images, intrinsics = calibrated(stored, camera, str(folder))
+    stamps = require_stamps(stamps[: files.first + len(files)], table, files)
+    require_short_gaps(files, stamps)
+    name = body.parent.name
+    return RecordedSequence(
+        name=name,
+        images=images,
+        intrinsics=intrinsics,
+        stamps=stamps,
+        sources=(Source(f"euroc/{name}"),),
+        T_any_camera=_true_poses(body / _TRUTH, stamps, sensor.T_body_sensor),
+        camera_height_m=camera.height_or(None),
+    )
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """A ``sensor.yaml``: the pose of the sensor in the body, and the other keys."""
+
+    path: Path
+    T_body_sensor: FloatArray
+    keys: dict[str, Any]
+
+    def camera(self) -> CameraFile:
+        """The calibration of a camera.
+
+        Raises:
+            SequenceError: a key is missing or wrong, or the model of the lens is unknown.
+        """
+        name = str(self.keys.get("distortion_model", "none"))
+        if name not in _MODELS or self.keys.get("camera_model", "pinhole") != "pinhole":
+            raise SequenceError(
+                f"{self.path} has camera_model {self.keys.get('camera_model')} and distortion_model {name}: known are "
+                f"pinhole with {', '.join(_MODELS)}; undistort the images, or give --camera"
+            )
+        try:
+            (width, height), (fx, fy, cx, cy) = self.keys["resolution"], self.keys["intrinsics"]
+            distortion = [] if _MODELS[name] == "pinhole" else self.keys["distortion_coefficients"]
+            fps = self.keys["rate_hz"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise SequenceError(
+                f"{self.path} needs resolution, intrinsics (4 numbers), distortion_coefficients and rate_hz: {error!r}"
+            ) from error
+        found = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
+        return camera_of({**found, "model": _MODELS[name], "distortion": distortion}, str(self.path))
+
+
+def _read_sensor(path: Path) -> _Sensor:
+    try:
+        text = path.read_text(encoding="utf-8")
+        # OpenCV's "%YAML:1.0" is no directive of YAML
+        keys = parse_yaml(text.partition("\n")[2] if text.startswith("%") else text)
+    except (OSError, UnicodeDecodeError, ErfsfmError) as error:
+        raise SequenceError(f"cannot read {path}, the calibration of an EuRoC sensor: {error}") from error
+    keys = keys if isinstance(keys, dict) else {}
+    try:
+        T_body_sensor = np.array(keys["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error!r}") from error
+    return _Sensor(path, T_body_sensor, keys)
+
+
+def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> FloatArray | None:
+    """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth."""
+    table = folder / "data.csv"
+    if not table.is_file():
+        return None
+    rows = _rows(table)
+    known = np.array([_stamp(row[0], table) for row in rows])
+    try:
+        values = np.array([[float(value) for value in row[1:8]] for row in rows])  # position, quaternion wxyz
+        T_any_sensor = poses_of(values[:, :3], values[:, [4, 5, 6, 3]])
+    except (ValueError, IndexError) as error:
+        raise SequenceError(f"{table} needs stamp, position and quaternion in each row: {error}") from error
+    sensor = folder / "sensor.yaml"
+    T_body_sensor = _read_sensor(sensor).T_body_sensor if sensor.is_file() else np.eye(4)
+    T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
+    T_any_camera = poses_near(T_any_body @ T_body_camera, known, stamps)
+    describe_unknown(T_any_camera, table)
+    return T_any_camera
+
+
+def _rows(table: Path) -> list[list[str]]:
+    """The rows of a table of EuRoC, comments left out; at least one."""
+    try:
+        lines = table.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SequenceError(f"cannot read {table}: {error}") from error
+    rows = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]
+    if not rows:
+        raise SequenceError(f"{table} has no rows: it needs one for each image or pose; copy it again")
+    return rows
+
+
+def _stamp(word: str, table: Path) -> float:
+    """Seconds from a stamp in nanoseconds, rounded once."""
+    try:
+        return int(word) / _NANOSECONDS
+    except ValueError:
+        raise SequenceError(f"{table} has {word!r} where a stamp in nanoseconds belongs; correct the row") from None
+
+
+def _camera_folder(body: Path) -> Path | None:
+    return next((body / name for name in _CAMERAS if (body / name / "data.csv").is_file()), None)
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    """``mav0`` itself, or the folder that has it."""
+    body = next((place for place in (path / "mav0", path) if _camera_folder(place) is not None), None)
+    return {} if body is None else {body.absolute().parent.name: partial(open_euroc, body, asked.camera)}
+
+
+LOADER = Loader("EuRoC", "mav0/cam0/data.csv", _find)

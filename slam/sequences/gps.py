@@ -1,0 +1,116 @@
+"""GPS tracks from files: CSV with a header, or NMEA 0183."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
+from pathlib import Path
+
+import numpy as np
+
+from slam.errors import SequenceError
+from slam.geodesy import GpsTrack
+from slam.se3 import FloatArray
+
+_COLUMNS = ("stamp", "latitude", "longitude", "altitude")
+_DAY_S = 86400.0
+_MOST = np.array([90.0, 180.0, 1e5])
+
+
+def read_gps(path: Path) -> GpsTrack:
+    """Read a GPS track.
+
+    CSV has a header with ``stamp`` in seconds on the clock of the images, ``latitude`` and ``longitude`` in degrees,
+    ``altitude`` in metres and, optionally, ``hdop``. Of NMEA, GGA sentences are fixes and RMC sentences give the date:
+    stamps are seconds since 1970, without a date seconds of the first day.
+
+    Raises:
+        SequenceError: the file cannot be read or holds something else, with the row.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
+    lines = text.splitlines()
+    rows = _nmea_rows(lines, path) if text.lstrip().startswith("$") else _csv_rows(lines, path)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    if not len(table):
+        raise SequenceError(f"{path} holds no GPS fix: CSV with a header {','.join(_COLUMNS)}, or NMEA is read")
+    stamps = table[:, 0]
+    if (np.diff(stamps) <= 0).any():
+        row = int(np.argmax(np.diff(stamps) <= 0)) + 2
+        raise SequenceError(f"{path}: the stamp of fix {row} does not follow that of the one before: sort the file")
+    return GpsTrack(stamps, table[:, 1:4], table[:, 4])
+
+
+def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
+    """Rows of stamp, latitude, longitude, altitude, dilution."""
+    reader = csv.DictReader(lines, skipinitialspace=True)
+    missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
+    if missing:
+        raise SequenceError(f"{path} lacks {', '.join(missing)}: its first row must name {', '.join(_COLUMNS)}")
+    rows = []
+    for row in reader:
+        try:
+            numbers = [float(row[name]) for name in _COLUMNS] + [float(row.get("hdop") or 1.0)]
+        except (TypeError, ValueError):
+            numbers = []
+        rows.append(_checked(numbers, f"{path} row {reader.line_num}"))
+    return rows
+
+
+def _nmea_rows(lines: Iterable[str], path: Path) -> list[list[float]]:
+    """The same of GGA sentences with a fix; each receiver repeats a fix at most once a stamp."""
+    rows: list[list[float]] = []
+    midnight: float | None = None
+    for number, line in enumerate(lines, start=1):
+        words = _sentence(line)
+        kind = words[0][-3:]
+        try:
+            if kind == "RMC" and len(words) > 9 and words[9]:
+                day = datetime.strptime(words[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
+                if midnight is None:
+                    rows = [[row[0] + day, *row[1:]] for row in rows]
+                midnight = day
+            if kind != "GGA" or len(words) < 10 or words[6] in ("", "0"):
+                continue
+            stamp = (midnight or 0.0) + _seconds(words[1])
+            if rows and stamp < rows[-1][0] - _DAY_S / 2:
+                stamp += _DAY_S
+            fix = [stamp, _degrees(words[2], words[3]), _degrees(words[4], words[5]), float(words[9])]
+            fix.append(float(words[8] or 1.0))
+        except ValueError:
+            fix = []
+        if fix and rows and fix[0] == rows[-1][0]:
+            continue
+        rows.append(_checked(fix, f"{path} row {number}"))
+    return rows
+
+
+def _sentence(line: str) -> list[str]:
+    """The words of an NMEA sentence, one empty word where its checksum is wrong."""
+    body, star, checksum = line.strip().lstrip("$").partition("*")
+    if star and checksum.upper() != f"{reduce(xor, body.encode(), 0):02X}":
+        return [""]
+    return body.split(",")
+
+
+def _seconds(word: str) -> float:
+    return 3600 * int(word[:2]) + 60 * int(word[2:4]) + float(word[4:])
+
+
+def _degrees(word: str, side: str) -> float:
+    """Degrees of ``DDMM.MMM`` or ``DDDMM.MMM``, negative south and west."""
+    point = word.index(".") if "." in word else len(word)
+    degrees = int(word[: point - 2]) + float(word[point - 2 :]) / 60.0
+    return -degrees if side in ("S", "W") else degrees
+
+
+def _checked(numbers: list[float], where: str) -> list[float]:
+    place: FloatArray = np.array(numbers[1:4])
+    if len(numbers) != 5 or not np.isfinite(numbers).all() or (abs(place) > _MOST).any() or numbers[4] <= 0:
+        raise SequenceError(f"{where} is no GPS fix: a stamp, degrees, metres and a dilution above 0 are needed")
+    return numbers

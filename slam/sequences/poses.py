@@ -1,0 +1,78 @@
+"""True poses at the stamps of images."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from slam import se3
+from slam.frames import runs
+from slam.se3 import FloatArray
+
+logger = logging.getLogger(__name__)
+
+_MAX_GAP_S = 0.1
+
+
+def rebased(T_any_camera: FloatArray) -> FloatArray:
+    """Poses ``T_world_camera`` ``(N, 4, 4)`` whose world is the first camera; the first is the identity."""
+    T_any_first = T_any_camera[0].copy()
+    T_any_first[:3, :3] = se3.nearest_rotation(T_any_first[:3, :3])
+    T_world_camera: FloatArray = se3.invert(T_any_first) @ T_any_camera
+    T_world_camera[0] = np.eye(4)
+    return T_world_camera
+
+
+def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
+    """Poses ``(N, 4, 4)`` of positions ``(N, 3)`` and quaternions ``(N, 4)``, which are normalised.
+
+    Raises:
+        ValueError: a quaternion is zero, or a number is not finite.
+    """
+    if not (np.isfinite(positions).all() and np.isfinite(quaternions_xyzw).all()):
+        raise ValueError("a number of a pose is not finite")
+    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
+
+
+def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
+    """Poses ``(N, 4, 4)`` at ``stamps`` ``(N,)`` from poses ``(M, 4, 4)`` at ``known`` ``(M,)``; ends are held."""
+    times = np.clip(stamps, known[0], known[-1])
+    R = Slerp(known, Rotation.from_matrix(T_any_camera[:, :3, :3]))(times).as_matrix()
+    t = np.column_stack([np.interp(times, known, T_any_camera[:, axis, 3]) for axis in range(3)])
+    return se3.make(R, t)
+
+
+def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
+    """Poses as of `interpolated_poses`; NaN where the nearest known pose is more than 0.1 s away."""
+    if len(known) < 2:
+        return np.full((len(stamps), 4, 4), np.nan)
+    before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
+    gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
+    T_near = interpolated_poses(T_any_camera, known, stamps)
+    T_near[gap > _MAX_GAP_S] = np.nan
+    return T_near
+
+
+def describe_unknown(T_any_camera: FloatArray, path: Path) -> None:
+    """Warn of frames without a true pose, and say which have one.
+
+    Args:
+        T_any_camera: ``(N, 4, 4)``, NaN where unknown.
+        path: the file of true poses.
+    """
+    known = known_poses(T_any_camera)
+    if known.all():
+        return
+    longest = max(runs(np.flatnonzero(known).tolist()), key=lambda run: run[1] - run[0], default=None)
+    advice = "" if longest is None else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
+    missing = int(np.argmin(known))
+    logger.warning("%s has no pose within 0.1 s of image %d: the sequence has no reference%s", path, missing, advice)
+
+
+def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
+    """Which of the poses ``(N, 4, 4)`` are known."""
+    return np.asarray(np.isfinite(T_any_camera).all(axis=(1, 2)))

@@ -1,0 +1,127 @@
+"""The topics and messages of a bag.
+
+Messages are read by rosbags' own definitions of the standard types. Those that a bag carries are not used, for rosbags
+would make code of them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from slam.errors import SequenceError
+from slam.runtime.imports import import_rosbags
+
+BAG_SUFFIXES = (".bag", ".db3", ".mcap")
+_METADATA = "metadata.yaml"
+_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"
+_TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_NANOSECONDS = 10**9
+
+
+class Bag:
+    """An open bag: a ``.bag`` file of ROS 1, or a folder, ``.db3`` or ``.mcap`` file of ROS 2.
+
+    Attributes:
+        path: of the bag.
+        types: the message type of each topic, as ``sensor_msgs/msg/Image``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a bag.
+
+        Raises:
+            SequenceError: it is damaged, or rosbags is not installed.
+        """
+        self.path = path
+        self._is_ros1 = path.suffix == ".bag"
+        rosbag1, rosbag2, typesys = import_rosbags()
+        with self._errors():
+            self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
+            self._reader.open()
+            stores = typesys.Stores
+            self._types = typesys.get_typestore(stores.ROS1_NOETIC if self._is_ros1 else stores.ROS2_HUMBLE)
+            for name in _TRANSFORM_TYPES:
+                if name not in self._types.types:
+                    self._types.register(typesys.get_types_from_msg(_TRANSFORMS, name))
+            self.types: dict[str, str] = {each.topic: each.msgtype for each in self._reader.connections}
+
+    def topics(self, *types: str) -> list[str]:
+        """Topics of some message types that have messages, sorted."""
+        counts = {each.topic: each.msgcount for each in self._reader.connections}
+        return sorted(topic for topic, kind in self.types.items() if kind in types and counts[topic] != 0)
+
+    def raw(self, topic: str, start_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
+        """The messages of a topic as stored, with the times at which they were recorded, from ``start_ns`` on.
+
+        Raises:
+            SequenceError: the bag is damaged.
+        """
+        connections = [each for each in self._reader.connections if each.topic == topic]
+        with self._errors():
+            for _, time_ns, data in self._reader.messages(connections=connections, start=start_ns):
+                yield time_ns, data
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """The messages of a topic, in the order in which they were recorded.
+
+        Raises:
+            SequenceError: the bag is damaged.
+        """
+        for _, data in self.raw(topic):
+            yield self.parse(topic, data)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic.
+
+        Raises:
+            SequenceError: it has none, or the bag is damaged.
+        """
+        message = next(self.messages(topic), None)
+        if message is None:
+            raise SequenceError(f"topic {topic} of {self.path} has no messages")
+        return message
+
+    def parse(self, topic: str, data: bytes) -> Any:
+        """A message as stored, by the type of its topic.
+
+        Raises:
+            SequenceError: it is damaged.
+        """
+        with self._errors():
+            parse = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
+            return parse(data, self.types[topic])
+
+    def stamp_ns(self, data: bytes) -> int:
+        """The stamp in nanoseconds of a message as stored whose first field is a header, without reading all of it.
+
+        Raises:
+            SequenceError: it is damaged.
+        """
+        with self._errors():
+            if self._is_ros1:
+                seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # after the sequence number
+            else:
+                order = "<" if data[1] & 1 else ">"
+                seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)  # after the encapsulation
+        return int(seconds) * _NANOSECONDS + int(nanoseconds)
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except SequenceError:
+            raise
+        except Exception as error:  # of whatever kind a damaged file raises inside rosbags
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise SequenceError(f"bag {self.path} cannot be read ({reason}): copy it again, or reindex it") from error
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path has the name of a bag, or is the folder of a ROS 2 bag."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() and any(file.suffix in BAG_SUFFIXES[1:] for file in path.iterdir())
+    return path.suffix in BAG_SUFFIXES

@@ -1,0 +1,244 @@
+"""Sequences of bags: each camera of a bag is one, named by its topic."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import re
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.readers.camera_file import CameraFile
+from slam.errors import SequenceError
+from slam.frames import Image
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import explicit_camera, own_camera
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import describe_unknown, poses_near
+from slam.sequences.recording import RecordedSequence, ScanReader, Source
+from slam.sequences.ros.bag import Bag, is_bag
+from slam.sequences.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    POINT_CLOUD,
+    camera_file_of,
+    image_of,
+    is_colour,
+    points_of,
+)
+from slam.sequences.ros.transforms import StaticTransforms, transform_of
+from slam.sequences.undistortion import calibrated
+
+logger = logging.getLogger(__name__)
+
+_ODOMETRY, _TRANSFORM = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
+_TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
+_CACHED_FRAMES = 32
+_SKIPPED_FRAMES = 30
+_SCAN_DELAY_S = 0.05
+_NANOSECONDS = 10**9
+
+
+class StampedMessages:
+    """The messages of a topic whose first field is a header, in the order of their stamps, read one at a time.
+
+    All messages are read once for their stamps. Where no header has a stamp, the times of recording are used; of
+    messages with one stamp the first is kept.
+    """
+
+    def __init__(self, bag: Bag, topic: str) -> None:
+        """Read the stamps.
+
+        Raises:
+            SequenceError: the topic has no messages, or the bag is damaged.
+        """
+        self._bag, self.topic = bag, topic
+        pairs = [(time_ns, bag.stamp_ns(data)) for time_ns, data in bag.raw(topic)]
+        if not pairs:
+            raise SequenceError(f"topic {topic} of {bag.path} has no messages")
+        self._times_ns = [time_ns for time_ns, _ in pairs]
+        stamps_ns = [stamp_ns for _, stamp_ns in pairs] if any(stamp for _, stamp in pairs) else self._times_ns
+        numbers = sorted(range(len(pairs)), key=lambda number: stamps_ns[number])
+        self._numbers = [n for k, n in enumerate(numbers) if not k or stamps_ns[n] > stamps_ns[numbers[k - 1]]]
+        if len(self._numbers) < len(pairs):
+            logger.warning("%s: %d messages repeat a stamp: left out", topic, len(pairs) - len(self._numbers))
+        self.stamps: FloatArray = np.array([stamps_ns[number] / _NANOSECONDS for number in self._numbers])
+        self._next = 0
+        self._following: Iterator[tuple[int, bytes]] = iter(())
+
+    def __len__(self) -> int:
+        """Number of messages."""
+        return len(self._numbers)
+
+    def read(self, index: int) -> Any:
+        """One message.
+
+        Raises:
+            SequenceError: the bag is damaged.
+        """
+        number = self._numbers[index]
+        if not self._next <= number <= self._next + _SKIPPED_FRAMES or self._next == 0:
+            time_ns = self._times_ns[number]
+            self._next = self._times_ns.index(time_ns)
+            self._following = self._bag.raw(self.topic, time_ns)
+        for _, data in self._following:
+            self._next += 1
+            if self._next == number + 1:
+                return self._bag.parse(self.topic, data)
+        raise SequenceError(f"{self._bag.path} breaks off at message {number} of {self.topic}: copy it again")
+
+
+class BagImages:
+    """The images of a topic, all of the size of the first. Not for use from several threads."""
+
+    def __init__(self, bag: Bag, topic: str) -> None:
+        """Read the stamps of all and the first image for its size.
+
+        Raises:
+            SequenceError, DataError: the bag is damaged, or the first image cannot be read.
+        """
+        self.messages = StampedMessages(bag, topic)
+        self._where = f"an image of {topic} in {bag.path}"
+        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
+        self.height, self.width = self._cached(0).shape[:2]
+
+    def __len__(self) -> int:
+        """Number of images."""
+        return len(self.messages)
+
+    def read(self, index: int) -> Image:
+        """One image ``(height, width, 3)`` uint8 RGB.
+
+        Raises:
+            SequenceError, DataError: it cannot be read, or has another size than the first.
+        """
+        image = self._cached(index)
+        if image.shape[:2] != (self.height, self.width):
+            height, width = image.shape[:2]
+            raise SequenceError(f"{self._where} is {width}x{height}, the first is {self.width}x{self.height}")
+        return image.copy()
+
+    def _decode(self, index: int) -> Image:
+        return image_of(self.messages.read(index), self._where)
+
+
+def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> RecordedSequence:
+    """Open the images of a topic with what the bag has beside: calibration, true poses, LiDAR scans.
+
+    Raises:
+        SequenceError, DataError: the bag is damaged, or its images have no calibration.
+    """
+    bag = Bag(path)
+    stored = BagImages(bag, topic)
+    stamps = stored.messages.stamps
+    fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    if asked is not None:
+        camera = explicit_camera(asked, stored, fps)
+    else:
+        camera = own_camera(_calibration(bag, topic, fps), None, stored, path.absolute().parent)
+    images, intrinsics = calibrated(stored, camera, f"{topic} in {path}")
+    mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
+    T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
+    return RecordedSequence(
+        name=name,
+        images=images,
+        intrinsics=intrinsics,
+        stamps=stamps,
+        sources=(Source(f"bag/{name}"),),
+        T_any_camera=_true_poses(bag, mounted, frame, stamps),
+        camera_height_m=camera.height_or(None),
+        T_camera_lidar=T_camera_lidar,
+        scans=scans,
+    )
+
+
+def camera_topics(bag: Bag) -> list[str]:
+    """Topics with pictures of a camera: not those of depth."""
+    return [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+
+
+def _calibration(bag: Bag, topic: str, fps: float) -> CameraFile:
+    """By the ``camera_info`` beside the images."""
+    known = bag.topics(CAMERA_INFO)
+    base = topic.removesuffix("/compressed")
+    home = base.rpartition("/")[0]
+    info = next((name for name in (f"{home}/camera_info", f"{base}/camera_info") if name in known), None)
+    if info is None:
+        raise SequenceError(
+            f"no {home}/camera_info for {topic} in {bag.path}: it has {', '.join(known) or 'no camera_info'}; give "
+            f"--camera"
+        )
+    is_rectified = base.rpartition("/")[2].startswith("image_rect")
+    return camera_file_of(bag.first(info), is_rectified, fps, f"{info} in {bag.path}")
+
+
+def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray) -> FloatArray | None:
+    """``T_any_camera`` at the images' stamps from a topic that is named as truth, NaN where unknown; None without."""
+    topics = [topic for topic in bag.topics(_ODOMETRY, _TRANSFORM) if _TRUTH.search(topic)]
+    for topic in topics:
+        body = bag.first(topic).child_frame_id
+        T_body_camera = mounted.between(body, camera)
+        if T_body_camera is None:
+            logger.warning("%s is not used: no static transform from its %s to the camera's %s", topic, body, camera)
+            continue
+        found = StampedMessages(bag, topic)
+        messages = (found.read(k) for k in range(len(found)))
+        T_any_body = np.stack([transform_of(m.pose.pose if hasattr(m, "pose") else m.transform) for m in messages])
+        T_any_camera = poses_near(T_any_body @ T_body_camera, found.stamps, stamps)
+        describe_unknown(T_any_camera, bag.path)
+        return T_any_camera
+    return None
+
+
+def _scans(
+    bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray
+) -> tuple[FloatArray | None, dict[int, ScanReader]]:
+    """``T_camera_lidar``, and the nearest cloud of each frame within 50 ms, of the first LiDAR whose mount is known."""
+    for topic in bag.topics(POINT_CLOUD):
+        T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
+        if T_camera_lidar is None:
+            logger.warning("%s is not used: no static transform from its frame to the camera's %s", topic, camera)
+            continue
+        clouds = StampedMessages(bag, topic)
+        nearest: NDArray[np.intp] = np.abs(stamps[None] - clouds.stamps[:, None]).argmin(axis=1)
+        close = np.abs(stamps[nearest] - clouds.stamps) <= _SCAN_DELAY_S
+        where = f"a cloud of {topic} in {bag.path}"
+        read: dict[int, ScanReader] = {
+            int(nearest[k]): partial(_points, clouds, int(k), where) for k in np.flatnonzero(close)
+        }
+        return T_camera_lidar, read
+    return None, {}
+
+
+def _points(clouds: StampedMessages, index: int, where: str) -> FloatArray:
+    return points_of(clouds.read(index), where)
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
+    if is_bag(path):
+        topics = camera_topics(Bag(path))
+        return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
+    found = {}
+    for file in sorted(path.glob("*.bag")) if path.is_dir() else ():
+        topics = camera_topics(Bag(file))
+        for topic in topics:
+            found[f"{file.stem}{topic}" if len(topics) > 1 else file.stem] = _opener(
+                file, topic, len(topics) > 1, asked
+            )
+    return found
+
+
+def _opener(path: Path, topic: str, is_one_of_several: bool, asked: Asked) -> Opener:
+    stem = path.absolute().stem
+    name = stem + topic.replace("/", "_") if is_one_of_several else stem
+    return partial(open_topic, path, topic, name, asked.camera)
+
+
+LOADER = Loader("ROS bag", "a .bag, .db3 or .mcap", _find)

@@ -1,0 +1,126 @@
+"""Images, cameras and point clouds of ROS messages."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.errors import DataError
+from erfsfm.readers.camera_file import CameraFile, camera_of
+from erfsfm.readers.images import decode_image, eight_bits
+from slam.errors import SequenceError
+from slam.frames import Image
+from slam.se3 import FloatArray
+
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+
+_CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding: channels, OpenCV's conversion to RGB
+    "rgb8": (3, None),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "mono16": (1, cv2.COLOR_GRAY2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+}
+_MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
+    "": "pinhole",
+    "none": "pinhole",
+    "plumb_bob": "opencv",
+    "rational_polynomial": "opencv",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
+_FLOAT32 = 7  # PointField.FLOAT32
+
+
+def is_colour(message: Any) -> bool:
+    """Whether an image or compressed image shows what a camera sees, not depth."""
+    if hasattr(message, "encoding"):
+        return message.encoding in _CONVERSIONS
+    return "compressedDepth" not in message.format
+
+
+def image_of(message: Any, where: str) -> Image:
+    """The picture ``(H, W, 3)`` uint8 RGB of an ``Image`` or a ``CompressedImage``.
+
+    Raises:
+        SequenceError, DataError: an encoding that is not known, or too few bytes.
+    """
+    if hasattr(message, "format"):
+        return decode_image(bytes(message.data), where)
+    encoding = message.encoding
+    if encoding not in _CONVERSIONS:
+        raise SequenceError(f"{where} has encoding {encoding}; known are {', '.join(_CONVERSIONS)}")
+    channels, conversion = _CONVERSIONS[encoding]
+    sample = np.dtype(np.uint16 if encoding == "mono16" else np.uint8).newbyteorder(
+        ">" if message.is_bigendian else "<"
+    )
+    height, width, step = message.height, message.width, message.step
+    row = width * channels * sample.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not 0 < row <= step or len(data) < height * step:
+        raise SequenceError(f"{where} has {len(data)} bytes for {width}x{height} pixels of {encoding}")
+    values = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row]).view(sample)
+    if encoding == "mono16":
+        values = eight_bits(values.astype(np.uint16), where)
+    picture = values.reshape(height, width, channels)
+    return np.array(picture if conversion is None else cv2.cvtColor(picture, conversion), dtype=np.uint8)
+
+
+def camera_file_of(info: Any, is_rectified: bool, fps: float, where: str) -> CameraFile:
+    """The camera of a ``CameraInfo``: K with its distortion, or P of rectified images.
+
+    Raises:
+        SequenceError, DataError: it was not calibrated, or the model of the lens is unknown.
+    """
+    K, P, distortion = (getattr(info, key.upper() if hasattr(info, key.upper()) else key) for key in "kpd")
+    model = "" if is_rectified or not np.any(distortion) else info.distortion_model
+    if model not in _MODELS:
+        known = ", ".join(name for name in _MODELS if name)
+        raise SequenceError(f"{where} has distortion_model {model}; known are {known}: give --camera")
+    fx, _, cx, *_ = P if is_rectified else K
+    fy, cy = (P[5], P[6]) if is_rectified else (K[4], K[5])
+    if not (fx > 0 and fy > 0):
+        raise SequenceError(f"{where} has no calibration, its focal length is {fx:g}: give --camera")
+    keys = {"width": info.width, "height": info.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "fps": fps}
+    coefficients = [] if _MODELS[model] == "pinhole" else [float(value) for value in distortion]
+    return camera_of({**keys, "model": _MODELS[model], "distortion": coefficients}, where)
+
+
+def points_of(cloud: Any, where: str) -> FloatArray:
+    """The points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres; those that are not finite are left out.
+
+    Raises:
+        DataError: it has no x, y, z as float32, or too few bytes.
+    """
+    offsets = {field.name: field.offset for field in cloud.fields if field.datatype == _FLOAT32}
+    if not {"x", "y", "z"} <= offsets.keys():
+        raise DataError(f"{where} has no x, y and z as float32")
+    count, step = cloud.width * cloud.height, cloud.point_step
+    data: NDArray[np.uint8] = np.asarray(cloud.data, dtype=np.uint8)
+    if len(data) < count * step:
+        raise DataError(f"{where} has {len(data)} bytes for {count} points of {step}")
+    order = ">" if cloud.is_bigendian else "<"
+    layout = np.dtype(
+        {
+            "names": ["x", "y", "z"],
+            "formats": [f"{order}f4"] * 3,
+            "offsets": [offsets[k] for k in "xyz"],
+            "itemsize": step,
+        }
+    )
+    table = np.frombuffer(data[: count * step].tobytes(), layout)
+    points = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
+    return points[np.isfinite(points).all(axis=1)]

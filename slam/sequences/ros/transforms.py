@@ -1,0 +1,54 @@
+"""Static transforms of a bag: which frame is mounted where on which."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from slam.se3 import FloatArray, invert
+from slam.sequences.poses import poses_of
+from slam.sequences.ros.bag import Bag
+
+TOPIC = "/tf_static"
+
+
+class StaticTransforms:
+    """The tree of the frames of ``/tf_static``."""
+
+    def __init__(self, bag: Bag) -> None:
+        """Read all static transforms; the last of a frame counts."""
+        messages = bag.messages(TOPIC) if TOPIC in bag.types else ()
+        self._parents = {
+            frame_name(each.child_frame_id): (frame_name(each.header.frame_id), transform_of(each.transform))
+            for message in messages
+            for each in message.transforms
+        }
+
+    def between(self, a: str, b: str) -> FloatArray | None:
+        """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them."""
+        (root_a, T_root_a), (root_b, T_root_b) = (self._from_root(frame_name(frame)) for frame in (a, b))
+        return invert(T_root_a) @ T_root_b if root_a == root_b else None
+
+    def _from_root(self, frame: str) -> tuple[str, FloatArray]:
+        T_root_frame, seen = np.eye(4), {frame}
+        while frame in self._parents:
+            frame, T_parent_child = self._parents[frame]
+            if frame in seen:
+                break  # a loop has no root
+            seen.add(frame)
+            T_root_frame = T_parent_child @ T_root_frame
+        return frame, T_root_frame
+
+
+def frame_name(text: str) -> str:
+    """The name of a frame; ROS 1 may write it with a slash."""
+    return text.removeprefix("/")
+
+
+def transform_of(message: Any) -> FloatArray:
+    """``T_parent_child`` ``(4, 4)`` of a ``Transform`` or a ``Pose``."""
+    t = message.translation if hasattr(message, "translation") else message.position
+    q = message.rotation if hasattr(message, "rotation") else message.orientation
+    T: FloatArray = poses_of(np.array([[t.x, t.y, t.z]]), np.array([[q.x, q.y, q.z, q.w]]))[0]
+    return T

@@ -1,0 +1,102 @@
+"""TUM's monocular benchmark: ``images/``, ``times.txt`` and ``camera.txt`` with the FOV lens (Engel et al. 2016)."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.readers.camera_file import CameraFile, camera_of
+from erfsfm.readers.images import has_images, list_images
+from erfsfm.readers.numbering import NumberedFiles, by_name
+from slam.errors import SequenceError
+from slam.se3 import FloatArray
+from slam.sequences.camera_file import own_camera
+from slam.sequences.images import ImageFiles
+from slam.sequences.loader import Asked, Loader, Opener
+from slam.sequences.poses import describe_unknown, poses_near, poses_of
+from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, require_stamps
+from slam.sequences.undistortion import calibrated
+
+_CAMERA, _TIMES, _TRUTH = "camera.txt", "times.txt", "groundtruthSync.txt"
+_LENS = "FOV"
+
+
+def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
+    """Open a sequence; response and vignette (``pcalib.txt``, ``vignette.png``) are not used.
+
+    True poses are those of the start and the end that the benchmark gives.
+
+    Raises:
+        SequenceError, DataError: if images, ``camera.txt`` or ``times.txt`` are missing or malformed.
+    """
+    folder = folder.absolute()
+    if not has_images(folder / "images"):
+        raise SequenceError(f"no images in {folder / 'images'}: unpack images.zip there")
+    files = by_name(list_images(folder / "images"))
+    stored = ImageFiles(files)
+    stamps = _stamps(folder / _TIMES, files)
+    require_short_gaps(files, stamps)
+    fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    camera = own_camera(_camera(folder / _CAMERA, fps), asked, stored, folder)
+    images, intrinsics = calibrated(stored, camera, str(folder))
+    return RecordedSequence(
+        name=folder.name,
+        images=images,
+        intrinsics=intrinsics,
+        stamps=stamps,
+        sources=(Source(f"tum_mono/{folder.name}"),),
+        T_any_camera=_true_poses(folder / _TRUTH, stamps),
+        camera_height_m=camera.height_or(None),
+    )
+
+
+def _camera(path: Path, fps: float) -> CameraFile:
+    """Focal lengths and principal point over the image's size, and the angle of the lens; then the size."""
+    try:
+        first, second = path.read_text(encoding="utf-8").splitlines()[:2]
+        words = first.split()
+        fx, fy, cx, cy, angle = (float(word) for word in words[words[0] == _LENS :])
+        width, height = (int(word) for word in second.split())
+    except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
+        raise SequenceError(
+            f"{path} needs a row of fx fy cx cy and the lens's angle and a row of width and height: {error}"
+        ) from error
+    keys = {"fx": fx * width, "fy": fy * height, "cx": cx * width - 0.5, "cy": cy * height - 0.5}
+    lens = {"model": "fov", "distortion": [angle]} if angle else {}
+    return camera_of({"width": width, "height": height, "fps": fps, **keys, **lens}, str(path))
+
+
+def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
+    """Rows of number, seconds and perhaps exposure."""
+    try:
+        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        stamps = np.array([float(row[1]) for row in rows if row])
+    except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
+        raise SequenceError(f"{path} needs rows of number, seconds and exposure: {error}") from error
+    return require_stamps(stamps, path, files)
+
+
+def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
+    """``T_any_camera`` at the images' stamps, NaN where unknown; None without the file."""
+    if not path.is_file():
+        return None
+    try:
+        rows = np.array([line.split() for line in path.read_text(encoding="utf-8").splitlines() if line], np.float64)
+        rows = rows.reshape(len(rows), 8)[np.isfinite(rows).all(axis=1)]
+        T_known = poses_of(rows[:, 1:4], rows[:, 4:])
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise SequenceError(f"{path} needs rows of stamp, position and quaternion: {error}") from error
+    T_any_camera = poses_near(T_known, rows[:, 0], stamps)
+    describe_unknown(T_any_camera, path)
+    return T_any_camera
+
+
+def _find(path: Path, asked: Asked) -> dict[str, Opener]:
+    if not ((path / _CAMERA).is_file() and (path / _TIMES).is_file()):
+        return {}
+    return {path.absolute().name: partial(open_tum_mono, path, asked.camera)}
+
+
+LOADER = Loader("TUM mono", f"{_CAMERA} and {_TIMES}", _find)

@@ -1,0 +1,65 @@
+"""A map is reduced without being read as a whole, and stays the same surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import slam.results.map_mesh
+from slam.errors import RunError
+from slam.formats.ply import Ply, write_ply
+from slam.results.map_mesh import MapMesh, MapMeshFile
+
+
+@pytest.fixture
+def file(plain: Ply, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MapMeshFile:
+    monkeypatch.setattr(slam.results.map_mesh, "_CHUNK", 1000)  # many pieces
+    write_ply(tmp_path / "map_mesh.ply", plain)
+    return MapMeshFile(tmp_path / "map_mesh.ply")
+
+
+def area(mesh: MapMesh) -> float:
+    a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
+    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def test_a_small_map_stays_as_it_is(file: MapMeshFile, plain: Ply) -> None:
+    mesh = file.reduced(100_000)
+    assert plain.triangles is not None and plain.colours is not None
+    assert np.array_equal(mesh.points, plain.points)
+    assert np.array_equal(mesh.colours, plain.colours)
+    assert np.array_equal(mesh.triangles, plain.triangles)
+
+
+def test_a_large_map_keeps_its_surface_and_colours(file: MapMeshFile) -> None:
+    whole, mesh = file.reduced(100_000), file.reduced(4000)
+    assert 1500 < len(mesh.triangles) < 5000 < len(whole.triangles)
+    inner = mesh.points[abs(mesh.points[:, [0, 2]]).max(axis=1) < 70.0]
+    assert np.allclose(inner[:, 1], 1.65)
+    assert area(mesh) == pytest.approx(area(whole), rel=0.08)
+    assert mesh.colours.mean(axis=0) == pytest.approx(whole.colours.mean(axis=0), abs=12.0)
+
+
+def test_decimation_reaches_its_number_and_keeps_a_plain_flat(file: MapMeshFile) -> None:
+    mesh = file.reduced(100_000).decimated(900)
+    assert 500 < len(mesh.triangles) <= 900
+    assert mesh.triangles.max() < len(mesh.points) == len(mesh.colours)
+    assert area(mesh) == pytest.approx(area(file.reduced(100_000)), rel=0.1)
+
+
+def test_near_a_point_are_all_whole_triangles(file: MapMeshFile) -> None:
+    mesh = file.near(np.array([0.0, 1.65, 0.0]), 20.0)
+    assert np.linalg.norm(mesh.points - [0.0, 1.65, 0.0], axis=1).max() < 20.0
+    assert area(mesh) == pytest.approx(np.pi * 20.0**2, rel=0.25)
+
+
+@pytest.mark.parametrize("damage", [lambda whole: whole[:-5], lambda whole: b"ply\n", lambda whole: b"<html>"])
+def test_a_damaged_file_is_one_clear_line(plain: Ply, tmp_path: Path, damage: object) -> None:
+    path = tmp_path / "map_mesh.ply"
+    write_ply(path, plain)
+    assert callable(damage)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(RunError, match="is no mesh that can be read"):
+        MapMeshFile(path)

@@ -1,0 +1,206 @@
+"""Bags of ROS 1 and ROS 2: images, calibration, stamps, true poses and scans; several cameras; damage."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.doctor import examine
+from slam.errors import SequenceError
+from slam.frames import Intrinsics
+from slam.runtime import imports
+from slam.sequences.catalogue import open_sequence, sequence_names
+
+CAMERA = Intrinsics(40, 24, 30, 30, 20, 12)
+FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 50_000_000, 6
+NewBag = Callable[..., Any]
+
+
+def picture(k: int, channels: int = 1) -> np.ndarray:
+    shape = (24, 40) if channels == 1 else (24, 40, channels)
+    return np.random.default_rng(k).integers(0, 255, shape, dtype=np.uint8)
+
+
+def drive(bag: Any, topic: str = "/cam0/image_raw", encoding: str = "mono8") -> None:
+    """Six images whose stamps go backwards in the bag: the first two are recorded in the other order."""
+    bag.camera_info(f"{topic.rpartition('/')[0]}/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    for k in range(FRAMES):
+        bag.image(topic, FIRST_NS + k * STEP_NS, picture(k), encoding, late_ns=2 * STEP_NS if k == 0 else 0)
+
+
+def test_opens(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    path = bag.close()
+    sequence = open_sequence(path)
+    assert (sequence.name, len(sequence), sequence.intrinsics) == ("walk", FRAMES, CAMERA)
+    assert sequence.stamps.tolist() == [(FIRST_NS + k * STEP_NS) / 10**9 for k in range(FRAMES)]
+    assert sequence.provenance() == ("bag/walk[0:6]",) and sequence.reference is None
+    for k in (0, 1, 5, 2, 3, 0):
+        assert np.array_equal(sequence.frame(k).image, np.repeat(picture(k)[:, :, None], 3, axis=2))
+    assert sequence_names(path) == ["/cam0/image_raw"]
+    line = examine(path)[-1]
+    assert line.startswith("ok       sequence /cam0/image_raw: 6 frames of 40x24") and line.endswith("(ROS bag)")
+    assert open_sequence(path.parent, frames="1:3").name == "walk"
+
+
+def test_several_cameras_are_listed_and_named_by_their_topics(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    drive(bag, "/cam1/image_raw")
+    bag.image("/depth/image_raw", FIRST_NS, np.ones((24, 40), np.uint16), "16UC1")
+    path = bag.close()
+    with pytest.raises(SequenceError, match="has 2 sequences: /cam0/image_raw, /cam1/image_raw; choose one"):
+        open_sequence(path)
+    assert open_sequence(path, "/cam1/image_raw").name == "walk_cam1_image_raw"
+    with pytest.raises(SequenceError, match=r"no sequence /cam2/image_raw in .*: found /cam0"):
+        open_sequence(path, "/cam2/image_raw")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_compressed_images(new_bag: NewBag, kind: str, suffix: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/camera/camera_info", CAMERA, "plumb_bob", (0.0,) * 5)
+    data = cv2.imencode(suffix, picture(1, 3))[1].ravel()
+    message = bag.make("sensor_msgs/msg/CompressedImage", header=bag.header(FIRST_NS, "c"), format="x", data=data)
+    bag.write("/camera/image_raw/compressed", FIRST_NS, message)
+    expected = cv2.imdecode(data, cv2.IMREAD_COLOR)[:, :, ::-1]
+    assert np.array_equal(open_sequence(bag.close()).frame(0).image, expected)
+
+
+@pytest.mark.parametrize(
+    "encoding, channels",
+    [
+        ("rgb8", 3),
+        ("bgr8", 3),
+        ("rgba8", 4),
+        ("bgra8", 4),
+        ("8UC3", 3),
+        ("yuv422", 2),
+        ("yuv422_yuy2", 2),
+        ("mono16", 1),
+    ],
+)
+def test_encodings_of_a_grey_picture(new_bag: NewBag, encoding: str, channels: int) -> None:
+    """Channels of equal value are grey in every encoding; of YUV 4:2:2 those with chroma 128."""
+    level = 90
+    pixels = np.full((24, 40, channels), level, np.uint8)
+    if channels == 2:
+        pixels[:, :, 0 if encoding == "yuv422" else 1] = 128
+    elif encoding == "mono16":
+        pixels = np.full((24, 40), level * 256 + 7, np.uint16)
+    bag = new_bag()
+    bag.camera_info("/c/camera_info", CAMERA, "", ())
+    bag.image("/c/image", FIRST_NS, pixels, encoding)
+    image = open_sequence(bag.close()).frame(0).image
+    assert image.shape == (24, 40, 3) and np.ptp(image) == 0
+    assert image[0, 0, 0] == pytest.approx(level, abs=16)  # video levels of YUV are stretched
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+def test_red_stays_red(new_bag: NewBag, encoding: str) -> None:
+    if encoding.startswith("bayer"):
+        cell = {"r": 200, "g": 20, "b": 20}
+        pixels = np.tile(np.array([cell[c] for c in encoding[6:10]], np.uint8).reshape(2, 2), (12, 20))
+    else:
+        pixels = np.tile(np.array([200, 20, 20] if encoding == "rgb8" else [20, 20, 200], np.uint8), (24, 40, 1))
+    bag = new_bag()
+    bag.camera_info("/c/camera_info", CAMERA, "", ())
+    bag.image("/c/image", FIRST_NS, pixels, encoding)
+    assert open_sequence(bag.close()).frame(0).image[12, 20].tolist() == [200, 20, 20]
+
+
+def test_calibration(new_bag: NewBag, kind: str, tmp_path: Path, camera_yaml: str) -> None:
+    bag = new_bag(kind)
+    drive(bag, "/raw/image_raw")
+    drive(bag, "/flat/image_rect")
+    bag.camera_info("/bent/camera_info", CAMERA, "equidistant", (-0.05, 0.01, 0.0, 0.0))
+    bag.image("/bent/image_raw", FIRST_NS, picture(0), "mono8")
+    bag.camera_info("/odd/camera_info", CAMERA, "spiral", (1.0,))
+    bag.image("/odd/image_raw", FIRST_NS, picture(0), "mono8")
+    bag.image("/bare/image_raw", FIRST_NS, picture(0), "mono8")
+    path = bag.close()
+    assert open_sequence(path, "/raw/image_raw").intrinsics.fx == 30
+    assert open_sequence(path, "/flat/image_rect").intrinsics.fx == 31  # P of rectified images
+    assert open_sequence(path, "/bent/image_raw").intrinsics.fx not in (30, 31)
+    with pytest.raises(SequenceError, match=r"distortion_model spiral; known are .*give --camera"):
+        open_sequence(path, "/odd/image_raw")
+    with pytest.raises(SequenceError, match=r"no /bare/camera_info for /bare/image_raw .*give --camera"):
+        open_sequence(path, "/bare/image_raw")
+    assert open_sequence(path, "/bare/image_raw", Path("fov=90")).intrinsics.fx == pytest.approx(20)
+
+
+def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag, kind: str) -> None:
+    """The body moves 1 m along its x a frame; the camera looks along that axis, the LiDAR is 2 m above the camera."""
+    bag = new_bag(kind)
+    drive(bag)
+    half = 0.5
+    bag.mount("body", "camera", bag.transform((0.1, 0, 0), (-half, half, -half, half)))
+    bag.mount("camera", "lidar", bag.transform((0, -2, 0)))
+    for k in range(-1, FRAMES + 1):
+        transform = bag.transform((k, 5, 0))
+        bag.write(
+            "/ground_truth",
+            FIRST_NS + k * STEP_NS,
+            bag.stamped_transform(FIRST_NS + k * STEP_NS, "w", "body", transform),
+        )
+    fields = [
+        bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")
+    ]
+    points = np.array([[1, 2, 3, 0], [np.nan, 0, 0, 0], [4, 5, 6, 0]], np.float32)
+    cloud = bag.make(
+        "sensor_msgs/msg/PointCloud2",
+        header=bag.header(FIRST_NS + 2 * STEP_NS + 9_000_000, "lidar"),
+        height=1,
+        width=3,
+        fields=fields,
+        is_bigendian=False,
+        point_step=16,
+        row_step=48,
+        data=points.view(np.uint8).ravel(),
+        is_dense=False,
+    )
+    bag.write("/points", FIRST_NS + 3 * STEP_NS, cloud)
+    sequence = open_sequence(bag.close())
+    assert sequence.reference is not None
+    assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-9)
+    assert [k for k in range(FRAMES) if sequence.has_scan(k)] == [2]
+    assert sequence.scan(2).tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert sequence.T_camera_lidar is not None and sequence.T_camera_lidar[:3, 3].tolist() == [0, -2, 0]
+
+
+def test_truth_of_an_unknown_mount_is_not_used(new_bag: NewBag, caplog: pytest.LogCaptureFixture) -> None:
+    bag = new_bag()
+    drive(bag)
+    bag.write("/vicon/rig", FIRST_NS, bag.stamped_transform(FIRST_NS, "w", "rig", bag.transform((0, 0, 0))))
+    with caplog.at_level(logging.WARNING):
+        assert open_sequence(bag.close()).reference is None
+    assert "/vicon/rig is not used: no static transform from its rig to the camera's camera" in caplog.text
+
+
+def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    drive(bag)
+    path = bag.close()
+    file = path if path.is_file() else next(each for each in path.iterdir() if each.suffix in (".db3", ".mcap"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(SequenceError, match=r"bag .*walk.* cannot be read") as caught:
+        open_sequence(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "walk.bag").write_bytes(b"")
+
+    def absent(name: str) -> None:
+        raise ImportError(f"No module named {name}")
+
+    monkeypatch.setattr(imports.importlib, "import_module", absent)
+    with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
+        open_sequence(tmp_path / "walk.bag")

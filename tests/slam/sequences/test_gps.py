@@ -1,0 +1,65 @@
+"""GPS tracks as receivers and loggers write them, and files that are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.errors import SequenceError
+from slam.sequences.gps import read_gps
+
+NMEA = """$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47
+$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A
+$GPGGA,123520,4807.050,S,01131.000,W,0,00,,,M,,M,,
+$GPGGA,123521,4807.050,S,01131.000,W,1,08,1.8,545.0,M,46.9,M,,
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "track"
+    path.write_text(text)
+    return path
+
+
+def test_csv(tmp_path: Path) -> None:
+    text = "stamp, latitude, longitude, altitude\n0.0,49.0,8.4,115\n1.0,49.00001,8.4,115.5\n"
+    track = read_gps(written(tmp_path, text))
+    np.testing.assert_array_equal(track.stamps, [0.0, 1.0])
+    np.testing.assert_array_equal(track.places, [[49.0, 8.4, 115.0], [49.00001, 8.4, 115.5]])
+    np.testing.assert_array_equal(track.dilution, 1.0)
+
+
+def test_nmea_with_its_date_and_without_fixes_that_are_none(tmp_path: Path) -> None:
+    track = read_gps(written(tmp_path, NMEA))
+    np.testing.assert_allclose(track.stamps, [764426119.0, 764426121.0])  # 1994-03-23 12:35:19 UTC
+    np.testing.assert_allclose(track.places[0], [48.1173, 11.516667, 545.4], atol=1e-6)
+    np.testing.assert_allclose(track.places[1, :2], [-48.1175, -11.516667], atol=1e-6)
+    np.testing.assert_array_equal(track.dilution, [0.9, 1.8])
+
+
+def test_a_wrong_checksum_is_left_out(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="holds no GPS fix"):
+        read_gps(written(tmp_path, NMEA.splitlines()[0].replace("*47", "*48")))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time,lat\n1,2\n", "lacks stamp, latitude, longitude, altitude"),
+        ("stamp,latitude,longitude,altitude\n", "holds no GPS fix"),
+        ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "row 2 is no GPS fix"),
+        ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "row 2 is no GPS fix"),
+        ("stamp,latitude,longitude,altitude\n1,49,8,100\n1,49,8,100\n", "fix 2 does not follow"),
+        ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "row 1 is no GPS fix"),
+    ],
+)
+def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(SequenceError, match=said):
+        read_gps(written(tmp_path, text))
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="cannot be read as a GPS track"):
+        read_gps(tmp_path / "none.csv")

@@ -24,8 +24,8 @@ from slam.config_frontend import (
     RoadConfig,
     ScaleConfig,
     ScaleMode,
-    WindowConfig,
 )
+from slam.config_window import WindowConfig
 
 __all__ = [
     "DepthConfig",

@@ -187,16 +187,8 @@ class Observer:
     def state(self) -> ObserverState:
         """The state from which another observer continues as without an interruption."""
         self.flush()
-        return ObserverState(
-            self._seen,
-            self._gate.state(),
-            self._odometry.state(),
-            self._keyframes.state(),
-            self._road.state(),
-            self._window,
-            self._recent,
-            self._unread,
-        )
+        parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
+        return ObserverState(self._seen, *parts, self._window, self._recent, self._unread)
 
     @property
     def frames(self) -> int:

@@ -9,7 +9,7 @@ from slam.frames import Frame, Intrinsics
 from slam.se3 import FloatArray, from_rotation_vector, invert
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=290.0, fy=290.0, cx=159.5, cy=119.5)
-FAR, NEAR = 4.0, 2.5
+FAR, NEAR = 4.0, 1.8
 _PX_PER_M = 120.0
 
 
@@ -42,7 +42,7 @@ def depth_map(T_world_camera: FloatArray) -> np.ndarray:
     return np.full((INTRINSICS.height, INTRINSICS.width), 2.0 * (FAR - T_world_camera[2, 3]), np.float32)
 
 
-def walk(frames: int, step_m: float = 0.02, turn: float = 0.004) -> FloatArray:
+def walk(frames: int, step_m: float = 0.03, turn: float = 0.004) -> FloatArray:
     """A camera carried to and fro, shaking a little."""
     rng = np.random.default_rng(5)
     phase = np.arange(frames) * 0.08

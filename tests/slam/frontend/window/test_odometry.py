@@ -53,8 +53,8 @@ def test_a_hand_held_camera_is_followed() -> None:
     assert np.sqrt((error**2).mean()) < 0.04 * extent
     turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
     assert np.rad2deg(turned).max() < 0.6
-    # learned depth, twice that of the far wall, gives the unit
-    assert 0.4 < similarity.scale < 0.75
+    # learned depth over depth gives the unit: 2 for the far wall, 4.4 for the near one
+    assert 0.2 < similarity.scale < 0.55
 
 
 @pytest.mark.parametrize("motion", ["standing", "turning"])

@@ -14,12 +14,12 @@ class WindowConfig(Section):
 
     use: Literal["auto", "always", "never"] = Field(
         default="auto",
-        description="auto: where no camera height is known and few steps see a road; never: single steps alone",
+        description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps alone",
     )
-    max_road_ratio: float = Field(
-        default=0.7, ge=0, le=1, description="with auto, ratio of steps with a road homography of a drive on roads"
+    decision_steps: int = Field(default=30, ge=2, description="triangulated steps after which auto decides")
+    vehicle_scatter_deg: float = Field(
+        default=10.0, gt=0, lt=90, description="median angle of a vehicle's steps to their usual direction, degrees"
     )
-    decision_frames: int = Field(default=60, ge=1, description="frames after which auto decides")
     keyframes: int = Field(default=10, ge=3, le=50, description="number of the last keyframes that are adjusted")
     max_corners: int = Field(default=500, ge=50, le=10000, description="largest number of corners of a keyframe")
     corner_quality: float = Field(

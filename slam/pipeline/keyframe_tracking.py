@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
+import numpy as np
+
 from slam.config import SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics
 from slam.frontend.window.odometry import WindowOdometry, WindowState
@@ -20,7 +24,7 @@ def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
 
 
 class KeyframeTracking:
-    """Tracks keyframes beside the steps, until those show a road."""
+    """Tracks keyframes beside the steps, until those are of a vehicle."""
 
     def __init__(self, config: WindowConfig, intrinsics: Intrinsics, seed: int, state: WindowState | None) -> None:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
@@ -39,17 +43,25 @@ class KeyframeTracking:
             self._odometry.add(frame, depth)
 
     def decide(self, seen: Observations) -> None:
-        """End the tracking where the steps so far show a road."""
-        if len(seen.roads) >= self._config.decision_frames and self._is_on_road(seen):
+        """End the tracking where the first steps are those of a vehicle."""
+        if self._odometry is not None and self._config.use == "auto" and is_vehicle(seen, self._config):
             self._odometry = None
 
     def poses(self, seen: Observations) -> WindowPoses:
-        """Relative poses of all frames so far; none on a road."""
-        if self._odometry is None or self._is_on_road(seen):
+        """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""
+        undecided = self._config.use == "auto" and is_vehicle(seen, self._config) is None
+        if self._odometry is None or undecided:
             return WindowPoses()
         return window_poses(self._odometry.state(), self._intrinsics, self._config, self._seed)
 
-    def _is_on_road(self, seen: Observations) -> bool:
-        if self._config.use == "always":
-            return False
-        return len(seen.road_steps) > self._config.max_road_ratio * max(len(seen.motions), 1)
+
+def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:
+    """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
+    triangulated = (motion for motion in seen.motions if motion.triangulated is not None)
+    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, config.decision_steps)]
+    if len(first) < config.decision_steps:
+        return None
+    directions = np.array(first) / np.linalg.norm(first, axis=1, keepdims=True)
+    usual = np.median(directions, axis=0)
+    cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
+    return float(np.median(cosine)) > float(np.cos(np.deg2rad(config.vehicle_scatter_deg)))

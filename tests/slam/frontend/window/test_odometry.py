@@ -9,6 +9,7 @@ from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses, window_poses
 from slam.se3 import FloatArray, rotation_angle, umeyama
+from slam.sequences.catalogue import open_sequence
 from slam.storage.serialisation import Serialiser
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
@@ -99,3 +100,21 @@ def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     for one, other in zip(whole.poses, resumed.poses, strict=True):
         np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
         np.testing.assert_array_equal(one.sigmas, other.sigmas)
+
+
+@pytest.mark.data
+def test_a_real_hand_held_recording(data_root: Path) -> None:
+    recording = data_root / "handheld_kitchen"
+    sequence = open_sequence(recording / "images")
+    indices = range(0, 240, 3)
+    truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)[indices, :, 3]
+    odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
+    unknown = np.full((sequence.intrinsics.height, sequence.intrinsics.width), np.nan, np.float32)
+    for k in indices:
+        odometry.add(sequence.frame(k), unknown)
+    T = chained(window_poses(odometry.state(), sequence.intrinsics, WindowConfig()))
+    assert sorted(T) == list(indices)
+    estimate = np.stack([T[k] for k in indices])
+    similarity = umeyama(truth, estimate[:, :3, 3], with_scale=True)
+    error = np.linalg.norm(similarity.apply_to_poses(estimate)[:, :3, 3] - truth, axis=1)
+    assert np.sqrt((error**2).mean()) < 0.04

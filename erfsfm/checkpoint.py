@@ -132,7 +132,10 @@ def load_model(name_or_folder: str | Path) -> Model:
     """
     folder = find_weights(name_or_folder)
     record = read_record(folder / "model.yaml")
-    nets: list[nn.Module] = list(build_networks(record.network))
+    try:
+        nets: list[nn.Module] = list(build_networks(record.network))
+    except ConfigError as error:
+        raise CheckpointError(f"{folder / 'model.yaml'} names networks that cannot be built: {error}") from error
     for index, (kind, name) in enumerate(zip(KINDS, FILES)):
         if record.networks in ("both", kind):
             fill_network(nets[index], _read_tensors(folder / name), folder / name, "model.yaml says")

@@ -15,7 +15,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.cli_pack import pack
-from erfsfm.errors import ErfsfmError
+from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -338,7 +338,10 @@ def main() -> None:
     try:
         app()
     except (ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm: {error}", err=True)
+        typer.echo(f"erfsfm: {one_line(str(error))}", err=True)
+        sys.exit(1)
+    except MemoryError:
+        typer.echo(f"erfsfm: {OUT_OF_MEMORY}", err=True)
         sys.exit(1)
     except KeyboardInterrupt:
         typer.echo("erfsfm: interrupted; what was written stays", err=True)

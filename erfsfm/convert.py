@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,10 @@ _MARK: dict[NetworkKind, str] = {"depth": "predict_disp1.0.weight", "pose": "pos
 _ENCODER = re.compile(r"conv(?P<stage>[1-7])\.(?P<place>\d+)\.(?P<rest>.+)")
 _DECODER = re.compile(r"(?P<block>upconv|iconv|predict_disp|predict_mask)(?P<level>[1-7])\.(?P<rest>.+)")
 # what a damaged file makes torch.load raise
-_DAMAGED = (RuntimeError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError)
+_DAMAGED = (
+    *(OSError, RuntimeError, EOFError, ValueError, TypeError, KeyError, AttributeError, IndexError),
+    struct.error,
+)
 
 
 @dataclass(frozen=True)

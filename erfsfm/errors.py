@@ -1,7 +1,28 @@
 """The errors a user can cause; the command line prints them as one line and exits with 1."""
 
+_LONGEST = 700
+_LAST = 200
 
-class ErfsfmError(Exception):
+
+OUT_OF_MEMORY = (
+    "memory ran out; what was written stays: use fewer frames or smaller images, or a machine with more memory"
+)
+
+
+def one_line(text: str) -> str:
+    """A message without line breaks; the middle of a very long one is left out."""
+    line = " ".join(text.splitlines())
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - _LAST]} ... {line[-_LAST:]}"
+
+
+class OneLineError(Exception):
+    """An error whose text is one line of bounded length, whatever a damaged file puts into it."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
+
+class ErfsfmError(OneLineError):
     """Base of every known error of the network package."""
 
 

@@ -1,7 +1,8 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and are read up to a limit."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import threading
@@ -9,6 +10,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
+MAX_IMAGE_BYTES = 2**30
+_BLOCK_BYTES = 2**20
 _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
 
@@ -37,6 +41,34 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """The content of a file that has no more than ``most`` bytes; also of a pipe.
+
+    Raises:
+        OSError: it cannot be read, or is larger.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size  # 0 of a pipe, which is read in blocks
+        parts = [file.read(min(size, most))]
+        while sum(map(len, parts)) <= most and (block := file.read(_BLOCK_BYTES)):
+            parts.append(block)
+    content = b"".join(parts)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
+    return content
+
+
+def read_text(path: Path, encoding: str = "utf-8", most: int = MAX_TEXT_BYTES) -> str:
+    """A text file with the line ends of any system.
+
+    Raises:
+        OSError: as `read_bytes`.
+        UnicodeDecodeError: another encoding.
+    """
+    text = read_bytes(path, most).decode(encoding)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def unfinished_name(path: Path) -> str | None:

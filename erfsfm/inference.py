@@ -21,6 +21,7 @@ from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.frozen import Frozen
+from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 from erfsfm.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.readers.images import resize_image
@@ -50,11 +51,15 @@ def choose_device(choice: str) -> torch.device:
     return torch.device("cuda" if choice != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-@dataclass(frozen=True)
+@dataclass
 class PreparedImage:
-    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``."""
+    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``.
+
+    ``features`` are those of a pose network that encodes each image by itself, once they were asked for.
+    """
 
     tensor: Tensor
+    features: Tensor | None = None
 
 
 class DepthPosePredictor:
@@ -74,6 +79,9 @@ class DepthPosePredictor:
         self.sources: int = model.record.network.sources
         self._depth_net = model.depth_net.eval().to(self.device)
         self._pose_net: nn.Module = _PoseMatrices(model.pose_net).eval().to(self.device)
+        self._pose_features: nn.Module | None = None
+        if isinstance(model.pose_net, Lite0PoseNet):
+            self._pose_features = _PoseFeatures(model.pose_net).eval()
         if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
             for network in (self._depth_net, self._pose_net):
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -104,6 +112,7 @@ class DepthPosePredictor:
         """Trace the networks: the same outputs up to rounding, faster on a CPU."""
         if self.device.type == "cpu":
             self._depth_net, self._pose_net = Frozen(self._depth_net), Frozen(self._pose_net)
+            self._pose_features = self._pose_features and Frozen(self._pose_features)
         return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
@@ -154,7 +163,7 @@ class DepthPosePredictor:
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
         middle = self.sources // 2
-        inputs = [self._tensor(image) for image in images]
+        inputs = [self._pose_input(image) for image in images]
         target = inputs.pop(middle)
         T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
         return self._finite(T_source_target, "pose")
@@ -176,6 +185,15 @@ class DepthPosePredictor:
         tensor = torch.from_numpy(resized.astype(np.float32)).to(self.device)
         return tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
 
+    def _pose_input(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
+        """The image, or its features where the pose network encodes each image by itself."""
+        if self._pose_features is None:
+            return self._tensor(image)
+        prepared = image if isinstance(image, PreparedImage) else self.prepare(image)
+        if prepared.features is None:
+            prepared.features = self._pose_features(prepared.tensor)
+        return prepared.features
+
     def _tensor(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
         return image.tensor if isinstance(image, PreparedImage) else self._input(image)
 
@@ -188,9 +206,24 @@ class _PoseMatrices(nn.Module):
         self.network = network
 
     def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
-        """``T_source_target`` ``(N, 4, 4)``, unscaled."""
-        vectors: Tensor = self.network(target, sources)
+        """``T_source_target`` ``(N, 4, 4)``, unscaled, of images or of their features."""
+        if isinstance(self.network, Lite0PoseNet):
+            vectors = self.network.motion(target, sources)
+        else:
+            vectors = self.network(target, sources)
         return pose_vector_to_matrix(vectors[0].double())
+
+
+class _PoseFeatures(nn.Module):
+    """What a pose network sees of one image."""
+
+    def __init__(self, network: Lite0PoseNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(1, 3, h, w)`` to ``(1, C, h / 16, w / 16)``."""
+        return self.network.features(image)
 
 
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

@@ -13,19 +13,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from erfsfm import __version__
-from erfsfm.errors import ErfsfmError
+from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
+from slam.localisation.cli import verbs as localisation_verbs
 from slam.runtime.progress import progress_bar
 from slam.runtime.signals import Terminated
+from slam.runtime.terminal import print_table
 from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from slam.results.folder import RunFolder
+    pass
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -79,7 +79,7 @@ def run(
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder; these frames follow its last one")
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
     gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
     seed: Seed = 0,
@@ -151,36 +151,7 @@ app.add_typer(calibration_verbs)
 app.add_typer(download_verbs)
 
 
-@app.command()
-def localize(
-    images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
-    map: Annotated[Path, typer.Option("--map", help="a run folder")],
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the images; default: that of the run")] = None,
-    output: Annotated[Path | None, typer.Option(help="TUM file for the poses found; image numbers as stamps")] = None,
-    as_json: Json = False,
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Poses of new images in an earlier run's map. They are in its frame and unit.
-
-    Example: erfsfm-slam localize photos --map results/latest --output photos.tum
-    """
-    from slam.localisation.localiser import localise
-    from slam.localisation.tables import localisation_json, localisation_table, write_localisations
-    from slam.results.folder import RunFolder
-
-    run_folder = RunFolder.open(map)
-    with progress_bar() as progress:
-        found = []
-        for localisation in localise(images, run_folder, camera):
-            found.append(localisation)
-            progress("images", len(found), len(found))
-    if as_json:
-        typer.echo(json.dumps(localisation_json(found), indent=2))
-    else:
-        _print_localisations(run_folder, localisation_table(found))
-    if output is not None:
-        write_localisations(output, found)
+app.add_typer(localisation_verbs)
 
 
 @app.command()
@@ -260,7 +231,7 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(comparison_json(runs), indent=2))
     else:
-        _print_table(comparison_table(runs))
+        print_table(comparison_table(runs))
 
 
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
@@ -273,7 +244,7 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
     if as_json:
         typer.echo(json.dumps(metrics, indent=2))
     else:
-        _print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
         for line in evo_commands(estimate, reference, format):
             typer.echo(line)
     broken = exceeded(metrics, limits)
@@ -287,7 +258,7 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
 
     sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
     known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
-    _print_table(metrics_table(known, f"{sequence['name']}, scale {metrics['scale']['mode']}"))
+    print_table(metrics_table(known, f"{sequence['name']}, scale {metrics['scale']['mode']}"))
     for note in unit_notes(metrics):
         typer.echo(note)
     for gap in sequence["bridged"]:
@@ -306,22 +277,6 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     )
 
 
-def _print_localisations(run_folder: RunFolder, table: Table) -> None:
-    from slam.results.comparison import unit_notes
-
-    _print_table(table)
-    for note in unit_notes(run_folder.metrics()):
-        typer.echo(note)
-
-
-def _print_table(table: Table) -> None:
-    """As wide as the terminal; in a pipe without wrapping."""
-    from rich.console import Console
-
-    on_terminal = sys.stdout is not None and sys.stdout.isatty()
-    Console(width=None if on_terminal else 200).print(table)
-
-
 def main() -> None:
     """Run the command line: a known error becomes one line and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -331,7 +286,10 @@ def main() -> None:
     try:
         app(prog_name="erfsfm-slam")
     except (SlamError, ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm-slam: {' '.join(str(error).splitlines())}", err=True)
+        typer.echo(f"erfsfm-slam: {one_line(str(error))}", err=True)
+        sys.exit(1)
+    except MemoryError:
+        typer.echo(f"erfsfm-slam: {OUT_OF_MEMORY}", err=True)
         sys.exit(1)
     except SystemExit as end:
         if end.code == _INTERRUPTED:

@@ -177,7 +177,7 @@ class PoseGraphConfig(Section):
 
 
 class MappingConfig(Section):
-    """TSDF fusion, see ``mapping.py``; metres, or camera heights under scale mode none."""
+    """TSDF fusion, see ``mapping/``; metres, or camera heights under scale mode none."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
@@ -186,27 +186,44 @@ class MappingConfig(Section):
         default=3.0, ge=0, description="or rotation after which a frame is fused, degrees"
     )
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
-    voxel_size_m: float = Field(default=0.2, gt=0, description="side of a voxel")
+    voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
     truncation_voxels: float = Field(
-        default=4.5, ge=1, description="truncation distance of the signed distance, voxels"
+        default=8.0, ge=1, description="truncation distance of the signed distance, voxels"
+    )
+    sky_brightness: int = Field(
+        default=245,
+        ge=1,
+        le=256,
+        description="level of all colours from which on a pixel above the horizon is sky",
+    )
+    sky_blueness: int = Field(
+        default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"
     )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth")
-    depth_max_m: float = Field(default=25.0, gt=0, description="largest fused depth")
+    depth_max_m: float = Field(default=22.0, gt=0, description="largest fused depth")
+    border: float = Field(
+        default=0.02, ge=0, lt=0.5, description="left, right and upper border left out, over the image's width"
+    )
+    bonnet: float = Field(
+        default=0.0, ge=0, lt=1, description="lower part left out, over the image's height: the car's own bonnet"
+    )
     max_depth_step: float = Field(
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
     consistency: float = Field(
-        default=0.1, gt=0, description="largest relative depth difference to the previous keyframe"
+        default=0.15, gt=0, description="largest relative depth difference to the previous keyframe"
     )
     max_relative_sigma: float = Field(
         default=0.2, gt=0, description="largest sigma of refined depth that is fused, relative to it"
     )
-    min_weight: float = Field(default=3.0, ge=0, description="least number of observations of an extracted voxel")
+    min_weight: float = Field(default=2.0, ge=0, description="least number of observations of an extracted voxel")
     min_component_triangles: int = Field(
-        default=100, ge=0, description="least number of triangles of a connected piece of the mesh"
+        default=300, ge=0, description="least number of triangles of a connected piece of the mesh"
     )
-    max_blocks: int = Field(
-        default=12000, ge=16, description="number of blocks (16^3 voxels, 80 KiB each) at which fusion stops"
+    close_holes_m: float = Field(default=1.5, ge=0, description="largest diameter of a hole of the road to close")
+    submap_m: float = Field(default=60.0, gt=0, description="length of road in a submap")
+    memory_mb: int = Field(
+        default=1000, ge=100, description="memory of the map, MiB: a submap ends before submap_m where it would be more"
     )
 
     @model_validator(mode="after")

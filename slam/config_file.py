@@ -54,6 +54,7 @@ OLD_NAMES = OldNames(
         "loops.length_sigma_share": "loops.length_relative_sigma",
         "loops.max_drift_share": "loops.max_drift_ratio",
         "loops.support_drift_share": "loops.support_drift_ratio",
+        "mapping.max_blocks": "mapping.memory_mb",
     },
     values={("frontend.use", "bridge"): "gaps"},
 )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from erfsfm.errors import DataError
+from erfsfm.errors import DataError, OneLineError
 
 
-class SlamError(Exception):
+class SlamError(OneLineError):
     """Base of every known error of the SLAM package."""
 
 
@@ -38,6 +38,10 @@ class TrajectoryError(SlamError):
 
 class RunError(SlamError):
     """A run folder is missing or incomplete."""
+
+
+class EmptyMapError(SlamError):
+    """A map without any surface."""
 
 
 @contextmanager

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from erfsfm import __version__
 from erfsfm.errors import ErfsfmError
-from erfsfm.inference import DepthPosePredictor, commit, overlapping
+from erfsfm.inference import DepthPosePredictor, commit
 from erfsfm.threads import limit_library_threads
 from slam.config import SlamConfig, dump_yaml, load_config
-from slam.errors import ConfigError, RunError, SlamError
+from slam.continuation import (
+    provenance_to_resume,
+    require_other_output,
+    settings_to_continue,
+    settings_to_resume,
+    state_to_continue,
+    state_to_resume,
+)
+from slam.errors import RunError, SlamError
 from slam.frames import Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
+from slam.pipeline.journal import Journal, clear_journal
+from slam.pipeline.observer import ObserverState
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
@@ -30,7 +41,7 @@ from slam.results.gps import write_places
 from slam.results.map import write_map
 from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
-from slam.results.output import UNFINISHED, check_output
+from slam.results.output import check_output
 from slam.results.report import DepthExample, write_report
 from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog, run_log
@@ -38,11 +49,11 @@ from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.imports import import_rerun
 from slam.runtime.signals import Terminated, raising_on_termination
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.continued import Continued
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
 
-# sections that the pass over the frames depends on: `run --continue` cannot change them
-_FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
+logger = logging.getLogger(__name__)
 
 
 class RunOptions(TypedDict, total=False):
@@ -85,7 +96,8 @@ class RunRequest:
         cache: folder of network outputs and image measurements; None computes all of them.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
-            configuration is used, and the new folder has the whole drive.
+            configuration is used, and the new folder has the whole drive. A run that did not end goes on in its own
+            folder, with its recording, weights and seed.
         gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``.
     """
 
@@ -128,8 +140,7 @@ def run_slam(
     """
     request = RunRequest(dataset, sequence, **options)
     with run_log() as log, raising_on_termination() as ignore_signals:
-        job = _prepare(request)
-        folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
+        job, folder = _begin(request)
         folder.write_metrics(describe_start(job.provenance))
         try:
             log.begin(folder.path / LOG)
@@ -155,71 +166,76 @@ class _Job:
     pipeline: SlamPipeline
     provenance: Provenance
     predictors_sha256: str
+    checkpoint: SessionCheckpoint | None
+
+    def checkpoint_of(self, state: ObserverState) -> SessionCheckpoint:
+        """What is kept of this run after some of its frames."""
+        return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
 
 
-def _prepare(request: RunRequest) -> _Job:
+def _begin(request: RunRequest) -> tuple[_Job, RunFolder]:
+    """Check everything, then make the folder of a new run, or go on in that of one that did not end."""
+    if request.continues is not None:
+        provenance = provenance_to_resume(request.continues, request.output, _recording(request))
+        if provenance is not None:
+            return _resume(request, request.continues, provenance)
+        require_other_output(request.continues, request.output)
+    job = _prepare(request)
+    return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
+
+
+def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tuple[_Job, RunFolder]:
+    """A run that did not end, on what it was run on, from its last kept state."""
+    named = provenance["recording"]
+    files = {name: Path(named[name]) if name in named else None for name in ("dataset", "camera", "gps")}
+    words = {name: named.get(name) for name in ("sequence", "frames")}
+    weights = provenance["weights"] if request.weights == "default" else request.weights
+    seed = request.seed or provenance["seed"]
+    same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
+    job = _prepare(same, place)
+    logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
+    return job, RunFolder.resume(place)
+
+
+def _prepare(request: RunRequest, resumes: Path | None = None) -> _Job:
     """Open and check all inputs of a run; writes nothing but the cache's folder."""
     if request.output is not None:
         check_output(request.output)
     if request.rerun is not None:
         import_rerun()
-    settings = _settings(request)
+    settings = _settings(request, resumes)
     dataset = None if request.dataset is None else Path(request.dataset)
     recording = open_sequence(dataset, request.sequence, request.camera, request.frames)
     networks = DepthPosePredictor.from_weights(request.weights, request.device).freeze()
     checkpoint, first = None, 0
     following = recording
-    if request.continues is not None:
-        checkpoint = _checkpoint(request.continues, following)
+    if resumes is not None:
+        checkpoint = state_to_resume(resumes, recording)
+    elif request.continues is not None:
+        checkpoint = state_to_continue(request.continues, following)
         recording = checkpoint.continued(following)
         first = len(recording) - len(following)
     source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first))
     sha256 = mixed_sha256(networks.sha256, source)
     if checkpoint is not None and checkpoint.weights_sha256 != sha256:
         raise RunError(
-            f"{request.continues} was run with other weights or another depth source: continue it with the same "
-            "--weights and depth.source"
+            f"{resumes or request.continues} was run with other weights or another depth source: continue it with the "
+            "same --weights and depth.source"
         )
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     rest = get_or_compute, checkpoint, request.seed, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
-    return _Job(request, settings, recording, pipeline, _provenance(request, networks, recording, source), sha256)
+    provenance = _provenance(request, networks, recording, source)
+    return _Job(request, settings, recording, pipeline, provenance, sha256, checkpoint)
 
 
-def _settings(request: RunRequest) -> SlamConfig:
-    """The configuration; of a run to continue, with changes that do not affect the pass over its frames."""
-    continues = request.continues
-    if continues is None:
-        return load_config(request.config, request.overrides)
-    if request.config is not None:
-        raise ConfigError(f"the configuration of {continues} is used to continue it: leave out --config")
-    output = request.output
-    if output is not None and continues.resolve() in (output.resolve(), (output / UNFINISHED).resolve()):
-        raise RunError(
-            f"{continues} is the run to continue, and would be lost with --output {output}: choose another --output"
-        )
-    own = load_config(RunFolder.open(continues).require("config.yaml"))
-    settings = load_config(continues / "config.yaml", request.overrides)
-    # another path may lead to the same source, or to more files of it: its identity is compared later
-    depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})
-    compared = settings.model_copy(update={"depth": depth})
-    for name in _FIXED_SECTIONS:
-        if getattr(compared, name) != getattr(own, name):
-            raise ConfigError(
-                f"{name} cannot be changed for {continues}: leave out --set {name}..., or run from the first frame"
-            )
-    return settings
-
-
-def _checkpoint(continues: Path, following: FrameSequence) -> SessionCheckpoint:
-    """The checkpoint of a run to continue, if these frames can follow it."""
-    checkpoint = SessionCheckpoint.open(continues)
-    ranges = [name for name in following.provenance() if name.endswith("]")]  # a simulated world has none
-    twice = overlapping(ranges, checkpoint.sources)
-    if twice:
-        raise RunError(f"{', '.join(twice)} holds frames of {continues}: give those that follow, with --frames A:B")
-    return checkpoint
+def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:
+    if resumes is not None:
+        return settings_to_resume(resumes, request.config, request.overrides)
+    if request.continues is not None:
+        return settings_to_continue(request.continues, request.config, request.overrides)
+    return load_config(request.config, request.overrides)
 
 
 def _frame_numbers(recording: FrameSequence, first: int) -> FrameNumbers:
@@ -251,23 +267,25 @@ def _provenance(
 
 def _recording(request: RunRequest) -> dict[str, str]:
     """The options that name the recording; files by their whole paths, for it may be opened from another folder."""
-    files = {"dataset": request.dataset, "camera": request.camera}
+    files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
     named = {name: Path(path) for name, path in files.items() if path is not None}
     places = {name: str(path.absolute() if path.exists() else path) for name, path in named.items()}
-    return places if request.sequence is None else places | {"sequence": request.sequence}
+    words = {"sequence": request.sequence, "frames": request.frames}
+    return places | {name: word for name, word in words.items() if word is not None}
 
 
 def _run(job: _Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
     folder.write_text("config.yaml", dump_yaml(job.settings))
-    estimate = job.pipeline.estimate()
+    estimate = job.pipeline.estimate(_journal(job, folder.path))
     _write_estimate(folder, estimate, job)
+    clear_journal(folder.path)
     metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
     quality = DepthQuality(job.recording, estimate.scale.mode)
-    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add))
-    numbers = write_map(folder, result, job.recording)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    numbers = write_map(folder, result, job.recording, job.request.progress)
     depth = quality.summary(job.settings.depth.refine != "none")
     folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
     views = write_map_views(folder, job.settings.output.viewer_triangles)
@@ -276,6 +294,17 @@ def _run(job: _Job, folder: RunFolder) -> None:
         write_report(folder, examples, views)
     if job.request.rerun is not None:
         write_rerun(job.request.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
+
+
+def _journal(job: _Job, folder: Path) -> Journal | None:
+    """Where the state of the pass is kept; not of a drive whose first frames are in another folder."""
+    keep = job.settings.output.keep
+    if keep == "nothing" or isinstance(job.recording, Continued):
+        return None
+    journal = Journal(folder, job.checkpoint_of, with_keyframes=keep == "keyframes")
+    if job.checkpoint is not None:
+        journal.begin_after(job.checkpoint.state.seen)
+    return journal
 
 
 def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
@@ -293,8 +322,7 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: _Job) -> None:
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
     keep = job.settings.output.keep
     if keep != "nothing":
-        checkpoint = SessionCheckpoint.of(job.recording, result.state, job.predictors_sha256)
-        folder.write(DRIVE, checkpoint.write)
+        folder.write(DRIVE, job.checkpoint_of(result.state).write)
     if keep == "keyframes":
         folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from erfsfm.files import read_text
 from slam import se3
 from slam.errors import TrajectoryError
 from slam.se3 import FloatArray
@@ -213,11 +214,11 @@ def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     if path.is_dir():
         raise TrajectoryError(f"{path}: this is a folder, not a trajectory file")
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except FileNotFoundError as error:
         raise TrajectoryError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
-        raise TrajectoryError(f"{path}: this is not a text file") from error
+        raise TrajectoryError(f"{path}: this is not a text file (UTF-8)") from error
     except OSError as error:
         raise TrajectoryError(f"{path}: {error.strerror}") from error
     for line, content in enumerate(text.splitlines(), start=1):

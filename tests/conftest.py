@@ -84,7 +84,8 @@ _METRICS = {
     "graph": {"nodes": int, "factors": int, "coverage": dict.fromkeys(("50", "90", "95"), float)},
     "loops": {**dict.fromkeys(("candidates", "verified", "accepted"), int), "rejected": list},
     "map": {
-        **dict.fromkeys(("triangles", "points", "blocks"), int),
+        **dict.fromkeys(("triangles", "points", "blocks", "submaps"), int),
+        **{"filters": dict, "floater_share": float, "double_wall_share": float},
         **_MAP_ERRORS,
         **{"in_field": dict, "by_distance": list, "truth": str, "evaluated_m": float},
         "with_scale": {"scale": float, **_MAP_ERRORS},

@@ -1,10 +1,10 @@
 """Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
 accuracy measures simulated worlds and KITTI sequences, ablation turns off one part at a time, speed measures time and
-memory. Every run is a process and a folder of its own under --output. A successful one is not repeated as long as
-sources, weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its
-reason. --jobs and --scheduler need Dask: pip install 'erfsfm-slam[benchmark]'. A scheduler's workers need the same
-files at the same paths.
+memory, maps the errors of the map with one of its parts turned off at a time. Every run is a process and a folder of
+its own under --output. A successful one is not repeated as long as sources, weights and options stay the same, so that
+a killed benchmark can be resumed; a failed one is a row with its reason. --jobs and --scheduler need Dask: pip install
+'erfsfm-slam[benchmark]'. A scheduler's workers need the same files at the same paths.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -16,12 +16,25 @@ import csv
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 from benchmarking.metric_definitions import rows
 from benchmarking.page import PICTURE, section, with_section
 from benchmarking.picture import draw, drawable
-from benchmarking.plan import ABLATION, ACCURACY, GROWTH, SPEED, Condition, Job, excerpts, plan, recordings, worlds
+from benchmarking.plan import (
+    ABLATION,
+    ACCURACY,
+    GROWTH,
+    MAPS,
+    SPEED,
+    Condition,
+    Job,
+    excerpts,
+    plan,
+    raw_drives,
+    recordings,
+    worlds,
+)
 from benchmarking.summary import summary_table
 from benchmarking.work import ROOT, measured, workers
 
@@ -47,8 +60,9 @@ def main(words: Sequence[str] | None = None) -> None:
         writer = csv.DictWriter(file, table_of_runs[0])
         writer.writeheader()
         writer.writerows(table_of_runs)
+    drives = [(path, "DRIVE") for path in getattr(options, "drives", ())]
     text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
-    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), (options.kitti, "KITTI"), (ROOT, ".")
+    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), (options.kitti, "KITTI"), (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
@@ -63,10 +77,12 @@ def main(words: Sequence[str] | None = None) -> None:
 def _jobs(options: argparse.Namespace) -> list[Job]:
     folder = options.output.resolve() / options.mode
     simulated = (options.worlds_in or options.output / "worlds").resolve()
-    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions)
+    truth: tuple[Literal["depth"], ...] = ("depth",) if options.mode == "maps" else ()
+    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth)
+    drives += raw_drives(getattr(options, "drives", ()))
     if options.kitti is not None:
         drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
-    configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED}[options.mode]
+    configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED, "maps": MAPS}[options.mode]
     rest = options.weights, options.seeds, options.set, options.device
     jobs = plan(folder, drives, configurations, *rest)
     if options.mode == "speed" and options.growth:
@@ -100,25 +116,37 @@ def _command(options: argparse.Namespace) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    modes = parser.add_subparsers(dest="mode", required=True, metavar="accuracy|ablation|speed")
+    modes = parser.add_subparsers(dest="mode", required=True, metavar="accuracy|ablation|speed|maps")
     for mode, what in (
         ("accuracy", "errors of network, odometry and optimised trajectory on every sequence"),
         ("ablation", "the same with one part turned off at a time"),
         ("speed", "time of every stage, memory, growth with the number of frames; one run after another"),
+        ("maps", "errors, size and cost of the map, with one of its parts turned off at a time"),
     ):
         add = modes.add_parser(
             mode, help=what, description=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
         ).add_argument
         fast = mode == "speed"
+        many = mode in ("accuracy", "ablation")
         add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
         add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
         add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
-        add("--routes", nargs="*", default=["loop"] if fast else ["loop", "straight"], help="of simulated worlds")
+        add(
+            "--routes",
+            nargs="*",
+            default=["loop", "straight"] if many else ["loop"],
+            help="of simulated worlds",
+        )
         add("--worlds", nargs="+", type=int, default=[610, 611] if mode == "accuracy" else [610], help="their seeds")
         add("--frames", type=int, default=300, help="their length")
         add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
         add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
-        add("--weights", nargs="+", default=["default"] if fast else ["default", "sim"], help="names or folders")
+        add(
+            "--weights",
+            nargs="+",
+            default=["default", "sim"] if many else ["default"],
+            help="names or folders",
+        )
         add(
             "--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the RANSAC draws"
         )
@@ -126,6 +154,8 @@ def _parser() -> argparse.ArgumentParser:
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
+        if mode == "maps":
+            add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives with LiDAR")
         if fast:
             add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
         else:

@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ LARGEST_WIDTH = 832  # pixels of the images that are measured: finer flow is slo
 _CHUNK = 8  # labels of one task
 
 Progress = Callable[[str, int, int], None]
+Measures = Literal["depth and poses", "poses"]
 
 
 @dataclass(frozen=True)
@@ -146,12 +147,21 @@ class ManyViewTeacher:
         size: height and width of the labels.
         stride: every how many frames there is one.
         cache_mb: memory for labels that were read.
+        measures: with ``poses`` alone there are no labels, every frame may be a target, and no depth is bounded.
     """
 
-    def __init__(self, folder: Path, size: tuple[int, int], stride: int, cache_mb: int = 0) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        size: tuple[int, int],
+        stride: int,
+        cache_mb: int = 0,
+        measures: Measures = "depth and poses",
+    ) -> None:
+        self.measures = measures
         self._folder = folder
         self._size = size
-        self._stride = stride
+        self._stride = stride if measures == "depth and poses" else 1
         self._labels = ArrayCache(cache_mb, (2, *size), np.float16)
         self._drives: dict[int, DriveLabels] = {}
 
@@ -166,6 +176,9 @@ class ManyViewTeacher:
     def structure(self, recording: Recording, first: int, sources: int) -> TeacherStructure:
         """Of the snippet that begins at a frame."""
         drive, target = self.drive(recording), first + sources // 2
+        if self.measures == "poses":
+            nothing = np.zeros(self._size, dtype=np.float16)
+            return TeacherStructure(drive.motion(first, sources), nothing, np.full_like(nothing, np.inf))
         least, most = self._labels.get((id(recording), target), lambda: np.stack(drive.label(target)))
         return TeacherStructure(drive.motion(first, sources), least, most)
 
@@ -180,6 +193,8 @@ class ManyViewTeacher:
         for done, drive in enumerate(without):
             progress("teacher: poses", done, len(without))
             drive.measure_poses(weights)
+        if self.measures == "poses":
+            return
         tasks = [(drive, chunk) for drive in drives for chunk in _missing(drive, sources)]
         total, done = sum(len(chunk) for _, chunk in tasks), 0
         if not tasks:

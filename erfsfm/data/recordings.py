@@ -102,9 +102,12 @@ class Recording:
         if self.poses_file is None:
             return None
         try:
-            rows = np.loadtxt(self.poses_file, ndmin=2).reshape(-1, 3, 4)
-        except ValueError as error:
+            numbers = np.loadtxt(self.poses_file, ndmin=2)
+            if numbers.shape[1] != 12 or not np.isfinite(numbers).all():
+                raise ValueError(f"it has {numbers.shape[1]} columns, or a number that is not finite")
+        except (OSError, ValueError) as error:
             raise DataError(f"{self.poses_file} must hold 12 numbers a row: {error}") from error
+        rows = numbers.reshape(-1, 3, 4)
         first = self.skipped if len(rows) == self.stored else self.start
         rows = rows[first : first + len(self)]
         if len(rows) < len(self):

@@ -36,6 +36,8 @@ logger = logging.getLogger(__name__)
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
 FOCAL_LENGTH = 1.9
 
+_MOST_FRAMES = 10_000_000  # of a recording
+
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
 
@@ -81,13 +83,15 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3).
+        """Sample ``number``: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3), and ``frames``
+        (N + 1): of each image in time order a number that is its own, mirrored another one.
 
         With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With
         weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
         """
         rng = np.random.default_rng([self._config.training.seed, number])
-        recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
+        which = int(rng.choice(len(self.recordings), p=self._probabilities))
+        recording = self.recordings[which]
         network = self._config.network
         starts = self._starts(recording)
         snippet = Snippet(recording, starts[int(rng.integers(len(starts)))])
@@ -97,6 +101,8 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
         images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
         sample = as_tensors(images, varied.K)
+        first = (2 * which + mirrored) * _MOST_FRAMES + snippet.first
+        sample["frames"] = torch.arange(first, first + network.sources + 1)
         if seen is not None:
             T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
             if self._many_views is not None:

@@ -94,16 +94,16 @@ class InvertedResidual(nn.Module):
 
 
 class Lite0Encoder(Encoder):
-    """Stem and seven stages, then a `context` of 3 x 3 convolutions at 1/32; each stage's output is kept.
+    """Stem and seven stages or the first of them, then a `context` of 3 x 3 convolutions; each output is kept.
 
     Batch statistics stay ImageNet's: a batch of four video frames is too few for its own.
     """
 
-    def __init__(self, in_channels: int, context: list[ConvBlock]) -> None:
+    def __init__(self, in_channels: int, context: list[ConvBlock], pretrained: int = 1 + len(STAGES)) -> None:
         super().__init__([])
         self.stages.append(nn.Sequential(Lite0Conv(in_channels, STEM_CHANNELS, Layer(3, 2))))
         inside = STEM_CHANNELS
-        for repeats, kernel, stride, expansion, outside in STAGES:
+        for repeats, kernel, stride, expansion, outside in STAGES[: pretrained - 1]:
             blocks = []
             for repeat in range(repeats):
                 layer = Layer(kernel, stride if repeat == 0 else 1)
@@ -131,17 +131,15 @@ class Lite0Encoder(Encoder):
         self.stages[:stages].requires_grad_(False)
 
     def take_imagenet(self) -> None:
-        """Start from ImageNet's weights; further input images share those of the first.
+        """Start from ImageNet's weights.
 
         Raises:
             ConfigError: the package that holds them is not installed, or not what it should be.
         """
         tensors = [value for key, value in _imagenet().items() if key.startswith(("_conv_stem", "_bn0", "_blocks"))]
         ours = [value for stage in self.stages[:-1] for value in stage.state_dict().values()]
-        if len(ours) != len(tensors):
+        if len(ours) > len(tensors):
             raise ConfigError(f"the ImageNet weights have {len(tensors)} tensors where {len(ours)} are needed")
-        images = ours[0].shape[1] // 3
-        tensors[0] = tensors[0].repeat(1, images, 1, 1) / images
         for own, value in zip(ours, tensors):
             if own.shape != value.shape:
                 raise ConfigError(f"an ImageNet weight has shape {tuple(value.shape)}, not {tuple(own.shape)}")

@@ -124,7 +124,13 @@ class PoseNet(nn.Module):
 
 
 def stack_images(target: Tensor, sources: Sequence[Tensor], count: int) -> Tensor:
-    """Target and `count` sources ``(B, 3, H, W)`` as one input ``(B, 3 * (1 + count), H, W)``.
+    """Target and `count` sources ``(B, 3, H, W)`` as one input ``(B, 3 * (1 + count), H, W)``."""
+    check_images(target, sources, count)
+    return torch.cat([target, *sources], dim=1)
+
+
+def check_images(target: Tensor, sources: Sequence[Tensor], count: int) -> None:
+    """Refuse images that are not a snippet.
 
     Raises:
         ValueError: another number of sources, or images of different shapes.
@@ -137,7 +143,6 @@ def stack_images(target: Tensor, sources: Sequence[Tensor], count: int) -> Tenso
                 "target and sources must have one shape (B, 3, H, W); "
                 f"got {tuple(target.shape)} and {tuple(image.shape)}"
             )
-    return torch.cat([target, *sources], dim=1)
 
 
 def pose_vectors(features: Tensor, sources: int) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
+from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
 
 Image = NDArray[np.uint8]
 
@@ -113,7 +114,7 @@ def _is_image(path: Path) -> bool:
 
 def _file_bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path, MAX_IMAGE_BYTES)
     except OSError as error:
         raise DataError(f"cannot read image {path}: {error.strerror}") from error
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
+from erfsfm.files import read_text
 from erfsfm.readers.pinhole import Pinhole, require_plausible
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +42,7 @@ class CalibrationFile:
             shipped = _SHIPPED.get(path.name)
             raise DataError(f"no {path.name} in {path.parent}" + (f": KITTI ships it {shipped}" if shipped else ""))
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DataError(f"cannot read calibration {path}: {error}") from error
         rows = (line.partition(":") for line in text.splitlines() if line.strip())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
+from erfsfm.files import read_text
 
 FloatArray = NDArray[np.float64]
 
@@ -22,11 +23,11 @@ def read_packet(path: Path) -> FloatArray:
         DataError: it cannot be read, or has not 30 numbers.
     """
     try:
-        row = [float(word) for word in path.read_text(encoding="utf-8").split()]
+        row = [float(word) for word in read_text(path).split()]
     except (OSError, ValueError) as error:
         raise DataError(f"cannot read OXTS packet {path}: {error}") from error
-    if len(row) != _COLUMNS:
-        raise DataError(f"OXTS packet {path} has {len(row)} numbers, not {_COLUMNS}: copy it again")
+    if len(row) != _COLUMNS or not np.isfinite(row).all():
+        raise DataError(f"OXTS packet {path} has {len(row)} numbers, not {_COLUMNS} finite ones: copy it again")
     return np.array(row)
 
 

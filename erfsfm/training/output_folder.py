@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from pathlib import Path
 
 import torch
@@ -12,6 +13,8 @@ from erfsfm.errors import ConfigError, TrainingError
 from erfsfm.files import write_atomically
 
 CONFIG = "config.yaml"
+# what a damaged checkpoint makes torch.load raise besides
+_OTHERS = (TypeError, AttributeError, OSError, struct.error)
 _BEGUN = {CONFIG, "checkpoints", "logs", "last", "best_pose"}  # left by a run that failed before its first weights
 
 
@@ -90,7 +93,7 @@ def _steps_of(checkpoint: Path) -> int:
         if {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:
             raise KeyError("depth_net")
         return int(state["global_step"])
-    except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, TypeError, KeyError) as error:
+    except (pickle.UnpicklingError, EOFError, RuntimeError, ValueError, LookupError, *_OTHERS) as error:
         raise TrainingError(
             f"{checkpoint} is damaged or no checkpoint of erfsfm: it cannot be resumed; start again in another --output"
         ) from error

@@ -130,7 +130,8 @@ def _encoded(recording: Recording, config: ExperimentConfig, teacher: ManyViewTe
     if teacher is None:
         return _Drive(recording, images)
     measured = teacher.drive(recording)
-    labels = {target: encode(*measured.label(target)) for target in measured.targets(config.network.sources)}
+    targets = measured.targets(config.network.sources) if teacher.measures == "depth and poses" else ()
+    labels = {target: encode(*measured.label(target)) for target in targets}
     return _Drive(recording, images, labels, measured)
 
 

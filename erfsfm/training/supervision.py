@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.many_view_teacher import ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.training.progress import stage_bars
@@ -25,7 +25,9 @@ def measured_views(
     if config.teacher.views != "many":
         return None
     size = (config.network.height, config.network.width)
-    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, labels_mb(config.data))
+    measures: Measures = "poses" if config.training.networks == "pose" else "depth and poses"
+    cache_mb = labels_mb(config.data)
+    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, cache_mb, measures)
     with stage_bars(quiet) as show:
         teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
     return teacher

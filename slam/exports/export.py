@@ -10,6 +10,7 @@ import numpy as np
 
 from slam import se3
 from slam.errors import RunError
+from slam.exports.map_file import has_map, map_file
 from slam.exports.nerfstudio import write_scene
 from slam.exports.occupancy import occupancy_grid
 from slam.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
@@ -77,7 +78,7 @@ def export(
     elif output.is_dir():
         raise RunError(f"{output} is a folder: give the name of a file to write")
     if what in _WRITERS:
-        _export_map(folder, what, output, up, options)
+        _export_map(folder, what, output, up, options, progress)
     elif what == "trajectory":
         write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
         write(output, _trajectory(folder, up))
@@ -86,35 +87,37 @@ def export(
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     elif what == "colmap":
-        _export_colmap(folder, output, up, options)
+        _export_colmap(folder, output, up, options, progress)
     elif what == "nerfstudio":
-        cloud = _cloud(folder, up, options)
+        cloud = _cloud(folder, up, options, progress)
         write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
     elif what == "raster":
-        _export_raster(folder, output, options)
+        _export_raster(folder, output, options, progress)
     else:
-        return _export_occupancy(folder, output, options)
+        return _export_occupancy(folder, output, options, progress)
     return output
 
 
-def _export_map(folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions) -> None:
+def _export_map(
+    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress | None
+) -> None:
     writers = _WRITERS[what]
     write = writers.get(output.suffix.lower())
     if write is None:
         known = ", ".join(writers)
         raise RunError(f"a {what} is written as {known}; got '{output.name}', give a name that ends in one of these")
-    source = folder.require(f"map_{what}.ply")
-    ply = read_ply(source)
-    if write is write_ply and up == "y-down" and options == ExportOptions():
-        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
-    else:
-        write(output, _rotated(prepared(ply, options), up))
+    with map_file(folder, what, progress) as source:
+        ply = read_ply(source)
+        if write is write_ply and up == "y-down" and options == ExportOptions():
+            write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
+        else:
+            write(output, _rotated(prepared(ply, options), up))
 
 
-def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions) -> None:
+def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress | None) -> None:
     """Poses of all frames, the run's camera, and the cloud of the map where there is one."""
     trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
-    cloud = _cloud(folder, up, options)
+    cloud = _cloud(folder, up, options, progress)
     points = np.zeros((0, 3)) if cloud is None else cloud.points
     colours = None if cloud is None else cloud.colours
     if colours is None:
@@ -122,22 +125,24 @@ def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOpti
     write_colmap(output, camera, trajectory.T_world_camera, points, colours)
 
 
-def _export_raster(folder: RunFolder, output: Path, options: ExportOptions) -> None:
+def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:
     mode, _ = lookup(folder.metrics(), "scale", "mode")
     if options.origin is not None and mode == "none":
         raise RunError(
             "a place on the earth needs metres, but this run's lengths are in camera heights: leave --origin"
         )
-    mesh = prepared(read_ply(folder.require("map_mesh.ply")), options)
+    with map_file(folder, "mesh", progress) as source:
+        mesh = prepared(read_ply(source), options)
     raster = height_raster(_rotated(mesh, "z"), options.resolution or DEFAULT_RESOLUTION, options.origin)
     write_raster(output, raster, "camera heights" if mode == "none" else "metres")
 
 
-def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions) -> Path:
+def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
     if output.suffix.lower() not in (".yaml", ".pgm"):
         raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
     mode, _ = lookup(folder.metrics(), "scale", "mode")
-    mesh = prepared(read_ply(folder.require("map_mesh.ply")), options)
+    with map_file(folder, "mesh", progress) as source:
+        mesh = prepared(read_ply(source), options)
     trajectory = _trajectory(folder, "z")
     grid = occupancy_grid(
         _rotated(mesh, "z"), trajectory.T_world_camera, options.resolution or DEFAULT_RESOLUTION, mode != "none"
@@ -147,10 +152,12 @@ def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions) -
     return written
 
 
-def _cloud(folder: RunFolder, up: str, options: ExportOptions) -> Ply | None:
+def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress | None) -> Ply | None:
     """The cloud of the map, None where the run has none."""
-    path = folder.path / "map_cloud.ply"
-    return _rotated(prepared(read_ply(path), options), up) if path.is_file() else None
+    if not has_map(folder, "cloud"):
+        return None
+    with map_file(folder, "cloud", progress) as source:
+        return _rotated(prepared(read_ply(source), options), up)
 
 
 def _rotated(ply: Ply, up: str) -> Ply:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from erfsfm.files import read_text
 from slam.errors import RunError
 from slam.frames import RelativePose
 from slam.se3 import FloatArray
@@ -62,7 +63,7 @@ def check_g2o(path: Path) -> None:
         RunError: it is missing, cut short, or a line is not one of the graph.
     """
     try:
-        text = path.read_text(encoding="ascii")
+        text = read_text(path, "ascii")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut short")
         vertices = 0

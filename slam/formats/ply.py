@@ -27,7 +27,7 @@ _NAMES = {"f8": "double", "f4": "float", "u1": "uchar", "i1": "char"}
 _NAMES |= {"u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 _GREY = 128
-_TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
+TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ def read_ply(path: Path) -> Ply:
     try:
         with path.open("rb") as file:
             is_text, elements = _header(file)
+            _require_size(path.stat().st_size - file.tell(), elements, is_text)
             read = _read_text if is_text else _read_binary
             parts = {element.name: read(file, element) for element in elements}
             if file.read(1).strip():
@@ -163,23 +164,28 @@ def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
     return replace(ply, vertices=vertices)
 
 
+def ply_header(vertex_type: np.dtype[np.void], vertices: int, triangles: int | None) -> bytes:
+    """The header of a binary PLY, whose triangles, if any, are `TRIANGLE` records."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam", f"element vertex {vertices}"]
+    for name in vertex_type.names or ():
+        lines.append(f"property {_NAMES[vertex_type[name].str[1:]]} {name}")
+    if triangles is not None:
+        lines += [f"element face {triangles}", "property list uchar uint vertex_indices"]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
 def write_ply(path: Path, ply: Ply) -> None:
     """Write a binary PLY, atomically.
 
     Raises:
         RunError: the file cannot be written.
     """
-    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam"]
-    lines.append(f"element vertex {len(ply.vertices)}")
-    for name in ply.vertices.dtype.names or ():
-        lines.append(f"property {_NAMES[ply.vertices.dtype[name].str[1:]]} {name}")
+    header = ply_header(ply.vertices.dtype, len(ply.vertices), None if ply.triangles is None else len(ply.triangles))
     parts: list[NDArray[np.void]] = [ply.vertices]
     if ply.triangles is not None:
-        lines += [f"element face {len(ply.triangles)}", "property list uchar uint vertex_indices"]
-        faces = np.empty(len(ply.triangles), _TRIANGLE)
+        faces = np.empty(len(ply.triangles), TRIANGLE)
         faces["count"], faces["vertices"] = 3, ply.triangles
         parts.append(faces)
-    header = "\n".join([*lines, "end_header", ""]).encode("ascii")
 
     def fill(partial: Path) -> None:
         with partial.open("wb") as file:
@@ -224,6 +230,18 @@ def _header(file: BinaryIO) -> tuple[bool, list[_Element]]:
     if not elements or elements[0].name != "vertex":
         raise ValueError("its vertices do not come first")
     return form == "ascii", elements
+
+
+def _require_size(size: int, elements: list[_Element], is_text: bool) -> None:
+    """Refuse a body that is shorter than announced, before any memory is taken for it."""
+    for element in elements:
+        fields = [kind for _, kind in element.fields]
+        if element.list_types is not None:
+            fields += [element.list_types[0], *[element.list_types[1]] * 3]
+        each = 2 * len(fields) if is_text else sum(np.dtype(kind).itemsize for kind in fields)
+        if element.count < 0 or element.count * each > size:
+            raise ValueError(f"it announces {element.count} elements '{element.name}', more than it holds")
+        size -= element.count * each
 
 
 def _words(file: BinaryIO) -> Iterator[list[str]]:

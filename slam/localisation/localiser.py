@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import CameraFile
@@ -22,12 +23,15 @@ from slam.loops.places import PLACES, Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
-from slam.se3 import FloatArray, invert, rotation_angle
+from slam.se3 import FloatArray, apply, invert
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
+from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
+# lower than for loops: corners match at several places, and learned depth is too uncertain for those seen from close by
+_MIN_INLIER_RATIO = 0.25
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -42,18 +46,31 @@ class Localisation:
     reason: str = ""
 
 
-def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterator[Localisation]:
+def image_numbers(images: Path, frames: str | None = None, every: int = 1) -> range:
+    """Numbers of the images to localise, from 0: every n-th of ``A:B``, half-open.
+
+    Raises:
+        SequenceError: no images, or the range is empty or reaches beyond them.
+    """
+    first, last = frame_range(frames or ":", len(image_paths(images)))
+    return range(first, last, every)
+
+
+def localise(
+    images: Path, run: RunFolder, camera: Path | None = None, numbers: range | None = None
+) -> Iterator[Localisation]:
     """Localise images in the map of a run, one after the other.
 
     Args:
         images: an image or a folder of images.
         run: a finished run with loops switched on.
         camera: their ``camera.yaml``; None for the one beside them, or else the camera of the run.
+        numbers: of the images to localise; None for all of them.
 
     Raises:
         SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
     """
-    paths = _image_paths(images)
+    paths = image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
@@ -62,7 +79,7 @@ def localise(images: Path, run: RunFolder, camera: Path | None = None) -> Iterat
         places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
-    for path in paths:
+    for path in paths if numbers is None else [paths[number] for number in numbers]:
         try:
             image = read_image(path)
             if undistortion is not None:
@@ -92,7 +109,9 @@ class Localiser:
         self._index = PlaceIndex(places.views, config)
 
     def locate(self, name: str, image: Image) -> Localisation:
-        """Localise an image ``(H, W, 3)`` uint8 RGB: one place with many inliers, or two places that agree on the pose.
+        """Localise an image ``(H, W, 3)`` uint8 RGB: by the points of all similar places of a street together.
+
+        The pose is supported by two of them, or by very many inliers.
 
         Raises:
             SequenceError: the image has another shape than its camera.
@@ -101,24 +120,12 @@ class Localiser:
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
-        hypotheses: list[_PoseHypothesis] = []
-        reasons: list[str] = []
-        for row in rows:
-            found = self._resect(self._places.views[row], self._places.T_world_camera[row], view)
-            if isinstance(found, str):
-                reasons.append(found)
-            else:
-                hypotheses.append(found)
-        if not hypotheses:
-            return Localisation(name, reason=f"{len(rows)} similar places; at the first, {reasons[0]}")
-        best = max(hypotheses, key=lambda hypothesis: hypothesis.inliers)
-        support = sum(self._agree(best, other) for other in hypotheses) - 1
-        if support == 0 and best.inliers < self._config.alone_inliers:
-            reason = f"only the place of frame {best.frame} supports a pose ({best.inliers} inliers)"
-            return Localisation(name, reason=reason)
-        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - best.T_world_camera[:3, 3], axis=1)
+        found = self._best([self._matched(row, view) for row in rows], view)
+        if isinstance(found, str):
+            return Localisation(name, reason=f"{len(rows)} similar places; {found}")
+        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
         nearest = self._places.views[int(away.argmin())].index
-        return Localisation(name, best.T_world_camera, nearest, best.inliers)
+        return Localisation(name, found.T_world_camera, nearest, found.inliers)
 
     def _view(self, image: Image) -> View:
         camera = self._intrinsics
@@ -133,34 +140,73 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _resect(self, place: View, T_world_place: FloatArray, view: View) -> _PoseHypothesis | str:
+    def _matched(self, row: int, view: View) -> _Matches:
+        place, T_world_place = self._places.views[row], self._places.T_world_camera[row]
         rows_place, rows_view = matches(place, view, self._config)
-        if len(rows_place) < self._config.min_inliers:
-            return f"only {len(rows_place)} corners match"
-        found = self._verifier.resect(place.points[rows_place], view.pixels[rows_view])
+        points = place.points[rows_place].astype(np.float64)
+        known = np.isfinite(points).all(axis=1)
+        return _Matches(place.index, T_world_place, apply(T_world_place, points[known]), rows_view[known])
+
+    def _best(self, places: list[_Matches], view: View) -> _Pose | str:
+        """The pose with most inliers at one place and those around it that has enough support; or why there is none."""
+        best: _Pose | None = None
+        reasons = []
+        for place in places:
+            found = self._resect(place, self._around(place, places), view)
+            if isinstance(found, str):
+                reasons.append(f"at that of frame {place.frame} {found}")
+            elif best is None or found.inliers > best.inliers:
+                best = found
+        return reasons[0] if best is None else best
+
+    def _around(self, place: _Matches, places: list[_Matches]) -> list[_Matches]:
+        """Places no farther away than the points that match here: they show the same street."""
+        if not len(place.points_world):
+            return [place]
+        here = place.T_world_camera[:3, 3]
+        reach = float(np.median(np.linalg.norm(place.points_world - here, axis=1)))
+        return [other for other in places if np.linalg.norm(other.T_world_camera[:3, 3] - here) <= reach]
+
+    def _resect(self, place: _Matches, around: list[_Matches], view: View) -> _Pose | str:
+        """The pose by the points of all these places, supported by two of them or by very many inliers."""
+        points_world = np.concatenate([other.points_world for other in around])
+        rows_view = np.concatenate([other.rows_view for other in around])
+        points = apply(invert(place.T_world_camera), points_world).astype(np.float32)
+        found = self._verifier.resect(points, view.pixels[rows_view], _MIN_INLIER_RATIO)
         if isinstance(found, str):
             return found
-        T_world_camera = T_world_place @ invert(found.T_image_points)
-        return _PoseHypothesis(place.index, T_world_camera, found.inliers, found.depth)
-
-    def _agree(self, one: _PoseHypothesis, other: _PoseHypothesis) -> bool:
-        T = invert(one.T_world_camera) @ other.T_world_camera
-        turned = float(rotation_angle(T[:3, :3]))
-        limit = self._config.agreement_ratio * min(one.depth, other.depth)
-        return turned < np.deg2rad(self._config.agreement_deg) and float(np.linalg.norm(T[:3, 3])) < limit
+        owner = np.repeat(np.arange(len(around)), [len(other.rows_view) for other in around])
+        supporting = np.bincount(owner[found.resection.inliers]) >= self._config.min_inliers / 2
+        inliers = len(np.unique(rows_view[found.resection.inliers]))  # a corner may match at several places
+        if supporting.sum() < 2 and inliers < self._config.alone_inliers:
+            return f"no second place supports the pose ({inliers} inliers)"
+        return _Pose(place.T_world_camera @ invert(found.T_image_points), inliers)
 
 
 @dataclass(frozen=True)
-class _PoseHypothesis:
-    """The pose of the image by the points of one place: number of inliers and their median ``depth``."""
+class _Matches:
+    """A place and the points of the world ``(M, 3)`` that match corners of the image, by the rows of these."""
 
     frame: int
     T_world_camera: FloatArray
+    points_world: FloatArray
+    rows_view: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """The pose of the image and its number of inliers."""
+
+    T_world_camera: FloatArray
     inliers: int
-    depth: float
 
 
-def _image_paths(images: Path) -> list[Path]:
+def image_paths(images: Path) -> list[Path]:
+    """An image, or those of a folder in their order.
+
+    Raises:
+        SequenceError: there are none.
+    """
     if images.is_file():
         return [images]
     folder = image_folder(images) if images.is_dir() else None

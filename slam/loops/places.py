@@ -4,18 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from erfsfm.readers.pinhole import Pinhole, impossible
 from slam.errors import RunError
 from slam.frames import Intrinsics
 from slam.loops.descriptors import View
-from slam.se3 import FloatArray
-from slam.storage.archive import reading_archive
+from slam.se3 import FloatArray, is_se3
+from slam.storage.archive import opened_archive, read_array
 
 PLACES = "places.npz"
 _FORMAT = 1
+# kind and shape of each array, for V views and M corners
+_ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "camera": ("f", (6,)),
+    "frames": ("i", ("V",)),
+    "counts": ("i", ("V",)),
+    "T_world_camera": ("f", ("V", 4, 4)),
+    "pixels": ("f", ("M", 2)),
+    "descriptors": ("u", ("M", 32)),
+    "points": ("f", ("M", 3)),
+}
 
 
 @dataclass(frozen=True)
@@ -48,14 +60,34 @@ class Places:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        with reading_archive(path):
-            with np.load(path, allow_pickle=False) as file:
-                content = {name: file[name] for name in file.files}
+        with opened_archive(path) as file:
+            content = {name: read_array(file, name) for name in ("format", *_ARRAYS)}
             if int(content["format"]) != _FORMAT:
                 raise RunError(f"{path} has format {content['format']}, this version reads {_FORMAT}: run again")
+            _check(content)
             width, height, *pinhole = content["camera"].tolist()
             frames, ends = content["frames"].tolist(), np.cumsum(content["counts"])
             # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
             return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])
+
+
+def _check(content: dict[str, NDArray[Any]]) -> None:
+    """Refuse arrays that do not belong together, with a ``ValueError``."""
+    sizes: dict[int | str, int] = {"V": len(content["frames"]), "M": int(content["counts"].sum())}
+    for name, (kind, shape) in _ARRAYS.items():
+        array, wanted = content[name], tuple(sizes.get(side, side) for side in shape)
+        if array.dtype.kind != kind or array.shape != wanted:
+            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {wanted}")
+    if (content["counts"] < 0).any() or (np.diff(content["frames"], prepend=-1) <= 0).any():
+        raise ValueError("frames do not increase, or a count is negative")
+    T_world_camera = content["T_world_camera"]
+    if len(T_world_camera) and not is_se3(T_world_camera, tolerance=1e-5):
+        raise ValueError("a pose is no rigid transform")
+    if not np.isfinite(content["pixels"]).all() or np.isinf(content["points"]).any():
+        raise ValueError("a pixel or a point is not finite")
+    width, height, *pinhole = content["camera"].tolist()
+    problem = impossible(Pinhole(int(width), int(height), *pinhole))
+    if problem is not None:
+        raise ValueError(problem)

@@ -96,10 +96,12 @@ class LoopVerifier:
         measured = RelativePose(earlier.index, later.index, T_middle, sigmas, LOOP_SOURCE)
         return Loop(measured, inliers, score)
 
-    def resect(self, points: NDArray[np.float32], pixels: NDArray[np.float32]) -> Sighting | str:
+    def resect(
+        self, points: NDArray[np.float32], pixels: NDArray[np.float32], min_inlier_ratio: float | None = None
+    ) -> Sighting | str:
         """The camera pose from ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or the reason for none.
 
-        Points with NaN are left out.
+        Points with NaN are left out. ``min_inlier_ratio`` is that of the configuration by default.
         """
         config = self._config
         known = np.isfinite(points).all(axis=1)
@@ -107,9 +109,11 @@ class LoopVerifier:
         if len(points_known) < config.min_inliers:
             return f"only {len(points_known)} matches have a trusted depth"
         K = self._intrinsics.K
+        if min_inlier_ratio is None:
+            min_inlier_ratio = config.min_inlier_ratio
         found = consensus(points_known, pixels_known, K, config.ransac_iterations, config.reprojection_px, self._seed)
         count = 0 if found is None else len(found[2])
-        if found is None or count < config.min_inliers or count < config.min_inlier_ratio * len(points_known):
+        if found is None or count < config.min_inliers or count < min_inlier_ratio * len(points_known):
             return f"only {count} of {len(points_known)} matches are inliers"
         extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < config.min_spread_ratio or extent[1] < config.min_spread_ratio / 2:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from slam.frontend.scale.scale_estimate import (
 from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
-from slam.mapping import TsdfMap
+from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place
+from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.observations import ClosedObservations
@@ -40,6 +43,7 @@ from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray
+from slam.sequences.continued import Continued
 from slam.storage.cache import GetOrCompute, without_cache
 from slam.trajectory import Trajectory
 
@@ -64,8 +68,8 @@ class Measurements:
 class SlamResult:
     """Trajectories with one row a frame, the graph, the map and the measurements.
 
-    ``state`` is that of the observer, for a run that continues this one; ``location`` is None
-    without a GPS track, and the reason where the track cannot be used.
+    ``state`` is that of the observer, for a run that continues this one; frames before ``first`` are of earlier runs.
+    ``location`` is None without a GPS track, and the reason where the track cannot be used.
     """
 
     network: Trajectory
@@ -81,6 +85,7 @@ class SlamResult:
     graph: PoseGraph
     map: TsdfMap | None
     stopwatch: Stopwatch
+    first: int
     location: Location | MeasurementFailure | None = None
 
 
@@ -121,6 +126,7 @@ class SlamPipeline:
         self._progress = progress or (lambda stage, done, total: None)
         self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
+        self.first = 0 if checkpoint is None else len(checkpoint.state.seen.roads)  # frames before are measured
         self._seed = seed
         self._gps_track = gps_track
         self._watch = Stopwatch()
@@ -135,16 +141,20 @@ class SlamPipeline:
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
 
-    def estimate(self) -> SlamResult:
-        """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``."""
+    def estimate(self, journal: Journal | None = None) -> SlamResult:
+        """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
+
+        Args:
+            journal: keeps the state of the pass every 100 frames.
+        """
         mode = self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        observations, state = self._observe()
+        observations, state = self._observe(journal)
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
-        self._warn_of_a_frozen_end(observations, state)
+        warn_of_a_frozen_end(len(self._sequence), observations, state)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
         graph, T_optimised, location = self._optimise(measured, loops)
@@ -162,6 +172,7 @@ class SlamPipeline:
             graph=graph,
             map=None,
             stopwatch=self._watch,
+            first=self.first,
             location=location,
         )
 
@@ -183,10 +194,16 @@ class SlamPipeline:
             intrinsics, config = self._sequence.intrinsics, self._config.loops
             return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
 
-    def fuse(self, estimate: SlamResult, compare: Callable[[KeyframeDepth], None] | None = None) -> TsdfMap | None:
+    def fuse(
+        self,
+        estimate: SlamResult,
+        compare: Callable[[KeyframeDepth], None] | None = None,
+        folder: Path | None = None,
+    ) -> TsdfMap | None:
         """Learned depth at the optimised poses, refined and fused into one surface; None where mapping is switched off.
 
-        ``compare`` is called with the depth of each keyframe that is far enough from the one before.
+        ``compare`` is called with the depth of each keyframe that is far enough from the one before; ``folder`` is
+        where finished submaps go, a temporary folder where it is None.
         """
         keyframes = estimate.observations.keyframes
         if not self._config.mapping.enabled or not keyframes:
@@ -195,7 +212,7 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        tsdf_map = TsdfMap(config.mapping, intrinsics)
+        tsdf_map = TsdfMap(config.mapping, intrinsics, folder)
         depths = KeyframeDepths(
             estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
         )
@@ -207,8 +224,8 @@ class SlamPipeline:
             if compare is not None:
                 compare(keyframe)
             with self._watch.stage("map"):
-                depth = keyframe.trusted(config.mapping.max_relative_sigma)
-                tsdf_map.integrate(depth, keyframe.image, T_world_camera[keyframe.index])
+                pose, number = T_world_camera[keyframe.index], keyframe.index
+                tsdf_map.integrate(keyframe.best, keyframe.image, pose, keyframe.relative_sigma, number)
             self._progress("map", done + 1, len(moved))
         return tsdf_map
 
@@ -224,10 +241,10 @@ class SlamPipeline:
         track = self._gps_track
         return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, mode)
 
-    def _observe(self) -> tuple[ClosedObservations, ObserverState]:
+    def _observe(self, journal: Journal | None) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, total = self._checkpoint, len(self._sequence)
-        first = 0 if checkpoint is None else len(checkpoint.stamps)
+        first = self.first
         state = None if checkpoint is None else checkpoint.state
         if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
             logger.warning(
@@ -251,35 +268,14 @@ class SlamPipeline:
                     frame = next(frames)
                 observer.add(index, frame)
                 self._progress("frames", index + 1, total)
+                done = index + 1 - first
+                if journal is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
+                    with self._watch.stage("journal"):
+                        journal.keep(observer.state())
             closed = observer.closed()
-            if checkpoint is not None:
-                self._warn_of_another_place(closed, first)
+            if isinstance(self._sequence, Continued):
+                warn_of_another_place(closed, first)
             return closed, observer.state()
-
-    def _warn_of_a_frozen_end(self, seen: ClosedObservations, state: ObserverState) -> None:
-        """No new image shows whether the camera stood or the video froze."""
-        end = len(self._sequence) - 1
-        for first, last in runs(state.seen.repeated):
-            if last == end and end not in seen.interpolated:
-                logger.warning(
-                    "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "
-                    "froze, leave them out with --frames",
-                    first,
-                    last,
-                    first - 1,
-                )
-
-    def _warn_of_another_place(self, seen: ClosedObservations, first: int) -> None:
-        """Copies of other recordings under the same name, and folders, are known by their first image alone."""
-        for start, end, reason in seen.failures:
-            if (start, end) == (first - 1, first) and first not in seen.interpolated:
-                logger.warning(
-                    "frame %d, the first that follows, does not match frame %d (%s): make sure that it was taken "
-                    "right after it on the same drive",
-                    end,
-                    start,
-                    reason,
-                )
 
     def _find_scale(
         self,

@@ -36,7 +36,7 @@ from slam.pipeline.observations import Keyframe, Observations
 from slam.pipeline.observer import ObserverState, RecentFrame
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
-from slam.storage.archive import reading_archive
+from slam.storage.archive import opened_archive, read_array
 from slam.storage.serialisation import Serialiser
 from slam.storage.spill import SpillFile
 
@@ -76,7 +76,7 @@ class SessionCheckpoint:
 
     def write(self, path: Path) -> None:
         """Write a file as in ``docs/outputs.md``."""
-        _SERIALISER.write(path, self)
+        SERIALISER.write(path, self)
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -85,7 +85,7 @@ class SessionCheckpoint:
         Raises:
             RunError: missing, damaged or of another version.
         """
-        content = _SERIALISER.read(path)
+        content = SERIALISER.read(path)
         if not isinstance(content, cls):
             raise RunError(f"{path} is damaged: run the sequence again")
         return content
@@ -100,7 +100,7 @@ class SessionCheckpoint:
             )
         checkpoint = cls.read(folder / DRIVE)
         if (folder / KEYFRAMES).is_file():
-            checkpoint.state.seen.keyframes.extend(_read_keyframes(folder / KEYFRAMES))
+            checkpoint.state.seen.keyframes.extend(read_keyframes(folder / KEYFRAMES))
         return checkpoint
 
     def continued(self, following: FrameSequence) -> Continued:
@@ -113,7 +113,7 @@ class SessionCheckpoint:
         return Continued(*known, following)
 
 
-_SERIALISER = Serialiser(
+SERIALISER = Serialiser(
     *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
     *(Corners, DynamicMask, HeadingPrior, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
@@ -130,8 +130,13 @@ def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _read_keyframes(path: Path) -> Iterator[Keyframe]:
+def read_keyframes(path: Path) -> Iterator[Keyframe]:
+    """Read what `write_keyframes` wrote, into a new spill file; `RunError` where it is damaged."""
     spill_file = SpillFile()
-    with reading_archive(path), np.load(path, allow_pickle=False) as file:
-        for index in sorted(int(name.removeprefix("image_")) for name in file.files if name.startswith("image_")):
-            yield Keyframe(index, spill_file.put(file[f"image_{index}"]), spill_file.put(file[f"depth_{index}"]))
+    with opened_archive(path) as file:
+        names = [name.removesuffix(".npy") for name in file.namelist()]
+        for index in sorted(int(name.removeprefix("image_")) for name in names if name.startswith("image_")):
+            image, depth = read_array(file, f"image_{index}"), read_array(file, f"depth_{index}")
+            if image.dtype != np.uint8 or depth.dtype != np.float32 or image.shape != (*depth.shape, 3):
+                raise ValueError(f"keyframe {index} is {image.dtype} {image.shape} with depth {depth.shape}")
+            yield Keyframe(index, spill_file.put(image), spill_file.put(depth))

@@ -28,12 +28,15 @@ class KeyframeDepth:
     depth: DepthMap
     refined: RefinedDepth | None
 
-    def trusted(self, max_relative_sigma: float) -> DepthMap:
-        """The depth to fuse: refined where it was, 0 where its sigma is too large."""
-        if self.refined is None:
-            return self.depth
-        known = self.refined.relative_sigma <= max_relative_sigma
-        return np.where(known, self.refined.depth, np.float32(0))
+    @property
+    def best(self) -> DepthMap:
+        """The depth to fuse: refined where it was."""
+        return self.depth if self.refined is None else self.refined.depth
+
+    @property
+    def relative_sigma(self) -> DepthMap | None:
+        """Sigma of the depth to fuse, relative to it; None where it is the network's, which states none."""
+        return None if self.refined is None else self.refined.relative_sigma
 
 
 class KeyframeDepths:

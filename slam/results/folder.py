@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from slam.errors import RunError
-from slam.results.output import ESTIMATE, METRICS, claim, replace_run, stamped
+from slam.results.output import ESTIMATE, METRICS, UNFINISHED, claim, reclaim, replace_run, stamped
 from slam.results.output import TRAJECTORIES as TRAJECTORIES
+from slam.results.schema import MetricsFile
 from slam.storage.files import write_atomically
+from slam.storage.json_file import read_json
 from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 logger = logging.getLogger(__name__)
@@ -47,6 +49,13 @@ class RunFolder:
         except OSError as error:
             where = output if output is not None else results
             raise RunError(f"no run folder can be made in {where}: {error.strerror or error}") from error
+
+    @classmethod
+    def resume(cls, path: Path) -> RunFolder:
+        """The folder of a run that did not end, to go on in it."""
+        reclaim(path)
+        is_beside = path.name == UNFINISHED and (path.parent / ESTIMATE).is_file()
+        return cls(path, path.parent if is_beside else None)
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -103,14 +112,9 @@ class RunFolder:
         """
         path = self.path / METRICS
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            return read_json(path, MetricsFile)
         except FileNotFoundError:
             return {"status": "running", "reason": f"the run was killed before it wrote {METRICS}"}
-        except (OSError, ValueError) as error:
-            raise RunError(f"{path} is damaged: {error}; run the sequence again") from error
-        if not isinstance(content, dict):
-            raise RunError(f"{path} is damaged: it holds no object; run the sequence again")
-        return content
 
     def trajectory(self, name: str) -> Trajectory | None:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""

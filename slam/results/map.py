@@ -6,9 +6,13 @@ import logging
 from dataclasses import asdict
 from typing import Any
 
-from slam.errors import SlamError
+from slam.errors import EmptyMapError
+from slam.evaluation.double_walls import double_wall_share
 from slam.frames import Sequence
-from slam.pipeline.batch import SlamResult
+from slam.mapping.submap import FOLDER as SUBMAPS
+from slam.mapping.submap import remove_submaps
+from slam.mapping.surface import positions
+from slam.pipeline.batch import Progress, SlamResult
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
@@ -16,25 +20,33 @@ from slam.results.summary import null
 logger = logging.getLogger(__name__)
 
 
-def write_map(folder: RunFolder, result: SlamResult, sequence: Sequence) -> dict[str, Any]:
-    """Write mesh and cloud, and give the numbers of the map; an empty map gives a reason and no error.
+def write_map(
+    folder: RunFolder, result: SlamResult, sequence: Sequence, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Merge the submaps, write mesh and cloud, and give the numbers of the map; an empty map gives a reason.
 
     Raises:
-        RunError: a file cannot be written.
+        SlamError: a file cannot be written; finished submaps stay.
     """
     if result.map is None:
         return _no_map("fusion is switched off (mapping.enabled)")
     try:
-        result.map.mesh(), result.map.cloud()
-    except SlamError as error:
+        with result.stopwatch.stage("mesh"):
+            surface = result.map.surface(progress)
+    except EmptyMapError as error:
         logger.warning("no map: %s", error)
+        remove_submaps(folder.path / SUBMAPS)
         return _no_map(str(error))
-    result.map.write_mesh(folder.path / "map_mesh.ply")
-    result.map.write_cloud(folder.path / "map_cloud.ply")
-    errors = map_errors(result.map.cloud().points_world, result, sequence)
-    return asdict(result.map.statistics()) | errors
+    with result.stopwatch.stage("mesh"):
+        surface.write_mesh(folder.path / "map_mesh.ply")
+        surface.write_cloud(folder.path / "map_cloud.ply")
+    remove_submaps(folder.path / SUBMAPS)
+    walls = {"double_wall_share": double_wall_share(surface.meshes())}
+    errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, sequence)
+    return asdict(result.map.statistics()) | walls | errors
 
 
 def _no_map(reason: str) -> dict[str, Any]:
-    sizes = {key: value for name in ("triangles", "points", "blocks") for key, value in null(name, reason).items()}
+    names = ("triangles", "points", "blocks", "submaps", "filters", "floater_share", "double_wall_share")
+    sizes = {key: value for name in names for key, value in null(name, reason).items()}
     return sizes | no_map_errors(reason)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from slam.errors import SlamError
-from slam.evaluation.map import compare, pose_similarity, statistics
-from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected
+from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
+from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
-from slam.se3 import FloatArray, apply, invert
+from slam.se3 import FloatArray, Similarity, apply, invert
 from slam.sequences.excerpt import Excerpt
 
 logger = logging.getLogger(__name__)
@@ -151,8 +152,12 @@ def no_map_errors(reason: str) -> dict[str, Any]:
     return {key: value for name in names for key, value in null(name, reason).items()}
 
 
-def map_errors(points: FloatArray, result: SlamResult, sequence: Sequence) -> dict[str, Any]:
-    """Errors of a map ``(P, 3)`` moved to the truth by one rigid motion, and under ``with_scale`` by a similarity."""
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: SlamResult, sequence: Sequence) -> dict[str, Any]:
+    """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
+
+    ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
+    are looked at are held.
+    """
     truth = find_truth(sequence)
     if isinstance(truth, str):
         return no_map_errors(truth)
@@ -164,7 +169,9 @@ def map_errors(points: FloatArray, result: SlamResult, sequence: Sequence) -> di
     unmetric = result.scale.mode == "none" or isinstance(result.scale.estimate, MeasurementFailure)
     if unmetric:
         del fits["rigid"]
-    placed = {name: fit.scale * points @ fit.R_a_b.T + fit.t_a_b for name, fit in fits.items()}
+    looked_at = np.concatenate([*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]).astype(np.int64)
+    cameras = cKDTree(sequence.reference[looked_at, :3, 3])
+    placed = {name: _placed(pieces(), fit, cameras) for name, fit in fits.items()}
     try:
         found = compare(truth, sequence.reference, placed)
     except SlamError as error:
@@ -173,6 +180,15 @@ def map_errors(points: FloatArray, result: SlamResult, sequence: Sequence) -> di
     scaled = {"scale": fits["with_scale"].scale} | statistics(found.distances["with_scale"])
     rigid = _unknown_scale() if unmetric else statistics(found.distances["rigid"])
     return {**rigid, "truth": truth.name, "evaluated_m": found.length_m, "with_scale": scaled}
+
+
+def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:
+    """The points of all pieces in the world of the truth that count at any of these cameras."""
+    near = [np.empty((0, 3))]
+    for points in pieces:
+        moved = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
+        near.append(moved[np.isfinite(cameras.query(moved, distance_upper_bound=RANGE_M + OUTLIER_M)[0])])
+    return np.concatenate(near)
 
 
 def _unknown_scale() -> dict[str, Any]:

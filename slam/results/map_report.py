@@ -21,6 +21,16 @@ _ERRORS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("f_score", "0.2"), "F-score, 0.2 m"),
     (("f_score", "0.5"), "F-score, 0.5 m"),
 )
+_FILTERS = {
+    "unknown": "no depth",
+    "border": "left, right and upper border of the image (mapping.border)",
+    "bonnet": "lower border, the car's own bonnet (mapping.bonnet)",
+    "sky": "bright or blue above the horizon (mapping.sky_brightness, mapping.sky_blueness)",
+    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m)",
+    "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
+    "edge": "at a step of depth (mapping.max_depth_step)",
+    "agreement": "the keyframe before does not agree (mapping.consistency)",
+}
 _TRUTHS = {
     "exact surface": "the exact surface of the simulated street",
     "depth maps": "depth maps accumulated at true poses",
@@ -39,6 +49,25 @@ def map_sizes(metrics: Metrics) -> Table | None:
     cells = [number(numbers, key) for key in keys]
     missing = [f"{name}: {cell.tooltip}" for name, cell in zip(names, cells) if cell.tooltip]
     return Table(["", *names], [[Cell("map"), *cells]], notes=notes_on(missing))
+
+
+def map_filters(metrics: Metrics) -> Table | None:
+    """The share of pixels that each filter took before fusion, and what cleaning the mesh took; None without a map."""
+    filters, _ = lookup(metrics, "map", "filters")
+    if filters is None:
+        return None
+    rows: list[Sequence[Cell] | str] = [
+        [Cell(name), Cell(f"{share:.1%}"), Cell(_FILTERS.get(name, ""))] for name, share in filters.items()
+    ]
+    rows.append([Cell("fused"), Cell(f"{1 - sum(filters.values()):.1%}"), Cell("what the filters left")])
+    for key, name, what in (
+        ("floater_share", "floaters", "of the mesh: small loose pieces, left out (mapping.min_component_triangles)"),
+        ("double_wall_share", "double walls", "of the mesh's area: a parallel surface 0.3 to 2 m before it"),
+    ):
+        share, _ = lookup(metrics, "map", key)
+        if share is not None:
+            rows.append([Cell(name), Cell(f"{share:.1%}"), Cell(what)])
+    return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows)
 
 
 def map_errors_table(metrics: Metrics) -> Table | None:

@@ -22,7 +22,6 @@ from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
 from slam.se3 import umeyama
-from slam.sequences.continued import Continued
 from slam.trajectory import Trajectory, associate
 
 
@@ -61,8 +60,8 @@ def estimate_metrics(
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
-            | {"continued_at": _frames_before(sequence)},
-            "timing": describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence)),
+            | {"continued_at": result.first},
+            "timing": describe_timing(result.stopwatch, len(sequence) - result.first),
             "scale": _scale(result),
             "trajectories": trajectories,
             **gps_metrics(result, gps_in_graph),
@@ -79,7 +78,7 @@ def whole_metrics(
     metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
 ) -> dict[str, Any]:
     """The metrics of a complete run: those of the estimate, with depth, the map and the final timing."""
-    timing = describe_timing(result.stopwatch, len(sequence) - _frames_before(sequence))
+    timing = describe_timing(result.stopwatch, len(sequence) - result.first)
     rest = {"timing": timing, "depth": depth, "map": map_summary}
     whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)
     return {key: value for key, value in whole.items() if key not in ("reason", "depth_reason", "map_reason")}
@@ -98,11 +97,6 @@ def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
         else:
             numbers[name] = trajectory_metrics(*associate(estimate, reference))
     return numbers
-
-
-def _frames_before(sequence: Sequence) -> int:
-    """Number of frames of earlier runs (``run --continue``)."""
-    return sequence.before if isinstance(sequence, Continued) else 0
 
 
 def _network_snippets(result: SlamResult) -> SnippetErrors | None:

@@ -5,7 +5,6 @@ Only files of a run are ever removed, and only from a folder whose ``metrics.jso
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -13,10 +12,14 @@ import shutil
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from erfsfm.files import unfinished_name, write_atomically
 from slam.errors import RunError
+from slam.mapping.submap import FOLDER as SUBMAPS
+from slam.mapping.submap import remove_submaps
+from slam.results.schema import MetricsFile
+from slam.storage.files import JOURNAL_FILE
+from slam.storage.json_file import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -76,6 +79,13 @@ def claim(output: Path) -> Path:
     return place
 
 
+def reclaim(output: Path) -> None:
+    """Go on in the folder of a run that did not end: its files stay, what a killed process was writing goes."""
+    for path in output.iterdir():
+        if _is_rest(path):
+            path.unlink()
+
+
 def replace_run(output: Path, place: Path) -> None:
     """Put the run in ``place`` (``output/unfinished``) in place of the one in ``output``.
 
@@ -83,6 +93,7 @@ def replace_run(output: Path, place: Path) -> None:
     next run recognises them as runs and replaces them, wherever this was interrupted.
     """
     write_atomically(output / METRICS, lambda path: shutil.copyfile(place / METRICS, path))
+    remove_submaps(output / SUBMAPS)
     for path in _files(output):
         if path.name != METRICS:
             path.unlink()
@@ -118,10 +129,10 @@ def _made(path: Path) -> bool:
 def _is_run(metrics: Path) -> bool:
     """Whether a ``metrics.json`` is that of a run, however it ended."""
     try:
-        content: Any = json.loads(metrics.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json(metrics, MetricsFile)
+    except (OSError, RunError):
         return False
-    if not isinstance(content, dict) or not {"schema", "status"} <= set(content):
+    if not {"schema", "status"} <= set(content):
         return False
     provenance = content.get("provenance")
     return isinstance(provenance, dict) and "weights_sha256" in provenance
@@ -129,17 +140,23 @@ def _is_run(metrics: Path) -> bool:
 
 def _is_rest(path: Path) -> bool:
     """Whether it is a partial file of a killed run."""
-    return unfinished_name(path) in _OWN
+    name = unfinished_name(path)
+    return name is not None and _is_own(name)
 
 
 def _files(folder: Path) -> list[Path]:
     """Files of a run, whole or partial."""
-    return [path for path in folder.iterdir() if path.name in _OWN or _is_rest(path)]
+    return [path for path in folder.iterdir() if _is_own(path.name) or _is_rest(path)]
+
+
+def _is_own(name: str) -> bool:
+    return name in _OWN or JOURNAL_FILE.fullmatch(name) is not None
 
 
 def _clear(folder: Path) -> None:
     """Remove an earlier run with its partial files; other files stay."""
     check_output(folder / UNFINISHED)
+    remove_submaps(folder / SUBMAPS)
     for path in _files(folder):
         path.unlink()
     if (folder / UNFINISHED).is_dir():

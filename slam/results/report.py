@@ -18,7 +18,7 @@ from slam.frames import DepthMap, Image
 from slam.results import report_tables
 from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
-from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_sizes
+from slam.results.map_report import has_map_curve, map_error_figure, map_errors_table, map_filters, map_sizes
 from slam.results.map_view import MAP_ABOVE, MAP_DRIVER, MapViews
 from slam.results.plots import (
     depth_figure,
@@ -125,6 +125,7 @@ def write_report(
         driver=_driver_picture(views),
         viewer=None if views is None else views.viewer,
         map=map_sizes(metrics),
+        map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
         map_curve=_map_curve(metrics),
         no_map=_absence(metrics, "map"),

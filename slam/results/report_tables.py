@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from slam.errors import RunError
 from slam.results.comparison import (
     ALIGNED_ATE,
     EVO_DIFFERENCE,
@@ -24,6 +24,8 @@ from slam.results.comparison import (
     written,
 )
 from slam.results.folder import TRAJECTORIES
+from slam.results.schema import LoopsFile
+from slam.storage.json_file import read_json
 
 Metrics = Mapping[str, Any]
 
@@ -282,11 +284,9 @@ def notes_on(reasons: Iterable[str]) -> list[str]:
 def _details(loops_file: Path, verdict: str) -> list[Any]:
     """One list of ``loops.json``; empty where the file is missing or damaged."""
     try:
-        tree = json.loads(loops_file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return list(read_json(loops_file, LoopsFile).get(verdict, []))
+    except (OSError, RunError):
         return []
-    entries = tree.get(verdict) if isinstance(tree, dict) else None
-    return entries if isinstance(entries, list) else []
 
 
 def _depth_source(metrics: Metrics) -> str:

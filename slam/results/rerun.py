@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import SlamError
+from slam.errors import EmptyMapError
 from slam.frames import Intrinsics
 from slam.pipeline.batch import SlamResult
 from slam.pipeline.observations import Keyframe
@@ -80,7 +80,7 @@ def _log_map(rr: Any, stream: Any, result: SlamResult, voxel_size: float) -> Non
         return
     try:
         cloud = result.map.cloud()
-    except SlamError:  # an empty map, which the run has reported
+    except EmptyMapError:  # an empty map, which the run has reported
         return
     colours = np.round(255 * np.clip(cloud.colours, 0, 1)).astype(np.uint8)
     points = rr.Points3D(cloud.points_world, colors=colours, radii=_POINT_VOXELS * voxel_size)

@@ -28,7 +28,6 @@ LOADERS: tuple[Loader, ...] = (
     odometry.LOADER,
     raw.LOADER,
     euroc.LOADER,
-    ros.LOADER,
     tum.LOADER,
     tum_mono.LOADER,
     seven_scenes.LOADER,
@@ -36,6 +35,7 @@ LOADERS: tuple[Loader, ...] = (
     nuscenes.LOADER,
     argoverse.LOADER,
     folder.LOADER,
+    ros.LOADER,
     video.LOADER,
 )
 

@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
@@ -186,7 +187,7 @@ def read_stamps(path: Path, files: NumberedFiles) -> FloatArray:
         SequenceError: it cannot be read, a row is no number, or its stamps do not belong to the files.
     """
     try:
-        stamps = np.array([float(line) for line in path.read_text(encoding="utf-8").split()])
+        stamps = np.array([float(line) for line in read_text(path).split()])
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold one time in seconds a row: {error}") from error
     return require_stamps(stamps, path, files)

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError
@@ -80,7 +81,7 @@ def _camera(folder: Path, images: ImageFiles, asked: Path | None) -> CameraFile:
 def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
     """Stamps and image paths of ``rgb.txt`` or ``depth.txt``."""
     stamps, paths = [], []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(_text(path).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -96,6 +97,13 @@ def _read_index(path: Path) -> tuple[FloatArray, list[Path]]:
     if missing is not None:
         raise SequenceError(f"no image {missing}, which {path} names: restore it or remove the row")
     return np.array(stamps), paths
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path, "utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SequenceError(f"{path} cannot be read ({error}): it needs rows of 'stamp file' in UTF-8") from error
 
 
 def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:

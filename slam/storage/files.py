@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 from erfsfm import files
 from slam.errors import SlamError
+
+# the state of a pass that has not ended, after so many frames (`slam.pipeline.journal`)
+JOURNAL_FILE = re.compile(r"pass-(?P<kind>part|state|keyframes)-(?P<frames>\d{6,})\.(?:zip|npz)")
 
 
 def write_atomically(

@@ -6,19 +6,21 @@ twice is read as one array, so that a resumed session gives the bytes of one wit
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import zipfile
 from collections.abc import Iterable
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.errors import RunError
-from slam.storage.archive import reading_archive
+from slam.storage.archive import opened_archive
 
 _FORMAT = 2
 Tree = Any  # of JSON
@@ -56,7 +58,7 @@ class Serialiser:
         Raises:
             RunError: the file is missing, damaged or of another version.
         """
-        with reading_archive(path), zipfile.ZipFile(path) as file:
+        with opened_archive(path) as file:
             head = json.loads(file.read("tree.json"))
             if head["format"] != _FORMAT:
                 raise RunError(f"{path} has format {head['format']}, this version reads {_FORMAT}: run again")
@@ -79,7 +81,12 @@ class Serialiser:
         if kind == "dict":
             return {self._unpacked(key, arrays): self._unpacked(value, arrays) for key, value in content}
         name, values = content
-        return self._kinds[name](**{key: self._unpacked(value, arrays) for key, value in values.items()})
+        unpacked = {key: self._unpacked(value, arrays) for key, value in values.items()}
+        types = _types(self._kinds[name])
+        wrong = [key for key, value in unpacked.items() if not _is_of(value, types[key])]
+        if wrong:
+            raise TypeError(f"{name}.{wrong[0]} is no {types[wrong[0]]}")
+        return self._kinds[name](**unpacked)
 
 
 class _Packing:
@@ -121,6 +128,33 @@ class _Packing:
 def _given(value: Any) -> Iterable[Field[Any]]:
     """The fields of the constructor; others are derived from them."""
     return (field for field in fields(value) if field.init)
+
+
+@functools.cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _is_of(value: Any, wanted: Any) -> bool:
+    """Whether a value is of an annotated type; every item of a container is checked."""
+    origin, parts = get_origin(wanted), get_args(wanted)
+    if wanted is Any:
+        return True
+    if origin is Literal:
+        return value in parts
+    if origin in (Union, UnionType):
+        return any(_is_of(value, part) for part in parts)
+    if origin is tuple:
+        whole = isinstance(value, tuple) and (parts[-1] is Ellipsis or len(value) == len(parts))
+        kinds = [parts[0]] * len(value) if whole and parts[-1] is Ellipsis else parts
+        return whole and all(map(_is_of, value, kinds))
+    if origin is list:
+        return isinstance(value, list) and all(_is_of(each, parts[0]) for each in value)
+    if isinstance(origin, type) and issubclass(dict, origin):
+        return isinstance(value, dict) and all(_is_of(k, parts[0]) and _is_of(v, parts[1]) for k, v in value.items())
+    if wanted is float:
+        return isinstance(value, float | int) and not isinstance(value, bool)
+    return isinstance(value, origin or wanted) and (wanted is not int or not isinstance(value, bool))
 
 
 def _array(read: Any, kind: str, shape: list[int]) -> NDArray[Any]:

@@ -15,7 +15,9 @@ from slam.errors import SlamError
 class SpillFile:
     """An unnamed temporary file; the operating system removes it when the process ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "keyframes") -> None:
+        """An empty file; ``what`` names its content in errors."""
+        self._what = what
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
         self._end = 0
 
@@ -32,7 +34,7 @@ class SpillFile:
             self._file.flush()
         except OSError as error:
             raise SlamError(
-                f"keyframes cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
+                f"{self._what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
                 "make room, set TMPDIR or switch fusion off (mapping.enabled=false)"
             ) from error
         spilled = SpilledArray(self, self._end, content.shape, content.dtype)
@@ -51,10 +53,10 @@ class SpillFile:
             found = self._file.readinto(array.data)  # type: ignore[attr-defined]
         except OSError as error:
             reason = error.strerror or error
-            raise SlamError(f"keyframes in {tempfile.gettempdir()} cannot be read ({reason})") from error
+            raise SlamError(f"{self._what} in {tempfile.gettempdir()} cannot be read ({reason})") from error
         if found != array.nbytes:
             raise SlamError(
-                f"keyframes in {tempfile.gettempdir()} are cut short ({found} of {array.nbytes} bytes): "
+                f"{self._what} in {tempfile.gettempdir()} are cut short ({found} of {array.nbytes} bytes): "
                 "something shortened the temporary file; run again"
             )
         return array

@@ -235,7 +235,8 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
         *map(str, arguments),
         *["--output", "my run", "--set", "scale.mode=none", "--seed", "5"],
     ]
-    assert metrics["provenance"]["recording"] == {"dataset": str(kitti_root.absolute()), "sequence": "sim"}
+    named = {"dataset": str(kitti_root.absolute()), "sequence": "sim", "frames": "0:6"}
+    assert metrics["provenance"]["recording"] == named
     code, out, err = call("export", "my run", "--what", "nerfstudio", "--output", "scene")
     assert code == 0 and "scene" in out and len(list(Path("scene/images").iterdir())) == 6, err
 

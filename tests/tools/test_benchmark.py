@@ -392,3 +392,18 @@ def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) 
     before = record.stat().st_mtime_ns
     benchmark.main([*words, "--report", str(report)])
     assert record.stat().st_mtime_ns == before
+
+
+def test_maps_need_depth_maps_beside_the_images_and_name_every_part(
+    page: ModuleType, plan: ModuleType, work: ModuleType, tmp_path: Path
+) -> None:
+    (loop,) = plan.worlds(tmp_path, ["loop"], [610], 50, truth=("depth",))
+    assert "--depth" in loop.simulate and loop.root.name.startswith("loop-610-50-depth-")
+    (drive,) = plan.raw_drives([tmp_path / "drive_0013"])
+    jobs = plan.plan(tmp_path, [loop, drive], plan.MAPS, ["default"], [0])
+    assert len(jobs) == 2 * len(plan.MAPS)
+    assert "--sequence" in jobs[0].arguments and "--sequence" not in jobs[1].arguments
+    errors = {"accuracy_median_m": 0.1, "accuracy_90_m": 0.5, "completeness": 0.8, "f_score": {"0.2": 0.7, "0.5": 0.9}}
+    results = [work.JobResult(job, {"map": errors | {"submaps": 3}}, "abc") for job in jobs]
+    text = page.maps_tables(results)
+    assert "| loop 610 | default | no sky | 0.100 | 0.50 |" in text and "drive_0013" in text

@@ -20,7 +20,8 @@ FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
 def derive_metrics(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Relative errors, and the number of true and of false accepted loops.
 
-    ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's.
+    ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's,
+    ``fusion_ms`` the time of fusion for a fused keyframe, without the refinement of its depth.
     """
     length = lookup(metrics, "sequence", "length_m")
     network, optimised = (_ate(metrics, name) for name in ("network", "optimised"))
@@ -28,6 +29,7 @@ def derive_metrics(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
         **_ratio("network_percent", network, length, 100.0),
         **_ratio("optimised_percent", optimised, length, 100.0),
         **_ratio("of_network", optimised, network, 1.0),
+        **_fusion(metrics),
         **_loops(folder, metrics),
     }
 
@@ -40,6 +42,11 @@ def _ratio(name: str, part: tuple[float | None, str], whole: tuple[float | None,
     if part[0] is None or not whole[0]:
         return null(name, part[1] or whole[1] or "nothing to compare with")
     return {name: unit * part[0] / whole[0]}
+
+
+def _fusion(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    seconds, reason = lookup(metrics, "timing", "stages", "map")
+    return _ratio("fusion_ms", (seconds, reason or "no map"), lookup(metrics, "map", "frames_fused"), 1e3)
 
 
 def _loops(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,6 +43,24 @@ TRUE_LOOPS = MetricDefinition("loops_true", "true loops", ("derived", "true_loop
 FALSE_LOOPS = MetricDefinition("loops_false", "false loops", ("derived", "false_loops"), 0)
 COVERAGE = MetricDefinition("coverage_95", "coverage of 95 %", ("graph", "coverage", "95"), 2)
 TRIANGLES = MetricDefinition("map_triangles", "map triangles", ("map", "triangles"), 0)
+MAP_ERRORS = (
+    MetricDefinition("map_accuracy_median_m", "accuracy, median (m)", ("map", "accuracy_median_m"), 3),
+    MetricDefinition("map_accuracy_90_m", "90 % (m)", ("map", "accuracy_90_m"), 2),
+    MetricDefinition("map_in_field_90_m", "90 % where the scanner looked (m)", ("map", "in_field", "accuracy_90_m"), 2),
+    MetricDefinition("map_completeness", "completeness, 0.3 m", ("map", "completeness"), 2),
+    MetricDefinition("map_f_score_02", "F-score, 0.2 m", ("map", "f_score", "0.2"), 2),
+    MetricDefinition("map_f_score_05", "0.5 m", ("map", "f_score", "0.5"), 2),
+    MetricDefinition("map_double_wall_share", "double walls", ("map", "double_wall_share"), 4),
+)
+MAP_SIZES = (
+    TRIANGLES,
+    MetricDefinition("map_blocks", "blocks", ("map", "blocks"), 0),
+    MetricDefinition("map_submaps", "submaps", ("map", "submaps"), 0),
+    MetricDefinition("map_frames_fused", "frames fused", ("map", "frames_fused"), 0),
+    MetricDefinition("map_floater_share", "floaters", ("map", "floater_share"), 3),
+)
+FUSION = MetricDefinition("fusion_ms_per_keyframe", "fusion (ms / keyframe)", ("derived", "fusion_ms"), 1)
+MESH = MetricDefinition("mesh_seconds", "mesh (s)", (*STAGES, "mesh"), 1)
 RATE = MetricDefinition("frames_per_second", "frames / s", ("timing", "frames_per_second"), 1)
 MEMORY = MetricDefinition("peak_rss_mb", "peak RSS (MiB)", ("timing", "peak_rss_mb"), 0)
 SECONDS = MetricDefinition("seconds_total", "seconds", ("timing", "seconds_total"), 1)
@@ -52,6 +70,7 @@ TIME = MetricDefinition("ms_per_frame", "ms / frame", ("process", "ms_per_frame"
 CPU = MetricDefinition("cpu_ms_per_frame", "CPU ms / frame", ("process", "cpu_ms_per_frame"), 1)
 DEFINITIONS = (FRAMES, LENGTH, *ERRORS, PERCENT, NETWORK_PERCENT, OF_NETWORK, R_REL, SCALE)
 DEFINITIONS += (LOOPS, TRUE_LOOPS, FALSE_LOOPS, COVERAGE, TRIANGLES)
+DEFINITIONS += (*MAP_ERRORS, *MAP_SIZES[1:], FUSION, MESH)
 DEFINITIONS += (RATE, MEMORY, SECONDS, TIME, CPU, COMMAND, LOAD)
 
 

@@ -32,10 +32,14 @@ from benchmarking.metric_definitions import (
     ERRORS,
     FALSE_LOOPS,
     FRAMES,
+    FUSION,
     LENGTH,
     LOAD,
     LOOPS,
+    MAP_ERRORS,
+    MAP_SIZES,
     MEMORY,
+    MESH,
     OF_NETWORK,
     PERCENT,
     R_REL,
@@ -123,10 +127,28 @@ Growth with the number of frames, without fusion; stages in ms / frame:
 {table({"sequence": drive, "weights": weights}, by_stage, growth)}{notes(results, (*costs, *grown))}"""
 
 
+def maps_tables(results: Sequence[JobResult]) -> str:
+    """Errors of the map with everything on and with one part turned off; sizes and cost."""
+    rows = {"sequence": drive, "weights": weights, "configuration": configuration}
+    whole = [o for o in results if o.job.configuration.name == EVERYTHING.name]
+    costs = (*MAP_SIZES, FUSION, MESH, MEMORY)
+    sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
+    return f"""Errors of the map after one rigid motion, by the best truth of each drive
+([outputs](outputs.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
+2 m before it.
+
+{table(rows, {q.title: over_seeds(q) for q in MAP_ERRORS}, results)}
+
+Sizes and cost:
+
+{sizes}{notes(results, (*MAP_ERRORS, *costs))}"""
+
+
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
     "ablation": ablation_tables,
     "speed": speed_tables,
+    "maps": maps_tables,
 }
 
 

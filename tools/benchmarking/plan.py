@@ -15,6 +15,8 @@ Condition = Literal["clean", "hazards"]
 class BenchmarkSequence:
     """A recording; one with ``simulate`` is made by ``erfsfm-slam simulate`` with those options.
 
+    ``sequence`` is empty for a root that is one recording.
+
     Drives of one ``kind`` are a row of the summary; ``clean`` names the same drive without hazards.
     """
 
@@ -73,6 +75,17 @@ SPEED = (
     Configuration("from the cache", cache="full"),
     Configuration("from the cache, no fusion", ("mapping.enabled=false",), cache="full"),
 )
+_MAP_PARTS: dict[str, tuple[str, ...]] = {
+    "depth not refined": ("depth.refine=none",),
+    "no border": ("mapping.border=0",),
+    "no sky": ("mapping.sky_brightness=256", "mapping.sky_blueness=256"),
+    "range to 30 m": ("mapping.depth_max_m=30",),
+    "no edge": ("mapping.max_depth_step=100",),
+    "no agreement": ("mapping.consistency=100",),
+    "small pieces kept": ("mapping.min_component_triangles=0",),
+    "no loops": ("loops.enabled=false",),
+}
+MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _MAP_PARTS.items()))
 GROWTH = Configuration("no fusion", (*QUIET, "mapping.enabled=false"))
 
 
@@ -106,7 +119,8 @@ class Job:
     def arguments(self) -> list[str]:
         """Arguments of ``erfsfm-slam``."""
         drive, configuration = self.drive, self.configuration
-        words = ["run", "--dataset", str(drive.root), "--sequence", drive.sequence, "--weights", self.weights]
+        words = ["run", "--dataset", str(drive.root), "--weights", self.weights]
+        words += ["--sequence", drive.sequence] if drive.sequence else []
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
         words += ["--frames", drive.frames] if drive.frames else []
         words += ["--cache", str(self.cache)] if configuration.cache != "none" else []
@@ -128,19 +142,30 @@ def plan(
 
 
 def worlds(
-    folder: Path, routes: Sequence[str], seeds: Sequence[int], frames: int, conditions: Sequence[Condition] = ("clean",)
+    folder: Path,
+    routes: Sequence[str],
+    seeds: Sequence[int],
+    frames: int,
+    conditions: Sequence[Condition] = ("clean",),
+    truth: Sequence[Literal["depth"]] = (),
 ) -> list[BenchmarkSequence]:
-    """Simulated drives, in folders named by all parameters of the simulation; ``hazards`` are all of them at once."""
+    """Simulated drives, in folders named by all parameters of the simulation; ``hazards`` are all of them at once.
+
+    ``truth`` is what is written beside the images.
+    """
     from slam.sequences.simulation.hazards import Hazard
     from slam.sequences.simulation.street import VERSION
 
-    every_hazard = ",".join(get_args(Hazard))
+    every_hazard, beside = ",".join(get_args(Hazard)), "".join(f"-{kind}" for kind in truth)
+    flags = [f"--{kind}" for kind in truth]
 
     def world(route: str, seed: int, condition: Condition) -> BenchmarkSequence:
-        name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames))
+        name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames), *flags)
         if condition == "clean":
-            return BenchmarkSequence(name, folder / f"{route}-{seed}-{frames}-v{VERSION}", simulate=words, kind=route)
-        root = folder / f"{route}-{seed}-{frames}-{condition}-v{VERSION}"
+            return BenchmarkSequence(
+                name, folder / f"{route}-{seed}-{frames}{beside}-v{VERSION}", simulate=words, kind=route
+            )
+        root = folder / f"{route}-{seed}-{frames}{beside}-{condition}-v{VERSION}"
         simulate = (*words, "--hazards", every_hazard)
         return BenchmarkSequence(
             f"{name}, {condition}", root, simulate=simulate, kind=f"{route}, {condition}", clean=name
@@ -155,6 +180,11 @@ def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[Be
 
     chosen = names or sequence_names(kitti)
     return [BenchmarkSequence(f"KITTI {name}", kitti, name, frames, kind="KITTI") for name in chosen]
+
+
+def raw_drives(folders: Sequence[Path]) -> list[BenchmarkSequence]:
+    """KITTI raw drives, each a folder of its own."""
+    return [BenchmarkSequence(folder.name, folder.resolve(), sequence="", kind="KITTI raw") for folder in folders]
 
 
 def excerpts(drive: BenchmarkSequence, counts: Sequence[int]) -> list[BenchmarkSequence]:

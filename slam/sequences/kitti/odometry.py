@@ -77,7 +77,8 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
 
 
 def _no_images(folder: Path) -> str:
-    found = ", ".join(sorted(p.name for p in folder.iterdir())) if folder.is_dir() else "no such folder"
+    names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else ["no such folder"]
+    found = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     looked = ", ".join(f"image_{camera}" for camera in ODOMETRY_CAMERAS)
     return f"no images in {folder}: looked for png or jpg in {looked}; found {found or 'an empty folder'}"
 

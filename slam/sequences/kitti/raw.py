@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.images import has_images, list_images
 from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CAMERA_HEIGHT_M, IMU_TO_VELO, VELO_TO_CAM, CalibrationFile
@@ -96,7 +97,7 @@ def _times(path: Path, files: NumberedFiles) -> FloatArray | None:
     if not path.is_file():
         return None
     try:
-        stamps = np.array(path.read_text(encoding="utf-8").split("\n"), dtype="datetime64[ns]")
+        stamps = np.array(read_text(path).split("\n"), dtype="datetime64[ns]")
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold a date and a time a row: {error}") from error
     stamps = stamps[~np.isnat(stamps)]

@@ -109,6 +109,10 @@ class Bag:
                 seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)  # after the encapsulation
         return int(seconds) * _NANOSECONDS + int(nanoseconds)
 
+    def close(self) -> None:
+        """Close the file; nothing can be read any more."""
+        self._reader.close()
+
     @contextmanager
     def _errors(self) -> Iterator[None]:
         try:

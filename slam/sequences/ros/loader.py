@@ -6,6 +6,7 @@ import functools
 import logging
 import re
 from collections.abc import Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -87,9 +88,11 @@ class StampedMessages:
             time_ns = self._times_ns[number]
             self._next = self._times_ns.index(time_ns)
             self._following = self._bag.raw(self.topic, time_ns)
+        position, self._next = self._next, 0  # after an error the next message is searched again
         for _, data in self._following:
-            self._next += 1
-            if self._next == number + 1:
+            position += 1
+            if position == number + 1:
+                self._next = position
                 return self._bag.parse(self.topic, data)
         raise SequenceError(f"{self._bag.path} breaks off at message {number} of {self.topic}: copy it again")
 
@@ -158,9 +161,14 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     )
 
 
-def camera_topics(bag: Bag) -> list[str]:
-    """Topics with pictures of a camera: not those of depth."""
-    return [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
+def camera_topics(path: Path) -> list[str]:
+    """Topics of a bag with pictures of a camera: not those of depth.
+
+    Raises:
+        SequenceError: the bag is damaged.
+    """
+    with closing(Bag(path)) as bag:
+        return [topic for topic in bag.topics(IMAGE, COMPRESSED_IMAGE) if is_colour(bag.first(topic))]
 
 
 def _calibration(bag: Bag, topic: str, fps: float) -> CameraFile:
@@ -223,11 +231,11 @@ def _points(clouds: StampedMessages, index: int, where: str) -> FloatArray:
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     """The cameras of a bag by topic; those of a folder of bags by bag, and by topic where a bag has several."""
     if is_bag(path):
-        topics = camera_topics(Bag(path))
+        topics = camera_topics(path)
         return {topic: _opener(path, topic, len(topics) > 1, asked) for topic in topics}
     found = {}
     for file in sorted(path.glob("*.bag")) if path.is_dir() else ():
-        topics = camera_topics(Bag(file))
+        topics = camera_topics(file)
         for topic in topics:
             found[f"{file.stem}{topic}" if len(topics) > 1 else file.stem] = _opener(
                 file, topic, len(topics) > 1, asked

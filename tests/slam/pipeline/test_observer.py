@@ -131,7 +131,7 @@ def run_on(damage: Damage) -> tuple[SlamResult, str]:
             lines.append(record.getMessage())
 
     listing = Listing(logging.WARNING)
-    logger = logging.getLogger("slam.pipeline.batch")
+    logger = logging.getLogger("slam.pipeline")
     logger.addHandler(listing)
     try:
         return run(damage), "\n".join(lines)

@@ -69,10 +69,3 @@ def test_every_missing_number_has_its_reason(tmp_path) -> None:
 def test_the_nearest_lidar_point_of_a_pixel_counts() -> None:
     depth = projected(np.array([[0.1, 0.1, 4.0], [0.2, 0.2, 8.0], [0, 0, -3.0]]), np.eye(4), CAMERA)
     assert depth[3, 4] == 4.0 and (depth > 0).sum() == 1
-
-
-def test_depth_of_large_sigma_is_not_fused() -> None:
-    trusted = keyframe().trusted(0.15)
-    assert (trusted[0] == 0).all()
-    np.testing.assert_allclose(trusted[1:], 5.5)
-    np.testing.assert_array_equal(keyframe(False).trusted(0.15), DEPTH)

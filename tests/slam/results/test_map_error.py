@@ -53,7 +53,7 @@ def errors(points: FloatArray, sequence: Sequence, mode: str = "camera-height", 
     result = SimpleNamespace(
         optimised=SimpleNamespace(T_world_camera=T_world_camera), scale=SimpleNamespace(mode=mode, estimate=None)
     )
-    return map_errors(points / scale, result, sequence)
+    return map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)
 
 
 def test_true_depth_at_true_poses_has_no_error(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from slam.errors import SequenceError
-from slam.sequences.catalogue import open_sequence, sequence_names
+from slam.sequences.catalogue import open_sequence, sequence_kinds, sequence_names
 
 
 def test_only_sequence_needs_no_name(tmp_path: Path, odometry) -> None:
@@ -96,3 +96,18 @@ def test_the_door_is_light() -> None:
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
+
+
+def test_a_folder_of_recordings_lists_all(tmp_path: Path, images, odometry, camera_yaml: str) -> None:
+    images(tmp_path / "left", ["0.png"])
+    images(tmp_path / "right/images", ["0.png"])
+    odometry(tmp_path / "kitti", name="03", frames=2)
+    odometry(tmp_path / "kitti", name="04", frames=2)
+    (tmp_path / "2011_09_26_drive_0013_extract").mkdir()  # refused where it is given, here it is only left out
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    kinds = {"kitti/03": "KITTI odometry", "kitti/04": "KITTI odometry", "left": "images", "right": "images"}
+    assert sequence_kinds(tmp_path) == kinds
+    for name in kinds:
+        assert len(open_sequence(tmp_path, name)) == 1 + ("kitti" in name)
+    with pytest.raises(SequenceError, match="has 4 sequences: kitti/03, kitti/04, left, right; choose one"):
+        open_sequence(tmp_path)

@@ -12,7 +12,7 @@ from slam.errors import RunError, SlamError
 from slam.frames import Intrinsics
 from slam.loops.descriptors import View
 from slam.loops.places import Places
-from slam.pipeline.checkpoint import SessionCheckpoint, _read_keyframes, write_keyframes
+from slam.pipeline.checkpoint import SessionCheckpoint, read_keyframes, write_keyframes
 from slam.pipeline.observer import Keyframe
 from slam.storage.archive import reading_archive
 from slam.storage.spill import SpillFile
@@ -31,7 +31,7 @@ def places(path: Path) -> None:
 
 
 READERS = {
-    "keyframes.npz": (keyframes, lambda path: [(k.index, k.image) for k in _read_keyframes(path)]),
+    "keyframes.npz": (keyframes, lambda path: [(k.index, k.image) for k in read_keyframes(path)]),
     "places.npz": (places, Places.read),
 }
 

@@ -45,6 +45,9 @@ def test_opens(new_bag: NewBag, kind: str) -> None:
     for k in (0, 1, 5, 2, 3, 0):
         assert np.array_equal(sequence.frame(k).image, np.repeat(picture(k)[:, :, None], 3, axis=2))
     assert sequence_names(path) == ["/cam0/image_raw"]
+    if path.is_dir():
+        (file,) = (file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
+        assert open_sequence(file).stamps.tolist() == sequence.stamps.tolist()
     line = examine(path)[-1]
     assert line.startswith("ok       sequence /cam0/image_raw: 6 frames of 40x24") and line.endswith("(ROS bag)")
     assert open_sequence(path.parent, frames="1:3").name == "walk"
@@ -204,3 +207,19 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(imports.importlib, "import_module", absent)
     with pytest.raises(SequenceError, match=r"bags need rosbags .*erfsfm-slam\[ros\]"):
         open_sequence(tmp_path / "walk.bag")
+
+
+def test_a_damaged_image_is_one_frame_alone(new_bag: NewBag, kind: str) -> None:
+    bag = new_bag(kind)
+    bag.camera_info("/c/camera_info", CAMERA, "", ())
+    for k in range(4):
+        data = cv2.imencode(".png", picture(k, 3))[1].ravel()
+        cut = data[: len(data) // 2] if k == 1 else data
+        header = bag.header(FIRST_NS + k * STEP_NS, "c")
+        message = bag.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=cut)
+        bag.write("/c/image/compressed", FIRST_NS + k * STEP_NS, message)
+    sequence = open_sequence(bag.close())
+    with pytest.raises(SequenceError, match=r"an image of /c/image/compressed in .* is truncated"):
+        sequence.frame(1)
+    for k in (2, 0, 3):
+        assert np.array_equal(sequence.frame(k).image, picture(k, 3)[:, :, ::-1])

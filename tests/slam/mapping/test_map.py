@@ -1,13 +1,12 @@
-import logging
-
 import numpy as np
 import pytest
 
 from slam import se3
 from slam.config import MappingConfig
 from slam.errors import SlamError
+from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
-from slam.mapping import TsdfMap
+from slam.mapping.map import TsdfMap
 from slam.pipeline.observations import Keyframe
 from slam.runtime.imports import import_open3d
 from slam.storage.spill import SpillFile
@@ -110,7 +109,13 @@ def test_flying_pixels_and_far_depth_are_left_out():
     smeared[:8] = 60.0  # sky
 
     def fuse(max_depth_step):
-        config = MappingConfig(max_depth_step=max_depth_step, min_weight=1, min_component_triangles=0, consistency=10.0)
+        config = MappingConfig(
+            max_depth_step=max_depth_step,
+            truncation_voxels=4.5,
+            min_weight=1,
+            min_component_triangles=0,
+            consistency=10.0,
+        )
         tsdf_map = TsdfMap(config, CAMERA)
         for x in (0.0, 0.31):
             tsdf_map.integrate(smeared, GREY, pose(x, 0.0, 0.0))
@@ -133,8 +138,8 @@ def test_standing_still_adds_nothing():
 
 def test_files_are_written_whole_and_read_back(tmp_path):
     tsdf_map = street_map()
-    tsdf_map.write_mesh(tmp_path / "mesh.ply")
-    tsdf_map.write_cloud(tmp_path / "cloud.ply")
+    tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
+    tsdf_map.surface().write_cloud(tmp_path / "cloud.ply")
     o3d = import_open3d()
     mesh = o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
     cloud = o3d.io.read_point_cloud(str(tmp_path / "cloud.ply"))
@@ -143,17 +148,20 @@ def test_files_are_written_whole_and_read_back(tmp_path):
     assert len(cloud.points) == statistics.points > 1000
     assert statistics.blocks > 0
     assert statistics.frames_fused == 12
-    assert mesh.has_vertex_colors()
+    assert mesh.has_vertex_colors() and mesh.has_vertex_normals()
     assert cloud.has_normals()
-    np.testing.assert_allclose(np.asarray(mesh.vertices), tsdf_map.mesh().vertices_world)
+    whole = tsdf_map.mesh()
+    np.testing.assert_array_equal(np.asarray(mesh.vertices), whole.vertices_world)
+    np.testing.assert_array_equal(np.asarray(mesh.triangles), whole.triangles)
+    np.testing.assert_array_equal(read_ply(tmp_path / "mesh.ply").vertices["filled"] > 0, whole.filled)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cloud.ply", "mesh.ply"]
 
 
 def test_two_runs_give_the_same_map(tmp_path):
     for run in ("one", "other"):
         tsdf_map = street_map()
-        tsdf_map.write_mesh(tmp_path / f"{run}_mesh.ply")
-        tsdf_map.write_cloud(tmp_path / f"{run}_cloud.ply")
+        tsdf_map.surface().write_mesh(tmp_path / f"{run}_mesh.ply")
+        tsdf_map.surface().write_cloud(tmp_path / f"{run}_cloud.ply")
     for what in ("mesh", "cloud"):
         one, other = (tmp_path / f"{run}_{what}.ply" for run in ("one", "other"))
         assert one.read_bytes() == other.read_bytes()
@@ -173,18 +181,9 @@ def test_empty_maps_say_so_and_do_not_crash(tmp_path):
         never_enough.integrate(street(np.zeros(3)), GREY, pose(500.0 * k, 0.0, 0.0))
     for tsdf_map in (empty, sky, unknown, all_small, never_enough):
         with pytest.raises(SlamError, match="the map is empty"):
-            tsdf_map.write_mesh(tmp_path / "mesh.ply")
+            tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
         assert tsdf_map.statistics().triangles == 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_full_map_stops_growing_and_counts_what_it_left_out(caplog):
-    with caplog.at_level(logging.WARNING):
-        tsdf_map = street_map(max_blocks=16, min_component_triangles=0)
-    statistics = tsdf_map.statistics()
-    assert statistics.frames_left_out > 0
-    assert statistics.frames_fused + statistics.frames_left_out == 12
-    assert caplog.text.count("the map is full") == 1
 
 
 def test_wrong_sizes_are_refused():

@@ -1,0 +1,42 @@
+"""The map of a run as a PLY file; of a run that was killed, what its finished submaps hold."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from slam.config import load_config
+from slam.mapping.submap import FOLDER, submap_paths
+from slam.mapping.surface import MapSurface
+from slam.results.folder import RunFolder
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, int, int], None]
+
+
+def has_map(folder: RunFolder, what: str) -> bool:
+    """Whether a run has a ``mesh`` or ``cloud``, or submaps of which one can be made."""
+    return (folder.path / f"map_{what}.ply").is_file() or bool(submap_paths(folder.path / FOLDER))
+
+
+@contextmanager
+def map_file(folder: RunFolder, what: str, progress: Progress | None = None) -> Iterator[Path]:
+    """The ``mesh`` or ``cloud`` of a run as a PLY file, which may be gone afterwards.
+
+    Raises:
+        SlamError: the run has neither it nor submaps, or these are damaged or hold no surface.
+    """
+    paths = submap_paths(folder.path / FOLDER)
+    if (folder.path / f"map_{what}.ply").is_file() or not paths:
+        yield folder.require(f"map_{what}.ply")
+        return
+    logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
+    surface = MapSurface(paths, load_config(folder.require("config.yaml")).mapping, progress)
+    with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
+        path = Path(temporary) / f"map_{what}.ply"
+        (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)
+        yield path

@@ -1,0 +1,121 @@
+"""Which pixels of a depth map are fused. Each filter has a name, settings, and the share of pixels that it took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import MappingConfig
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.se3 import FloatArray, invert
+
+Mask = NDArray[np.bool_]
+_DARK_BLUE = 110  # grey levels below which nothing is the sky by day
+FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement")
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A frame: depth ``(H, W)`` with 0 where unknown, its relative sigma or None, its image and pose."""
+
+    frame: int
+    depth: DepthMap
+    relative_sigma: DepthMap | None
+    image: Image
+    T_world_camera: FloatArray
+
+
+class DepthFilters:
+    """The filters of one camera, in the order of ``FILTERS``."""
+
+    def __init__(self, config: MappingConfig, intrinsics: Intrinsics) -> None:
+        """For depth maps of the size of the intrinsics."""
+        self._config, self._camera = config, intrinsics
+        self._rays = np.ascontiguousarray(
+            intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3).T, dtype=np.float32
+        )  # (3, H*W) with z = 1
+        height, width = intrinsics.height, intrinsics.width
+        border, self._above_bonnet = round(config.border * width), np.ones((height, width), dtype=bool)
+        self._inside = np.zeros((height, width), dtype=bool)
+        self._inside[border:, border : width - border] = True
+        self._above_bonnet[height - round(config.bonnet * height) :] = False
+        self._taken = np.zeros(len(FILTERS))
+        self._frames = 0
+
+    def shares(self) -> dict[str, float]:
+        """The share of all pixels that each filter took from what those before it left."""
+        return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
+
+    def kept(self, view: DepthView, other: DepthView | None) -> DepthMap:
+        """The depth to fuse ``(H, W)``, 0 elsewhere; ``other`` sees the same place from another position."""
+        config, depth = self._config, view.depth
+        everything = np.ones(depth.shape, dtype=bool)
+        sigma = view.relative_sigma
+        masks = (
+            depth > 0,
+            self._inside,
+            self._above_bonnet,
+            ~self._is_sky(view.image),
+            (depth >= config.depth_min_m) & (depth < config.depth_max_m),
+            everything if sigma is None else sigma <= config.max_relative_sigma,
+            ~_at_edges(self.trusted(view), config.max_depth_step),
+            everything if other is None else self._agrees(view, other),
+        )
+        left = everything
+        for number, mask in enumerate(masks):
+            remaining = left & mask
+            self._taken[number] += (left.sum() - remaining.sum()) / depth.size
+            left = remaining
+        self._frames += 1
+        return np.where(left, depth, np.float32(0))
+
+    def trusted(self, view: DepthView) -> DepthMap:
+        """Depth with 0 where its sigma is too large."""
+        if view.relative_sigma is None:
+            return view.depth
+        return np.where(view.relative_sigma <= self._config.max_relative_sigma, view.depth, np.float32(0))
+
+    def projected(self, view: DepthView, other: DepthView, stride: int = 1) -> tuple[NDArray[np.int64], DepthMap]:
+        """For every ``stride``-th pixel of a view its flat pixel in the other, -1 outside, and its depth there."""
+        camera = self._camera
+        T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
+        points = (self._rays * view.depth.ravel())[:, ::stride]
+        x, y, z = T_other_camera[:3, :3] @ points + T_other_camera[:3, 3:]
+        ahead = (z > 1e-3) & (points[2] > 0)
+        before = np.where(ahead, z, np.float32(np.inf))
+        u = np.rint(np.float32(camera.fx) * (x / before) + np.float32(camera.cx))
+        v = np.rint(np.float32(camera.fy) * (y / before) + np.float32(camera.cy))
+        inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        return np.where(inside, v * camera.width + u, -1).astype(np.int64), z
+
+    def _is_sky(self, image: Image) -> Mask:
+        """Bright or blue pixels ``(H, W)`` above the horizon of a level camera."""
+        config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
+        sky = np.zeros(image.shape[:2], dtype=bool)
+        red, _, blue = (each.astype(np.int16) for each in np.moveaxis(image[:horizon], 2, 0))
+        is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
+        sky[:horizon] = (image[:horizon].min(axis=2) >= config.sky_brightness) | is_blue
+        return sky
+
+    def _agrees(self, view: DepthView, other: DepthView) -> Mask:
+        """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
+        pixel, z = self.projected(view, other)
+        there = self.trusted(other).ravel()[pixel]
+        agrees = (pixel >= 0) & (np.abs(there - z) < self._config.consistency * z)
+        return np.asarray(agrees.reshape(view.depth.shape))
+
+
+def _at_edges(depth: DepthMap, max_step: float) -> Mask:
+    """Pixels on either side of a relative depth step, where networks blur depth."""
+    edges = np.zeros(depth.shape, dtype=bool)
+    for near, far in (
+        ((slice(None), slice(1, None)), (slice(None), slice(-1))),
+        ((slice(1, None),), (slice(-1),)),
+    ):
+        a, b = depth[near], depth[far]
+        step = np.abs(a - b) > max_step * np.minimum(a, b)
+        edges[near] |= step
+        edges[far] |= step
+    return edges

@@ -1,0 +1,96 @@
+"""Small holes of the road closed: flat loops of open edges that look upwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from slam.mapping.patch import Mask, Patch, Triangles, in_tile
+from slam.se3 import FloatArray
+
+_UPWARDS = 0.85  # least cosine to the camera's own upwards
+_FLAT = 0.15  # largest height of a hole's edge over its diameter
+_MOST_EDGES = 100
+
+
+def with_holes_closed(
+    patch: Patch, tile: NDArray[np.int64], voxel_size_m: float, up_world: FloatArray, largest_m: float
+) -> Patch:
+    """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
+
+    Args:
+        patch: the surface.
+        tile: its tile; a hole belongs to the tile that its middle is in.
+        voxel_size_m: of the map.
+        up_world: upwards ``(3,)`` near the tile.
+        largest_m: largest diameter.
+    """
+    vertices, triangles, own = [patch.vertices], [patch.triangles], [patch.own]
+    count = len(patch.vertices)
+    upwards = patch.normals() @ up_world
+    for ring in _rings(patch.triangles, count):
+        corners = patch.vertices[ring]
+        middle = corners.mean(axis=0)
+        if upwards[ring].mean() < _UPWARDS or not _is_small_and_flat(corners - middle, up_world, largest_m):
+            continue
+        vertices.append(middle[None])
+        triangles.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1))
+        own.append(np.repeat(in_tile(middle[None], tile, voxel_size_m), len(ring)))
+        count += 1
+    filled = np.concatenate([np.full(len(each), number > 0) for number, each in enumerate(triangles)])
+    return replace(
+        patch,
+        vertices=np.concatenate(vertices),
+        triangles=np.concatenate(triangles),
+        own=np.concatenate(own),
+        filled=filled,
+    )
+
+
+def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: float) -> bool:
+    """Whether a ring ``(R, 3)`` around the origin is the edge of a small hole in ground.
+
+    Its edges run as in the triangles beside them, which go round a hole the other way than round a piece of surface.
+    """
+    if 2 * float(np.linalg.norm(corners, axis=1).max()) > largest_m:
+        return False
+    area = 0.5 * np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    size = float(np.linalg.norm(area))
+    if size == 0 or float(-area @ up_world) < _UPWARDS * size:
+        return False
+    return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size
+
+
+def _rings(triangles: Triangles, vertices: int) -> list[NDArray[np.int64]]:
+    """Closed rings of open edges, each vertex once, in the direction of the triangles beside them."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    there, back = edges[:, 0] * vertices + edges[:, 1], edges[:, 1] * vertices + edges[:, 0]
+    begin, end = edges[~np.isin(there, back)].T
+    simple = _once(begin, vertices) & _once(end, vertices)
+    link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
+    _, label = connected_components(link, directed=False)
+    broken = np.zeros(vertices, dtype=bool)  # rings that touch themselves
+    touched = np.zeros(vertices, dtype=bool)
+    touched[begin] = touched[end] = True
+    broken[label[touched & ~simple]] = True
+    broken |= np.bincount(label[begin], minlength=vertices) > _MOST_EDGES
+    following = np.full(vertices, -1, dtype=np.int64)
+    following[begin] = end
+    chosen = begin[~broken[label[begin]]]
+    _, first = np.unique(label[chosen], return_index=True)
+    return [_walk(following, int(start)) for start in chosen[np.sort(first)]]
+
+
+def _once(ends: NDArray[np.int64], vertices: int) -> Mask:
+    return np.asarray(np.bincount(ends, minlength=vertices) == 1)
+
+
+def _walk(following: NDArray[np.int64], start: int) -> NDArray[np.int64]:
+    ring = [start]
+    while (vertex := int(following[ring[-1]])) != start:
+        ring.append(vertex)
+    return np.array(ring, dtype=np.int64)

@@ -1,0 +1,226 @@
+"""The map of a drive: depth maps fused into submaps on disk, submaps merged into one surface."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import MappingConfig
+from slam.errors import EmptyMapError
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.mapping.filters import DepthFilters, DepthView
+from slam.mapping.fusion import Fusion
+from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
+from slam.mapping.surface import MapSurface, Progress, colours, normals, positions
+from slam.mapping.views import ViewChooser
+from slam.se3 import FloatArray, invert, rotation_angle
+
+_FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
+_BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
+
+
+@dataclass(frozen=True)
+class MapMesh:
+    """Vertices and unit normals ``(V, 3)`` in the world, triangles ``(T, 3)``, colours ``(V, 3)`` in [0, 1].
+
+    ``filled`` ``(V,)`` marks vertices that close a hole.
+    """
+
+    vertices_world: FloatArray
+    triangles: NDArray[np.int64]
+    normals_world: FloatArray
+    colours: FloatArray
+    filled: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MapCloud:
+    """Points ``(P, 3)`` and unit normals ``(P, 3)`` in the world, colours ``(P, 3)`` in [0, 1]."""
+
+    points_world: FloatArray
+    normals_world: FloatArray
+    colours: FloatArray
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """Size of a map, the share of pixels that each filter took, and that of triangles in small loose pieces."""
+
+    triangles: int
+    points: int
+    blocks: int
+    submaps: int
+    frames_fused: int
+    frames_left_out: int
+    filters: dict[str, float]
+    floater_share: float
+
+
+@dataclass
+class _Stretch:
+    """The submap that grows."""
+
+    fusion: Fusion
+    frames: int = 0
+    length: float = 0.0
+    position: FloatArray | None = None
+
+    def moved_to(self, position: FloatArray) -> None:
+        """Count a fused frame."""
+        if self.position is not None:
+            self.length += float(np.linalg.norm(position - self.position))
+        self.position = position
+        self.frames += 1
+
+
+class TsdfMap:
+    """TSDF fusion of depth maps along a trajectory; lengths are in the trajectory's unit."""
+
+    def __init__(self, config: MappingConfig, intrinsics: Intrinsics, folder: Path | None = None) -> None:
+        """Prepare.
+
+        Args:
+            config: settings.
+            intrinsics: of all depth maps and images.
+            folder: parent of the folder of submaps; None keeps them in a temporary folder as long as the map lives.
+        """
+        self._config = config
+        self._size = (intrinsics.height, intrinsics.width)
+        self._intrinsics = intrinsics
+        self._filters = DepthFilters(config, intrinsics)
+        self._views = ViewChooser(self._filters)
+        self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
+        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
+        remove_submaps(self._folder)  # of a run that was killed here
+        self._previous: DepthView | None = None
+        self._first_is_fused = False
+        self._stretch: _Stretch | None = None
+        self._submaps = 0
+        self._fused = 0
+        self._surface: MapSurface | None = None
+
+    def integrate(
+        self,
+        depth: DepthMap,
+        image: Image,
+        T_world_camera: FloatArray,
+        relative_sigma: DepthMap | None = None,
+        frame: int = 0,
+    ) -> None:
+        """Filter a depth map, also by the previous keyframe, and fuse it; skip it if the camera hardly moved.
+
+        Args:
+            depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
+            image: its image ``(H, W, 3)`` uint8 RGB.
+            T_world_camera: its pose.
+            relative_sigma: of the depth, relative to it ``(H, W)``; None where it is not known.
+            frame: its number.
+
+        Raises:
+            RunError: a submap cannot be written.
+        """
+        if depth.shape != self._size or image.shape != (*self._size, 3):
+            raise ValueError(f"depth and image must be {self._size}; got {depth.shape} and {image.shape}")
+        known = np.isfinite(depth) & (depth > 0)
+        known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
+        view = DepthView(frame, known_depth, relative_sigma, image, T_world_camera)
+        previous = self._previous
+        if previous is None:
+            self._previous = view
+        elif self._has_moved(view.T_world_camera, previous.T_world_camera):
+            if not self._first_is_fused:
+                self._fuse(previous, view)
+                self._first_is_fused = True
+            self._fuse(view, previous)
+            self._previous = view
+
+    def moved(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
+        """Which of these frames ``integrate`` does not skip, as positions in ``frames``.
+
+        Args:
+            frames: frame numbers in time order.
+            T_world_camera: poses of all frames ``(N, 4, 4)``.
+        """
+        found: list[int] = []
+        for position, frame in enumerate(frames):
+            if not found or self._has_moved(T_world_camera[frame], T_world_camera[frames[found[-1]]]):
+                found.append(position)
+        return found
+
+    def surface(self, progress: Progress | None = None) -> MapSurface:
+        """The surface of all that was fused; more depth maps may follow.
+
+        Raises:
+            EmptyMapError: nothing was fused or seen often enough.
+            SlamError: a submap cannot be written, or the disk is full.
+        """
+        if self._surface is None:
+            if self._previous is not None and not self._first_is_fused:
+                self._fuse(self._previous, None)  # the only keyframe: there is no second view to compare it with
+                self._first_is_fused = True
+            self._finish_submap()
+            self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
+        return self._surface
+
+    def mesh(self) -> MapMesh:
+        """The whole surface as triangles, in memory; raises as ``surface``."""
+        surface = self.surface()
+        vertices = np.concatenate(list(surface.vertex_pieces()))
+        triangles = np.concatenate(list(surface.triangle_pieces()))
+        return MapMesh(positions(vertices), triangles, normals(vertices), colours(vertices), vertices["filled"] > 0)
+
+    def cloud(self) -> MapCloud:
+        """The whole surface as points, in memory; raises as ``surface``."""
+        points = np.concatenate(list(self.surface().cloud_pieces()))
+        return MapCloud(positions(points), normals(points), colours(points))
+
+    def statistics(self) -> MapStatistics:
+        """Counts, zero for an empty map."""
+        filters = self._filters.shares()
+        try:
+            surface = self.surface()
+        except EmptyMapError:
+            return MapStatistics(0, 0, 0, self._submaps, self._fused, 0, filters, 0.0)
+        sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
+        return MapStatistics(*sizes, self._fused, 0, filters, surface.floater_share)
+
+    def _has_moved(self, T_world_camera: FloatArray, T_world_previous: FloatArray) -> bool:
+        T_previous_camera = invert(T_world_previous) @ T_world_camera
+        moved = float(np.linalg.norm(T_previous_camera[:3, 3]))
+        turned = float(rotation_angle(T_previous_camera[:3, :3]))
+        config = self._config
+        return moved >= config.keyframe_distance_m or turned >= np.deg2rad(config.keyframe_rotation_deg)
+
+    def _fuse(self, view: DepthView, other: DepthView | None) -> None:
+        """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
+        kept = self._filters.kept(view, other)
+        config = self._config
+        if self._stretch is None:
+            limits = config.truncation_voxels, config.depth_max_m
+            self._stretch = _Stretch(Fusion(config.voxel_size_m, *limits, self._intrinsics))
+        stretch = self._stretch
+        if not stretch.fusion.integrate(kept, view.T_world_camera):
+            return
+        self._views.add(view, kept)
+        stretch.moved_to(view.T_world_camera[:3, 3])
+        self._fused += 1
+        self._surface = None
+        is_large = stretch.fusion.blocks * _BLOCK_MB >= _FUSION_SHARE * config.memory_mb
+        if is_large or stretch.length >= config.submap_m:
+            self._finish_submap()
+
+    def _finish_submap(self) -> None:
+        """Write the submap that grows, if there is one."""
+        if self._stretch is None or not self._stretch.frames:
+            return
+        keys, observed, tsdf, weight = self._stretch.fusion.observed()
+        fused = np.array(self._stretch.frames)
+        submap = Submap(keys, observed, tsdf, weight, fused=fused, **self._views.take(self._intrinsics))
+        submap.write(submap_path(self._folder, self._submaps))
+        self._submaps += 1
+        self._stretch = None

@@ -1,0 +1,237 @@
+"""The surface of a whole map, one tile in memory at a time.
+
+Tiles are extracted into a spill file. Vertices that neighbouring tiles share are the same bit by bit; by them pieces of
+surface are followed from tile to tile, small ones are left out, and the files are written with each vertex once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from slam.config import MappingConfig
+from slam.errors import EmptyMapError
+from slam.formats.ply_stream import write_ply_pieces
+from slam.mapping.colours import Painter
+from slam.mapping.holes import with_holes_closed
+from slam.mapping.patch import Mask, Patch, Triangles, extract_patch
+from slam.mapping.store import TILE_BLOCKS, SubmapStore
+from slam.mapping.submap import BLOCK_SIDE
+from slam.se3 import FloatArray
+from slam.storage.spill import SpilledArray, SpillFile
+
+Progress = Callable[[str, int, int], None]
+
+_LENGTHS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
+VERTEX = np.dtype([*((name, "<f4") for name in _LENGTHS), *((name, "u1") for name in _COLOURS)])
+_FILLED = np.dtype([*VERTEX.descr, ("filled", "u1")])
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What is kept of a tile, in the spill file.
+
+    ``vertices`` ``(V,)`` are records with ``filled``, ``triangles`` ``(T, 3)``, ``label`` ``(V,)`` numbers connected
+    parts, ``shared`` ``(S,)`` are vertices that a neighbouring tile may have, too; ``sizes`` counts the triangles of
+    each part.
+    """
+
+    vertices: SpilledArray
+    triangles: SpilledArray
+    label: SpilledArray
+    shared: NDArray[np.int64]
+    shared_points: NDArray[np.float32]
+    shared_labels: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Of a piece: labels to keep, shared vertices that another piece writes and those it writes, with their groups."""
+
+    parts: Mask
+    elsewhere: NDArray[np.int64]
+    groups_elsewhere: NDArray[np.int64]
+    owned: NDArray[np.int64]
+    groups_owned: NDArray[np.int64]
+
+
+def positions(records: NDArray[np.void]) -> FloatArray:
+    """Positions ``(V, 3)`` of vertices."""
+    return np.stack([records[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
+
+
+def normals(records: NDArray[np.void]) -> FloatArray:
+    """Normals ``(V, 3)`` of vertices."""
+    return np.stack([records[name].astype(np.float64) for name in ("nx", "ny", "nz")], axis=1)
+
+
+def colours(records: NDArray[np.void]) -> FloatArray:
+    """Colours ``(V, 3)`` of vertices in [0, 1]."""
+    return np.stack([records[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+
+
+class MapSurface:
+    """The cleaned surface of finished submaps."""
+
+    def __init__(self, paths: list[Path], config: MappingConfig, progress: Progress | None = None) -> None:
+        """Merge the submaps and extract their surface.
+
+        Args:
+            paths: finished submaps.
+            config: voxel size and how to clean.
+            progress: called with (stage, done, total).
+
+        Raises:
+            EmptyMapError: nothing was fused or seen often enough.
+            SlamError: a submap is damaged, or the disk is full.
+        """
+        store = SubmapStore(paths)
+        if store.fused == 0:
+            raise EmptyMapError("the map is empty: no depth passed the filters")
+        self._spill = SpillFile("the map")
+        self._pieces: list[Piece] = []
+        self.blocks, self.submaps = store.block_count(), store.submaps
+        self._extract(store, config, progress)
+        if not self._pieces:
+            raise EmptyMapError(f"the map is empty: no surface was seen {config.min_weight:g} times")
+        self._kept = _chosen(self._pieces, config.min_component_triangles)
+        self.triangles = sum(int(piece.sizes[kept.parts].sum()) for piece, kept in zip(self._pieces, self._kept))
+        if self.triangles == 0:
+            raise EmptyMapError("the map is empty: no piece of surface is larger than min_component_triangles")
+        everything = sum(int(piece.sizes.sum()) for piece in self._pieces)
+        self.floater_share = 1 - self.triangles / everything
+        sizes = [(len(each), int((each["filled"] == 0).sum())) for each in self.vertex_pieces()]
+        self.vertices, self.points = (sum(column) for column in zip(*sizes))
+
+    def vertex_pieces(self) -> Iterator[NDArray[np.void]]:
+        """Vertices as records with position, normal, colour and ``filled``, each once, tile by tile."""
+        for piece, kept in zip(self._pieces, self._kept):
+            yield piece.vertices.read()[self._written(piece, kept)]
+
+    def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
+        """The vertices that were observed, without those that close holes, as records."""
+        for vertices in self.vertex_pieces():
+            observed = vertices[vertices["filled"] == 0]
+            cloud = np.empty(len(observed), VERTEX)
+            for name in VERTEX.names or ():
+                cloud[name] = observed[name]
+            yield cloud
+
+    def triangle_pieces(self) -> Iterator[Triangles]:
+        """Triangles ``(t, 3)`` of all vertices, tile by tile."""
+        number_of_group: dict[int, int] = {}
+        begin = 0
+        for piece, kept in zip(self._pieces, self._kept):
+            written = self._written(piece, kept)
+            number = begin + np.cumsum(written) - 1
+            begin += int(written.sum())
+            number_of_group |= dict(zip(kept.groups_owned.tolist(), number[kept.owned].tolist()))
+            number[kept.elsewhere] = [number_of_group[group] for group in kept.groups_elsewhere.tolist()]
+            yield number[_kept_triangles(piece, kept)]
+
+    def meshes(self) -> Iterator[tuple[FloatArray, Triangles]]:
+        """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of each tile by itself."""
+        for piece, kept in zip(self._pieces, self._kept):
+            yield positions(piece.vertices.read()), _kept_triangles(piece, kept)
+
+    def write_mesh(self, path: Path) -> None:
+        """Write the mesh as binary PLY, atomically; ``RunError`` where that fails."""
+        write_ply_pieces(path, _FILLED, self.vertices, self.vertex_pieces, self.triangles, self.triangle_pieces)
+
+    def write_cloud(self, path: Path) -> None:
+        """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
+        write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
+
+    def _extract(self, store: SubmapStore, config: MappingConfig, progress: Progress | None) -> None:
+        painter = Painter(store, config.voxel_size_m, config.depth_max_m)
+        tiles = store.tiles()
+        least_weight = min(config.min_weight, float(store.fused))  # with fewer frames nothing would be extracted
+        for done, tile in enumerate(tiles, 1):
+            patch = extract_patch(store, tile, config.voxel_size_m, least_weight)
+            if patch is not None:
+                if config.close_holes_m > 0:
+                    up = _upwards(store, tile, config.voxel_size_m)
+                    patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
+                if patch.own.any():
+                    self._pieces.append(_piece(patch, painter, self._spill))
+            if progress is not None:
+                progress("mesh", done, len(tiles))
+
+    @staticmethod
+    def _written(piece: Piece, kept: _Kept) -> Mask:
+        written: Mask = kept.parts[piece.label.read()]
+        written[kept.elsewhere] = False
+        return written
+
+
+def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:
+    triangles = piece.triangles.read()
+    chosen: Triangles = triangles[kept.parts[piece.label.read()[triangles[:, 0]]]].astype(np.int64)
+    return chosen
+
+
+def _piece(patch: Patch, painter: Painter, spill: SpillFile) -> Piece:
+    """The part of a patch that belongs to its tile, with colours and normals."""
+    used, renumbered = np.unique(patch.triangles[patch.own], return_inverse=True)
+    triangles = renumbered.reshape(-1, 3).astype(np.int32)
+    is_outside = np.zeros(len(patch.vertices), dtype=bool)
+    is_outside[patch.triangles[~patch.own]] = True
+    filled = np.zeros(len(patch.vertices), dtype=bool)
+    filled[patch.triangles[patch.filled, 2]] = True  # the vertex in the middle of a hole comes last
+    vertices = np.empty(len(used), _FILLED)
+    columns = np.hstack([patch.vertices, patch.normals()])[used]
+    for name, column in zip(_LENGTHS, columns.T, strict=True):
+        vertices[name] = column
+    for name, shade in zip(_COLOURS, painter.colours(patch.vertices[used]).T, strict=True):
+        vertices[name] = shade
+    vertices["filled"] = filled[used]
+    ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    links = coo_array((np.ones(len(ends), dtype=bool), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used)))
+    parts, label = connected_components(links, directed=False)
+    shared = np.flatnonzero(is_outside[used])
+    put = spill.put
+    return Piece(
+        put(vertices),
+        put(triangles),
+        put(label.astype(np.int32)),
+        shared,
+        np.stack([vertices[name][shared] for name in ("x", "y", "z")], axis=1),
+        label[shared].astype(np.int64),
+        np.bincount(label[triangles[:, 0]], minlength=parts),
+    )
+
+
+def _chosen(pieces: list[Piece], least_triangles: int) -> list[_Kept]:
+    """Parts of at least so many triangles in all tiles together, and which piece writes a shared vertex: the first."""
+    begin = np.cumsum([0, *(len(piece.sizes) for piece in pieces)])
+    points = np.concatenate([piece.shared_points for piece in pieces])
+    part = np.concatenate([first + piece.shared_labels for first, piece in zip(begin, pieces)])
+    _, earliest, group = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    group = group.ravel()
+    link = coo_array((np.ones(len(part), dtype=bool), (part, part[earliest[group]])), shape=(begin[-1], begin[-1]))
+    _, whole = connected_components(link, directed=False)
+    kept_part = np.bincount(whole, weights=np.concatenate([piece.sizes for piece in pieces]))[whole] >= least_triangles
+    kept, place = [], 0
+    for first, last, piece in zip(begin, begin[1:], pieces):
+        rows = np.arange(place, place + len(piece.shared))
+        place += len(piece.shared)
+        is_first, is_kept = earliest[group[rows]] == rows, kept_part[part[rows]]
+        own, other = is_first & is_kept, ~is_first & is_kept
+        shared, groups = piece.shared, group[rows]
+        kept.append(_Kept(kept_part[first:last], shared[other], groups[other], shared[own], groups[own]))
+    return kept
+
+
+def _upwards(store: SubmapStore, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:
+    """Upwards ``(3,)`` in the camera of the view nearest to a tile."""
+    middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * voxel_size_m
+    nearest = np.linalg.norm(store.T_world_views[:, :3, 3] - middle, axis=1).argmin()
+    up: FloatArray = -store.T_world_views[nearest, :3, 1]
+    return up

@@ -1,0 +1,99 @@
+"""Views that colour a submap: of every two metres the sharpest keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.mapping.filters import DepthFilters, DepthView
+from slam.se3 import FloatArray, invert, rotation_angle
+
+_STEP_M = 2.0
+_STEP_DEG = 10.0
+_STRIDE = 7  # of the pixels that compare the brightness of two views
+_SAME_SURFACE = 0.05  # relative difference of depth
+_LEAST_SHARED = 50  # pixels
+_DARK = 8.0  # grey levels below which a ratio says little
+_BRIGHT = 247.0
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    view: DepthView
+    sharpness: float
+
+
+class ViewChooser:
+    """Chooses the views of one submap after the other."""
+
+    def __init__(self, filters: DepthFilters) -> None:
+        """Of the camera of these filters."""
+        self._filters = filters
+        self._chosen: list[DepthView] = []
+        self._steps: list[float] = []
+        self._begin: FloatArray | None = None
+        self._best: _Candidate | None = None
+        self._last: DepthView | None = None
+
+    def add(self, view: DepthView, kept: DepthMap) -> None:
+        """A fused frame with the depth that passed the filters."""
+        if self._begin is not None and _far(view.T_world_camera, self._begin):
+            self._close()
+        if self._begin is None:
+            self._begin = view.T_world_camera
+        sharpness = _sharpness(view.image)
+        if self._best is None or sharpness > self._best.sharpness:
+            self._best = _Candidate(DepthView(view.frame, kept, None, view.image, view.T_world_camera), sharpness)
+
+    def take(self, camera: Intrinsics) -> dict[str, Any]:
+        """The views since the last call, as fields of a `Submap`."""
+        self._close()
+        views, steps = self._chosen, self._steps
+        self._chosen, self._steps = [], []
+        height, width = camera.height, camera.width
+        return {
+            "frames": np.array([view.frame for view in views], dtype=np.int64),
+            "T_world_camera": np.array([view.T_world_camera for view in views]).reshape(-1, 4, 4),
+            "images": np.array([view.image for view in views], dtype=np.uint8).reshape(-1, height, width, 3),
+            "depths": np.array([view.depth for view in views], dtype=np.float16).reshape(-1, height, width),
+            "brightness_steps": np.array(steps, dtype=np.float64),
+            "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        }
+
+    def _close(self) -> None:
+        if self._best is not None:
+            view = self._best.view
+            self._steps.append(np.nan if self._last is None else self._brightness_step(view, self._last))
+            self._chosen.append(view)
+            self._last = view
+        self._begin = self._best = None
+
+    def _brightness_step(self, view: DepthView, before: DepthView) -> float:
+        """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
+        pixel, z = self._filters.projected(view, before, _STRIDE)
+        same = (pixel >= 0) & (np.abs(before.depth.ravel()[pixel] - z) < _SAME_SURFACE * z)
+        here, there = _grey(view.image).ravel()[::_STRIDE][same], _grey(before.image).ravel()[pixel[same]]
+        usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
+        if usable.sum() < _LEAST_SHARED:
+            return float("nan")
+        return float(np.median(np.log(here[usable]) - np.log(there[usable])))
+
+
+def _far(T_world_camera: FloatArray, T_world_other: FloatArray) -> bool:
+    T_other_camera = invert(T_world_other) @ T_world_camera
+    turned = float(rotation_angle(T_other_camera[:3, :3]))
+    return float(np.linalg.norm(T_other_camera[:3, 3])) >= _STEP_M or turned >= np.deg2rad(_STEP_DEG)
+
+
+def _grey(image: Image) -> FloatArray:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.float64)
+
+
+def _sharpness(image: Image) -> float:
+    """Variance of the Laplacian over that of the grey levels, so that contrast does not count."""
+    grey = _grey(image)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var() / (grey.var() + 1.0))

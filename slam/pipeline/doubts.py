@@ -1,0 +1,38 @@
+"""Warnings of what a pass over the frames cannot decide."""
+
+from __future__ import annotations
+
+import logging
+
+from slam.frames import runs
+from slam.pipeline.observations import ClosedObservations
+from slam.pipeline.observer import ObserverState
+
+logger = logging.getLogger(__name__)
+
+
+def warn_of_a_frozen_end(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
+    """No new image shows whether the camera stood or the video froze."""
+    end = frames - 1
+    for first, last in runs(state.seen.repeated):
+        if last == end and end not in seen.interpolated:
+            logger.warning(
+                "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "
+                "froze, leave them out with --frames",
+                first,
+                last,
+                first - 1,
+            )
+
+
+def warn_of_another_place(seen: ClosedObservations, first: int) -> None:
+    """Copies of other recordings under the same name, and folders, are known by their first image alone."""
+    for start, end, reason in seen.failures:
+        if (start, end) == (first - 1, first) and first not in seen.interpolated:
+            logger.warning(
+                "frame %d, the first that follows, does not match frame %d (%s): make sure that it was taken "
+                "right after it on the same drive",
+                end,
+                start,
+                reason,
+            )

@@ -1,0 +1,305 @@
+"""Every reader of files meets damaged ones: the answer is a value, or one line that names the file.
+
+A sample is written, changed by Hypothesis and read again. One row of `READERS` is all that a new reader needs.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import resource
+import shutil
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from erfsfm.checkpoint import load_model
+from erfsfm.config import load_experiment
+from erfsfm.convert import read_old
+from erfsfm.data.pack_index import read_pack
+from erfsfm.data.recordings import Recording
+from erfsfm.data.split_file import read_split_file
+from erfsfm.errors import ErfsfmError
+from erfsfm.inference import DepthPosePredictor
+from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
+from erfsfm.readers.camera_file import read_camera_file
+from erfsfm.readers.images import read_image, read_values
+from erfsfm.readers.kitti_oxts import read_packet
+from erfsfm.readers.video import VideoFrames
+from slam import run_slam, se3
+from slam.config import load_config
+from slam.errors import SlamError
+from slam.formats.g2o import check_g2o
+from slam.formats.ply import coloured_ply, read_ply, write_ply
+from slam.loops.places import Places
+from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.results.schema import LoopsFile, MetricsFile
+from slam.sequences.catalogue import open_sequence
+from slam.storage.cache import DiskCache
+from slam.storage.json_file import read_json
+from slam.trajectory import Trajectory, read_trajectory
+
+MORE_MEMORY = 2**30  # a reader may take so much
+FEW = settings(max_examples=12, derandomize=True, deadline=None, database=None, suppress_health_check=[*HealthCheck])
+MANY = settings(FEW, max_examples=1000, derandomize=False)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A file of the samples, and what reads it; ``sound`` checks a value that came from a changed file."""
+
+    name: str
+    file: str
+    read: Callable[[Path], Any]
+    sound: Callable[[Any], bool] = lambda value: True
+
+
+def _is_image(image: Any) -> bool:
+    return image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
+
+
+def _is_trajectory(trajectory: Trajectory) -> bool:
+    return se3.is_se3(trajectory.T_world_camera) and bool((np.diff(trajectory.stamps) > 0).all())
+
+
+def _is_sequence(sequence: Any) -> bool:
+    poses = sequence.reference
+    return bool((np.diff(sequence.stamps) > 0).all()) and (poses is None or se3.is_se3(poses, tolerance=1e-3))
+
+
+def _is_noise(noise: PoseNoise | None) -> bool:
+    return noise is None or bool(np.isfinite(noise.coefficients).all())
+
+
+def _pack_poses(folder: Path) -> Any:
+    return [recording.true_poses() for recording in read_pack(folder)]
+
+
+def _odometry_poses(path: Path) -> Any:
+    camera = read_camera_file(path.parents[1] / "camera.yaml").pinhole
+    return Recording("sim", images=[path] * 8, camera=camera, poses_file=path).true_poses()
+
+
+def _root(path: Path) -> Any:
+    return open_sequence(path.parents[2], "sim", None, None)
+
+
+READERS = (
+    Reader("PNG", "image.png", read_image, _is_image),
+    Reader("PNG of 16 bits", "depth.png", read_values),
+    Reader("JPEG", "image.jpg", read_image, _is_image),
+    Reader("BMP", "image.bmp", read_image, _is_image),
+    Reader("video", "drive.mp4", lambda path: VideoFrames(path).read(0), _is_image),
+    Reader("camera.yaml", "root/camera.yaml", read_camera_file),
+    Reader("settings of a run", "run/config.yaml", load_config),
+    Reader("settings of a training", "training.yaml", lambda path: load_experiment(str(path))),
+    Reader("split", "split.yaml", lambda path: read_split_file(str(path))),
+    Reader("KITTI calibration", "root/sequences/sim/calib.txt", _root, _is_sequence),
+    Reader("KITTI times", "root/sequences/sim/times.txt", _root, _is_sequence),
+    Reader("KITTI poses", "run/trajectory_optimised.kitti.txt", read_trajectory, _is_trajectory),
+    Reader("KITTI poses, training", "root/poses/sim.txt", _odometry_poses, lambda T: bool(np.isfinite(T).all())),
+    Reader("TUM poses", "run/trajectory_optimised.tum.txt", read_trajectory, _is_trajectory),
+    Reader("TUM images", "tum/rgb.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
+    Reader("OXTS packet", "packet.txt", read_packet, lambda packet: bool(np.isfinite(packet).all())),
+    Reader("metrics.json", "run/metrics.json", lambda path: read_json(path, MetricsFile)),
+    Reader("loops.json", "run/loops.json", lambda path: read_json(path, LoopsFile)),
+    Reader("places.npz", "run/places.npz", Places.read),
+    Reader("drive.zip", "run/drive.zip", SessionCheckpoint.read),
+    Reader("keyframes.npz", "run/keyframes.npz", lambda path: SessionCheckpoint.open(path.parent)),
+    Reader("graph.g2o", "run/graph.g2o", check_g2o),
+    Reader("PLY", "mesh.ply", read_ply, lambda ply: bool(np.isfinite(ply.points).all())),
+    Reader("model.yaml", "weights/model.yaml", lambda path: load_model(path.parent)),
+    Reader("safetensors", "weights/depth.safetensors", lambda path: load_model(path.parent)),
+    Reader("noise.yaml", "weights/noise.yaml", lambda path: read_pose_noise(path.parent), _is_noise),
+    Reader("checkpoint of SfMLearner", "old.pth.tar", read_old),
+    Reader("cache", "cache/ab/abcdef", lambda path: DiskCache(path.parents[1]).read("abcdef")),
+)
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_weights: Path) -> Path:
+    """A valid file for each reader."""
+    place = tmp_path_factory.mktemp("samples")
+    shutil.copytree(kitti_root, place / "root")
+    shutil.copytree(tiny_weights, place / "weights")
+    images = sorted((kitti_root / "sequences/sim/image_2").glob("*.png"))
+    image = cv2.imread(str(images[0]))
+    for suffix in ("png", "jpg", "bmp"):
+        cv2.imwrite(str(place / f"image.{suffix}"), image)
+    cv2.imwrite(str(place / "depth.png"), image[..., 0].astype(np.uint16) * 257)
+    video = cv2.VideoWriter(str(place / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, image.shape[1::-1])
+    for path in images:
+        video.write(cv2.imread(str(path)))
+    video.release()
+    (place / "tum/rgb").mkdir(parents=True)
+    shutil.copy(kitti_root / "camera.yaml", place / "tum")
+    for path in images:
+        shutil.copy(path, place / "tum/rgb")
+    (place / "tum/rgb.txt").write_text("".join(f"{k / 10} rgb/{path.name}\n" for k, path in enumerate(images)))
+    (place / "packet.txt").write_text(" ".join(["49.01", "8.43", *["0.5"] * 28]))
+    (place / "split.yaml").write_text("train: [kitti_raw/a]\nvalidation: []\ntest: ['kitti_raw/b[0:10]']\n")
+    shutil.copy(Path(__file__).parents[3] / "configs/erfsfm/tiny.yaml", place / "training.yaml")
+    triangle = np.eye(3)
+    write_ply(place / "mesh.ply", coloured_ply(triangle, triangle, triangle, np.array([[0, 1, 2]])))
+    sha256 = DepthPosePredictor.from_weights(place / "weights", "cpu").pose_sha256
+    six = (0.1,) * 6
+    known = {"frame": six, "turn": six, "length": six, "disagreement": six, "residual": six, "correlation": six}
+    write_pose_noise(place / "weights", PoseNoise(**known, pose_sha256=sha256, measured_on=["simulated/1"], pairs=9))
+    _write_old_checkpoint(place / "old.pth.tar")
+    DiskCache(place / "cache").write("abcdef", (np.arange(12.0).reshape(3, 4), np.zeros(2, np.uint8)))
+    overrides = ["output.keep=keyframes", "output.report=false", "geometry.enabled=false"]
+    run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)
+    return place
+
+
+def _write_old_checkpoint(path: Path) -> None:
+    tensors = {f"conv{level}.0.weight": torch.ones(4, 3, 3, 3) for level in range(1, 8)}
+    torch.save({"epoch": 1, "state_dict": {"conv1.0.weight": torch.ones(16, 3, 7, 7)} | tensors}, path)
+
+
+_NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+_HOSTILE = (
+    *(b"nan", b"inf", b"-inf", b"1e999", b"-1", b"0", b"1000000000000", b"9" * 60, b"1e308", b"1e-308", b"''"),
+    *(b"null", b"true", b"[]", b"{}", b"[[1]]", b'"x"', b"\\ud800", b"x", b"0x10", b"1_0", b"", b"~"),
+    b"!!python/name:os",
+)
+_LINE_ENDS = (b"\r\n", b"\r", b"\n\n", b"\x00", b" \n", b"\xc2\x85")
+
+
+@st.composite
+def damaged(draw: st.DrawFn, content: bytes) -> bytes:
+    """A change of a file: bytes, length, numbers, line ends, encoding, nesting; inside an archive, of a member."""
+    if zipfile.is_zipfile(io.BytesIO(content)) and draw(st.integers(0, 2)):
+        return _with_member_changed(draw, content)
+    size = len(content)
+    place = draw(st.integers(0, min(size, draw(st.sampled_from([64, 1024, size])))))
+    match draw(st.sampled_from(_CHANGES)):
+        case "cut":
+            return content[:place]
+        case "flip":
+            return (
+                content[:place] + bytes([content[place] ^ 1 << draw(st.integers(0, 7))]) + content[place + 1 :]
+                if (place < size)
+                else content
+            )
+        case "overwrite":
+            new = draw(st.binary(min_size=1, max_size=16))
+            return content[:place] + new + content[place + len(new) :]
+        case "insert":
+            return content[:place] + draw(st.binary(min_size=1, max_size=16)) + content[place:]
+        case "remove":
+            return content[:place] + content[place + draw(st.integers(1, 64)) :]
+        case "repeat":
+            return content[:place] + content[: draw(st.integers(0, size))]
+        case "number":
+            found = [*_NUMBER.finditer(content[:20_000])]
+            if not found:
+                return b""
+            number = draw(st.sampled_from(found))
+            return content[: number.start()] + draw(st.sampled_from(_HOSTILE)) + content[number.end() :]
+        case "line ends":
+            return content.replace(b"\n", draw(st.sampled_from(_LINE_ENDS)))
+        case "encoding":
+            text = content.decode("latin-1")
+            return text.encode(draw(st.sampled_from(["utf-16", "utf-32", "utf-8-sig", "utf-7"])))
+        case "nesting":
+            opening, closing = draw(st.sampled_from([(b"[", b"]"), (b'{"a":', b"}"), (b"- ", b""), (b"? ", b"")]))
+            depth = draw(st.sampled_from([40, 100_000]))
+            return opening * depth + b"1" + closing * depth
+        case "aliases":
+            rows = [b"a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+            rows += [b"a%d: &a%d [%s]" % (k, k, b", ".join([b"*a%d" % (k - 1)] * 9)) for k in range(1, 12)]
+            return b"\n".join(rows)
+        case "duplicate lines":
+            lines = content.splitlines(keepends=True)
+            return b"".join([*lines, lines[place % len(lines)]]) if lines else b""
+    raise AssertionError("an unknown change")
+
+
+_CHANGES = (
+    *("cut", "flip", "overwrite", "insert", "remove", "repeat", "number", "number", "line ends", "encoding"),
+    *("nesting", "aliases", "duplicate lines"),
+)
+
+
+def _with_member_changed(draw: st.DrawFn, content: bytes) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    chosen = draw(st.sampled_from(sorted(members)))
+    if draw(st.integers(0, 5)):
+        members[chosen] = draw(damaged(members[chosen]))
+    else:
+        del members[chosen]
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, member in members.items():
+            archive.writestr(name, member)
+    return file.getvalue()
+
+
+@contextmanager
+def limited_memory() -> Iterator[None]:
+    """A reader that takes what a header announces runs out of memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").is_file() else 0
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    if pages:
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MORE_MEMORY, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def examine(reader: Reader, path: Path, content: bytes) -> None:
+    """Read a changed file; anything but a sound value or one line about it fails the test."""
+    path.write_bytes(content)
+    with limited_memory(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            value = reader.read(path)
+        except (SlamError, ErfsfmError) as error:
+            line = str(error)
+            assert "\n" not in line and len(line) < 1000, line
+            assert path.name in line or path.parent.name in line, line
+            return
+    assert value is None or reader.sound(value)
+
+
+def _check(reader: Reader, samples: Path, tmp_path: Path, profile: settings) -> None:
+    top, _, rest = reader.file.partition("/")
+    source = samples / top
+    if rest:
+        shutil.copytree(source, tmp_path / top)
+    path = tmp_path / reader.file
+    sample = (samples / reader.file).read_bytes()
+
+    @profile
+    @given(damaged(sample))
+    def hold(content: bytes) -> None:
+        examine(reader, path, content)
+
+    path.write_bytes(sample)
+    assert reader.name == "checkpoint of SfMLearner" or reader.read(path) is not Ellipsis, "a sample can be read"
+    hold()
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_a_damaged_file_is_read_or_refused_in_one_line(reader: Reader, samples: Path, tmp_path: Path) -> None:
+    _check(reader, samples, tmp_path, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_many_damaged_files(reader: Reader, samples: Path, tmp_path: Path) -> None:
+    _check(reader, samples, tmp_path, MANY)

@@ -1,0 +1,76 @@
+"""Colours, exposure, holes of the road, and the shares of the filters."""
+
+import numpy as np
+import pytest
+
+from slam.config import MappingConfig
+from slam.frames import Intrinsics
+from slam.mapping.colours import evened
+from slam.mapping.filters import FILTERS, DepthFilters, DepthView
+from slam.mapping.holes import with_holes_closed
+from slam.mapping.patch import Patch
+
+
+def test_exposure_is_evened_out(street_map):
+    flat = street_map(grey=lambda k: 120.0).mesh().colours
+    changing = street_map(grey=lambda k: 120.0 * (1.5 if (k // 4) % 2 else 1.0)).mesh().colours
+    assert flat.std() < 0.02
+    assert changing.std() < 0.03  # 0.1 without it
+    assert 0.4 < changing.mean() < 0.75
+
+
+def test_brightness_steps_become_small_gains():
+    steps = np.array([np.nan, 0.4, -0.4, np.nan, 0.2])
+    brightness = evened(steps)
+    np.testing.assert_allclose(np.diff(brightness)[[0, 1, 3]], [0.4, -0.4, 0.2], atol=0.01)
+    np.testing.assert_allclose([brightness[:3].mean(), brightness[3:].mean()], 0, atol=0.01)
+    assert len(evened(np.array([np.nan]))) == 1
+
+
+def test_a_hole_of_the_road_is_closed_and_marked(street_map):
+    whole = street_map(hidden=True, close_holes_m=4.0)
+    mesh = whole.mesh()
+    assert mesh.filled.sum() == 1
+    np.testing.assert_allclose(mesh.vertices_world[mesh.filled][0], [0, 1.65, 20], atol=0.7)
+    assert mesh.normals_world[mesh.filled][0][1] < -0.99
+    assert len(whole.cloud().points_world) == len(mesh.vertices_world) - 1
+    assert not street_map(hidden=True, close_holes_m=1.5).mesh().filled.any()
+
+
+@pytest.mark.parametrize(("up", "closed"), [((0.0, 0.0, 1.0), 1), ((0.0, 0.0, -1.0), 0), ((1.0, 0.0, 0.0), 0)])
+def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float], closed: int):
+    """A sheet of 5 x 5 squares that looks along z, without the one in the middle."""
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(6), np.arange(6), indexing="ij"))
+    vertices = np.stack([x, y, np.zeros(36)], axis=1) * 0.2 + 1.0
+    squares = [(i, j) for i in range(5) for j in range(5) if (i, j) != (2, 2)]
+    corners = np.array([[6 * i + j, 6 * (i + 1) + j, 6 * (i + 1) + j + 1, 6 * i + j + 1] for i, j in squares])
+    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    sheet = Patch(vertices, triangles, np.ones(48, dtype=bool), np.zeros(48, dtype=bool))
+    full = with_holes_closed(sheet, np.zeros(3, np.int64), 0.2, np.array(up), 1.5)
+    assert len(full.vertices) - 36 == closed and full.filled.sum() == 4 * closed and full.own.all()
+    np.testing.assert_allclose(full.vertices[36:], np.tile([1.5, 1.5, 1.0], (closed, 1)))
+    normals = np.cross(*(full.vertices[full.triangles[:, k]] - full.vertices[full.triangles[:, 0]] for k in (1, 2)))
+    assert (normals[:, 2] > 0).all()
+
+
+def test_each_filter_counts_what_it_took():
+    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
+    depth = np.full((50, 100), 10.0, np.float32)
+    depth[:, 90:] = 0
+    depth[:, 80:90] = 40.0
+    sigma = np.full(depth.shape, 0.05, np.float32)
+    sigma[:, :20] = 0.5
+    image = np.full((50, 100, 3), 90, np.uint8)
+    image[10:30, 30:40] = 250  # bright: sky above the horizon at row 24.5
+    image[10:15, 40:50] = (100, 120, 140)
+    config = MappingConfig(border=0.1, bonnet=0.2, max_relative_sigma=0.2)
+    filters = DepthFilters(config, camera)
+    kept = filters.kept(DepthView(0, depth, sigma, image, np.eye(4)), None)
+    shares = filters.shares()
+    assert tuple(shares) == FILTERS
+    assert shares["unknown"] == pytest.approx(0.1)
+    assert shares["border"] == pytest.approx(0.1 + 0.8 * 0.2)  # 10 columns on the left, 10 rows of the other 80
+    assert shares["bonnet"] == pytest.approx(0.8 * 0.2)
+    assert shares["sky"] == pytest.approx((14 * 10 + 5 * 10) / 5000)
+    assert shares["range"] == pytest.approx(0.1 * 0.6) and shares["sigma"] == pytest.approx(0.1 * 0.6)
+    assert 1 - sum(shares.values()) == pytest.approx((kept > 0).mean())

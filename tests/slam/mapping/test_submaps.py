@@ -1,0 +1,74 @@
+"""Submaps differ from one grid by rounding alone, and tiles leave no seam."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from slam.config import MappingConfig
+from slam.errors import RunError
+from slam.mapping.store import TILE_BLOCKS, SubmapStore
+from slam.mapping.submap import BLOCK_SIDE, FOLDER, Submap, remove_submaps, submap_paths
+from slam.mapping.surface import MapSurface
+
+
+def test_submaps_merge_to_the_surface_of_one(street_map):
+    one, many = street_map(submap_m=1e6), street_map(submap_m=3.0)
+    assert one.statistics().submaps == 1 and many.statistics().submaps >= 5
+    assert many.statistics().frames_fused == 18 and many.statistics().frames_left_out == 0
+    a, b = one.mesh(), many.mesh()
+    assert abs(len(a.triangles) - len(b.triangles)) < 0.01 * len(a.triangles)
+    low, high = a.vertices_world.min(axis=0), a.vertices_world.max(axis=0)
+    np.testing.assert_allclose([b.vertices_world.min(axis=0), b.vertices_world.max(axis=0)], [low, high], atol=0.01)
+    distance = np.minimum(np.abs(b.vertices_world[:, 1] - 1.65), np.abs(np.abs(b.vertices_world[:, 0]) - 6))
+    distance = np.minimum(distance, np.abs(b.vertices_world[:, 2] - 40))
+    assert np.median(distance) < 0.01
+
+
+def test_little_memory_ends_a_submap_early_and_leaves_nothing_out(street_map):
+    statistics = street_map(memory_mb=100, voxel_size_m=0.06).statistics()
+    assert statistics.submaps > 1 and statistics.frames_fused == 18
+
+
+def test_tiles_are_joined_without_a_seam(street_map):
+    """The road crosses the border of tiles at x = 0; with voxels of 0.1 m another one lies at z = 25.6."""
+    mesh = street_map(voxel_size_m=0.1, min_component_triangles=0).mesh()
+    vertices, triangles = mesh.vertices_world, mesh.triangles
+    assert len(np.unique(vertices, axis=0)) == len(vertices)
+    edges = Counter(map(tuple, np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).tolist()))
+    assert max(edges.values()) == 2
+    open_edges = np.array([edge for edge, count in edges.items() if count == 1])
+    middle = vertices[open_edges].mean(axis=1)
+    side = TILE_BLOCKS * BLOCK_SIDE * 0.1
+    at_border = (np.abs(middle[:, 0]) < 0.2) | (np.abs(middle[:, 2] - side) < 0.2)
+    inside = (middle[:, 1] > 1.4) & (np.abs(middle[:, 0]) < 4) & (middle[:, 2] > 12) & (middle[:, 2] < 30)
+    assert not (at_border & inside).any()
+    x = vertices[triangles][..., 0]
+    left, right = triangles[x.min(axis=1) < 0], triangles[x.max(axis=1) > 0]
+    assert len(np.intersect1d(left, right)) > 50
+
+
+def test_finished_submaps_outlive_the_process_that_made_them(street_map, tmp_path):
+    street_map(tmp_path, submap_m=6.0)  # its last frames are not in a finished submap
+    paths = submap_paths(tmp_path / FOLDER)
+    assert len(paths) == 2
+    surface = MapSurface(paths, MappingConfig())
+    assert surface.triangles > 1000 and SubmapStore(paths).fused < 18
+    remove_submaps(tmp_path / FOLDER)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_submap_is_one_line(street_map, tmp_path):
+    street_map(tmp_path, submap_m=5.0)
+    path = submap_paths(tmp_path / FOLDER)[0]
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
+        Submap.read(path)
+    with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
+        MapSurface([path], MappingConfig())
+
+
+def test_progress_counts_tiles(street_map):
+    calls = []
+    street_map().surface(lambda stage, done, total: calls.append((stage, done, total)))
+    assert calls[-1] == ("mesh", len(calls), len(calls))

@@ -14,6 +14,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
+from slam.batch.cli import verbs as batch_verbs
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
@@ -147,6 +148,7 @@ def evaluate(
 
 
 app.add_typer(export_verbs)
+app.add_typer(batch_verbs)
 app.add_typer(calibration_verbs)
 app.add_typer(download_verbs)
 

@@ -4,7 +4,7 @@ accuracy measures simulated worlds and KITTI sequences, ablation turns off one p
 memory, maps the errors of the map with one of its parts turned off at a time. Every run is a process and a folder of
 its own under --output. A successful one is not repeated as long as sources, weights and options stay the same, so that
 a killed benchmark can be resumed; a failed one is a row with its reason. --jobs and --scheduler need Dask: pip install
-'erfsfm-slam[benchmark]'. A scheduler's workers need the same files at the same paths.
+'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the same paths.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -53,8 +53,11 @@ def main(words: Sequence[str] | None = None) -> None:
         raise SystemExit(str(error)) from error
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or --kitti")
-    with workers(at_a_time, scheduler) as spread:
-        results = measured(jobs, spread)
+    try:
+        with workers(at_a_time, scheduler) as spread:
+            results = measured(jobs, spread)
+    except SlamError as error:
+        raise SystemExit(str(error)) from error
     table_of_runs = rows(results)
     with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table_of_runs[0])

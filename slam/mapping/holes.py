@@ -32,10 +32,10 @@ def with_holes_closed(
     vertices, triangles, own = [patch.vertices], [patch.triangles], [patch.own]
     count = len(patch.vertices)
     upwards = patch.normals() @ up_world
-    for ring in _rings(patch.triangles, count):
+    for ring in _rings(patch.triangles, upwards):
         corners = patch.vertices[ring]
         middle = corners.mean(axis=0)
-        if upwards[ring].mean() < _UPWARDS or not _is_small_and_flat(corners - middle, up_world, largest_m):
+        if not _is_small_and_flat(corners - middle, up_world, largest_m):
             continue
         vertices.append(middle[None])
         triangles.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1))
@@ -58,15 +58,20 @@ def _is_small_and_flat(corners: FloatArray, up_world: FloatArray, largest_m: flo
     """
     if 2 * float(np.linalg.norm(corners, axis=1).max()) > largest_m:
         return False
-    area = 0.5 * np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    (x, y, z), (u, v, w) = corners.T, corners[[*range(1, len(corners)), 0]].T
+    area = 0.5 * np.array([y @ w - z @ v, z @ u - x @ w, x @ v - y @ u])
     size = float(np.linalg.norm(area))
     if size == 0 or float(-area @ up_world) < _UPWARDS * size:
         return False
     return float(np.abs(corners @ area).max()) <= _FLAT * largest_m * size
 
 
-def _rings(triangles: Triangles, vertices: int) -> list[NDArray[np.int64]]:
-    """Closed rings of open edges, each vertex once, in the direction of the triangles beside them."""
+def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]:
+    """Closed rings of open edges, each vertex once, in the direction of the triangles beside them.
+
+    Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
+    """
+    vertices = len(upwards)
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     there, back = edges[:, 0] * vertices + edges[:, 1], edges[:, 1] * vertices + edges[:, 0]
     begin, end = edges[~np.isin(there, back)].T
@@ -77,7 +82,9 @@ def _rings(triangles: Triangles, vertices: int) -> list[NDArray[np.int64]]:
     touched = np.zeros(vertices, dtype=bool)
     touched[begin] = touched[end] = True
     broken[label[touched & ~simple]] = True
-    broken |= np.bincount(label[begin], minlength=vertices) > _MOST_EDGES
+    edges_of = np.bincount(label[begin], minlength=vertices)
+    upwards_of = np.bincount(label[begin], weights=upwards[begin], minlength=vertices)
+    broken |= (edges_of > _MOST_EDGES) | (upwards_of < _UPWARDS * edges_of)
     following = np.full(vertices, -1, dtype=np.int64)
     following[begin] = end
     chosen = begin[~broken[label[begin]]]

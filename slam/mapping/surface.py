@@ -179,8 +179,10 @@ def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:
 
 def _piece(patch: Patch, painter: Painter, spill: SpillFile) -> Piece:
     """The part of a patch that belongs to its tile, with colours and normals."""
-    used, renumbered = np.unique(patch.triangles[patch.own], return_inverse=True)
-    triangles = renumbered.reshape(-1, 3).astype(np.int32)
+    is_used = np.zeros(len(patch.vertices), dtype=bool)
+    is_used[patch.triangles[patch.own]] = True
+    used, renumbered = np.flatnonzero(is_used), np.cumsum(is_used) - 1
+    triangles = renumbered[patch.triangles[patch.own]].astype(np.int32)
     is_outside = np.zeros(len(patch.vertices), dtype=bool)
     is_outside[patch.triangles[~patch.own]] = True
     filled = np.zeros(len(patch.vertices), dtype=bool)

@@ -103,6 +103,20 @@ def import_feather() -> ModuleType:
         raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
 
 
+def import_dask() -> tuple[ModuleType, ModuleType]:
+    """Import cloudpickle and Dask's distributed scheduler, an optional extra.
+
+    Raises:
+        SlamError: if one is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("cloudpickle"), importlib.import_module("distributed")
+    except (ImportError, OSError) as error:
+        raise SlamError(
+            f"several workers and schedulers need Dask ({error}): pip install 'erfsfm-slam[cluster]'"
+        ) from error
+
+
 def import_remotezip() -> tuple[ModuleType, ModuleType, ModuleType]:
     """Import remotezip, requests and the exceptions of urllib3 below them, an optional extra.
 

@@ -6,11 +6,13 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+Progress = Callable[[str, int, int], None]
+
 
 class progress_bar:  # noqa: N801 - reads as the function it stands for
     """A progress bar on a terminal, nothing in a pipe."""
 
-    def __enter__(self) -> Callable[[str, int, int], None]:
+    def __enter__(self) -> Progress:
         if sys.stderr is None or not sys.stderr.isatty():
             return lambda stage, done, total: None
         from rich.console import Console

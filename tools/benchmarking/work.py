@@ -10,10 +10,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,14 @@ from benchmarking import plan
 from benchmarking.derived_metrics import derive_metrics
 from benchmarking.plan import BenchmarkSequence, Job
 
+from slam.batch import cluster
+from slam.batch.cluster import Spread
 from slam.results.comparison import failure
 from slam.storage.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
 BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # removed after a run: no table reads them
-
-Spread = Callable[[Callable[[Any], None], Sequence[Any]], Iterable[None]]
 
 
 @dataclass(frozen=True)
@@ -128,30 +127,8 @@ def revision() -> str:
 
 @contextmanager
 def workers(count: int, scheduler: str | None) -> Iterator[Spread]:
-    """A ``map`` over jobs: one after another, or through Dask."""
-    if count == 1 and scheduler is None:
-        yield map
-        return
-    try:
-        import cloudpickle
-        from dask.distributed import Client, as_completed
-    except ImportError as error:
-        raise SystemExit("--jobs and --scheduler need Dask: pip install 'erfsfm-slam[benchmark]'") from error
-    for module in (plan, sys.modules[__name__]):  # workers elsewhere do not have them
-        cloudpickle.register_pickle_by_value(module)
-    local: dict[str, Any] = {
-        "n_workers": count,
-        "threads_per_worker": 1,
-        "memory_limit": None,
-        "dashboard_address": ":0",
-    }
-    with Client(scheduler) if scheduler else Client(**local) as client:
-
-        def spread(work: Callable[[Any], None], items: Sequence[Any]) -> Iterator[None]:
-            packed = [cloudpickle.dumps(partial(work, item)) for item in items]
-            for future in as_completed(client.map(lambda task: cloudpickle.loads(task)(), packed, pure=False)):
-                yield future.result()
-
+    """A map over jobs: one after another, or through Dask, whose workers need not have these modules."""
+    with cluster.workers(count, scheduler, (plan, sys.modules[__name__])) as spread:
         yield spread
 
 
@@ -162,12 +139,15 @@ def measured(jobs: Sequence[Job], spread: Spread) -> list[JobResult]:
         SystemExit: a world could not be made.
     """
     drives = {job.drive.root: job.drive for job in jobs if job.drive.simulate}
-    for _ in spread(simulate, list(drives.values())):
-        pass
+    for _, ended in spread(simulate, list(drives.values())):
+        if isinstance(ended, Exception):
+            raise ended
     missing = [drive.name for drive in drives.values() if not drive.root.is_dir()]
     if missing:
         raise SystemExit(f"could not be simulated: {', '.join(missing)}")
-    for done, _ in enumerate(spread(perform, jobs), 1):
+    for done, (_, ended) in enumerate(spread(perform, jobs), 1):
+        if isinstance(ended, Exception):
+            raise ended
         print(f"{done} of {len(jobs)} runs", file=sys.stderr)
     return [job_result(job) for job in jobs]
 

@@ -1,11 +1,17 @@
 """Features that are kept give the same poses, and each image is encoded once."""
 
+import numpy as np
 import pytest
 import torch
 
+from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.snippets import split_recordings
+from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.presets import build
 from erfsfm.training.feature_memory import FeatureMemory, features_recur
+from erfsfm.training.run import train
 
 
 @pytest.fixture
@@ -46,3 +52,28 @@ def test_images_that_change_are_not_remembered():
         other = {name: dict(values) for name, values in tree.items()}
         other[section][key] = value
         assert not features_recur(ExperimentConfig.model_validate(other)), (section, key)
+
+
+def test_a_training_of_poses_encodes_each_image_once_and_wants_no_label(small, write_root, tmp_path, monkeypatch):
+    root = write_root(tmp_path / "kitti", frames=8, step=(0.0, 0.0, 0.05))
+    network = {"pose": "posenet-lite0", "height": 32, "width": 64, "sources": 4}
+    tree = small | {
+        "network": small.get("network", {}) | network,
+        "data": small["data"] | {"roots": [root], "validation": [], "exclude": [], "zoom": 1.0, "colour_jitter": 0.0},
+        "teacher": {"views": "many", "rotation_weight": 10.0, "translation_weight": 1.0, "cache": tmp_path / "poses"},
+        "loss": {"photometric_weight": 0.0, "smoothness_weight": 0.0},
+        "training": small["training"] | {"networks": "pose", "frozen_stages": 6, "steps": 12},
+        "pretrained": "none",
+    }
+    config = ExperimentConfig.model_validate(tree)
+    (recording,) = split_recordings(config.data)[0]
+    T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
+    T_world_camera[:, 2, 3] = 0.3 * np.arange(len(recording))
+    ManyViewTeacher(tmp_path / "poses", (32, 64), 2).drive(recording).keep_poses(T_world_camera)
+    encoded = []
+    features = Lite0PoseNet.features
+    monkeypatch.setattr(Lite0PoseNet, "features", lambda self, each: encoded.append(len(each)) or features(self, each))
+    output = train(config, tmp_path / "run", device="cpu")
+    assert 0 < sum(encoded) <= 2 * len(recording)  # as they are and mirrored
+    assert load_model(output).record.network.pose == "posenet-lite0"
+    assert not list((tmp_path / "poses").rglob("*.npz"))

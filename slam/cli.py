@@ -19,6 +19,7 @@ from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
 from slam.errors import SlamError
 from slam.exports.cli import verbs as export_verbs
+from slam.live.cli import verbs as live_verbs
 from slam.localisation.cli import verbs as localisation_verbs
 from slam.runtime.progress import progress_bar
 from slam.runtime.signals import Terminated
@@ -149,6 +150,7 @@ def evaluate(
 
 app.add_typer(export_verbs)
 app.add_typer(batch_verbs)
+app.add_typer(live_verbs)
 app.add_typer(calibration_verbs)
 app.add_typer(download_verbs)
 

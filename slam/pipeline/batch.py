@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
-from slam.frames import Predictor, RelativePose, runs
+from slam.frames import Frame, Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors
 from slam.frontend.failure import MeasurementFailure
@@ -141,16 +141,25 @@ class SlamPipeline:
         estimate = self.estimate()
         return replace(estimate, map=self.fuse(estimate))
 
-    def estimate(self, journal: Journal | None = None) -> SlamResult:
+    def estimate(
+        self,
+        journal: Journal | None = None,
+        frames: Iterator[Frame] | None = None,
+        watch: Callable[[Observer], None] | None = None,
+    ) -> SlamResult:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
         Args:
             journal: keeps the state of the pass every 100 frames.
+            frames: of a sequence that grows as they come; None reads them from the sequence.
+            watch: called after every frame.
         """
-        mode = self.require_possible()
+        if frames is None:
+            self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        observations, state = self._observe(journal)
+        observations, state = self._observe(journal, frames, watch)
+        mode = self.require_possible()
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
@@ -241,7 +250,9 @@ class SlamPipeline:
         track = self._gps_track
         return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, mode)
 
-    def _observe(self, journal: Journal | None) -> tuple[ClosedObservations, ObserverState]:
+    def _observe(
+        self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
+    ) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, total = self._checkpoint, len(self._sequence)
         first = self.first
@@ -262,11 +273,11 @@ class SlamPipeline:
             state,
         )
         with observer:
-            frames = read_ahead(partial(read_frame, self._sequence), range(first, total))
-            for index in range(first, total):
-                with self._watch.stage("read"):
-                    frame = next(frames)
+            read = read_ahead(partial(read_frame, self._sequence), range(first, total))
+            for index, frame in enumerate(self._watch.each("read", frames or read), first):
                 observer.add(index, frame)
+                if watch is not None:
+                    watch(observer)
                 self._progress("frames", index + 1, total)
                 done = index + 1 - first
                 if journal is not None and done % EVERY_FRAMES == 0 and index + 1 < total:

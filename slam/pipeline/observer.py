@@ -196,6 +196,11 @@ class Observer:
         return len(self._seen.roads) + (self._pending is not None)
 
     @property
+    def seen(self) -> Observations:
+        """What was measured so far."""
+        return self._seen
+
+    @property
     def has_snippets(self) -> bool:
         """Whether the pose network has measured anything yet."""
         return bool(self._seen.snippets)

@@ -103,6 +103,18 @@ def import_feather() -> ModuleType:
         raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
 
 
+def import_zmq() -> ModuleType:
+    """Import pyzmq, an optional extra.
+
+    Raises:
+        SlamError: if it is not installed or cannot be loaded.
+    """
+    try:
+        return importlib.import_module("zmq")
+    except (ImportError, OSError) as error:
+        raise SlamError(f"--publish needs pyzmq ({error}): pip install 'erfsfm-slam[live]'") from error
+
+
 def import_dask() -> tuple[ModuleType, ModuleType]:
     """Import cloudpickle and Dask's distributed scheduler, an optional extra.
 

@@ -7,9 +7,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 if sys.platform != "win32":
     import resource
+
+
+T = TypeVar("T")
 
 
 class Stopwatch:
@@ -32,6 +36,15 @@ class Stopwatch:
             yield
         finally:
             self.stages[name] = self.stages.get(name, 0.0) + time.perf_counter() - start
+
+    def each(self, name: str, items: Iterator[T]) -> Iterator[T]:
+        """The items; the time to wait for each belongs to a stage."""
+        while True:
+            with self.stage(name):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
 
     @property
     def seconds(self) -> float:

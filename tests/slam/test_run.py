@@ -173,7 +173,7 @@ def test_an_unreadable_image_is_bridged_and_reported(
 def test_however_a_run_ends_its_folder_has_the_reason(
     quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    def stop(self: SlamPipeline) -> None:
+    def stop(self: SlamPipeline, *_: object) -> None:
         raise error
 
     monkeypatch.setattr(SlamPipeline, "estimate", stop)

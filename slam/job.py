@@ -1,0 +1,162 @@
+"""A run that passed all checks, from its first frame to its whole folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.errors import ErfsfmError
+from erfsfm.threads import limit_library_threads
+from slam.config import SlamConfig, dump_yaml
+from slam.errors import RunError, SlamError
+from slam.frames import Frame, Intrinsics
+from slam.frames import Sequence as FrameSequence
+from slam.loops.places import PLACES, Places
+from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
+from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
+from slam.pipeline.journal import Journal, clear_journal
+from slam.pipeline.observer import Observer, ObserverState
+from slam.results.depth import DepthQuality
+from slam.results.folder import RunFolder
+from slam.results.gps import write_places
+from slam.results.map import write_map
+from slam.results.map_view import write_map_views
+from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
+from slam.results.report import DepthExample, write_report
+from slam.results.rerun import write_rerun
+from slam.results.run_log import LOG, RunLog
+from slam.results.summary import Provenance, as_json, describe_start
+from slam.runtime.signals import Terminated
+from slam.sequences.continued import Continued
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Frames that come while they are taken, and who watches them.
+
+    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder.
+    """
+
+    frames: Callable[[], Iterator[Frame]]
+    watch: Callable[[Observer], None]
+    finish: Callable[[SlamResult, Path], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run that passed all checks; ``rerun`` is an ``.rrd`` file to write, ``stream`` None for a recording."""
+
+    settings: SlamConfig
+    recording: FrameSequence
+    pipeline: SlamPipeline
+    provenance: Provenance
+    predictors_sha256: str
+    checkpoint: SessionCheckpoint | None
+    rerun: Path | None = None
+    progress: Progress | None = None
+    stream: Stream | None = None
+
+    def checkpoint_of(self, state: ObserverState) -> SessionCheckpoint:
+        """What is kept of this run after some of its frames."""
+        return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
+
+
+def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[[], None]) -> RunFolder:
+    """Run to the end; however that is, the folder keeps the results and the reason.
+
+    Raises:
+        SlamError, ErfsfmError: one line.
+    """
+    folder.write_metrics(describe_start(job.provenance))
+    try:
+        log.begin(folder.path / LOG)
+        with limit_library_threads():
+            _run(job, folder)
+    except BaseException as error:
+        ignore_signals()
+        _leave_failure(folder, log, job.settings.output.report, error)
+        if folder.replaces is not None and isinstance(error, SlamError):
+            kept = f"{folder.replaces} keeps its earlier run, this one is in {folder.path}"
+            raise RunError(f"{error}; {kept}") from error
+        raise
+    return folder
+
+
+def _run(job: Job, folder: RunFolder) -> None:
+    """Estimate, then map, then report; each is on disk before the next begins."""
+    folder.write_text("config.yaml", dump_yaml(job.settings))
+    stream, journal = job.stream, _journal(job, folder.path)
+    frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
+    estimate = job.pipeline.estimate(journal, frames, watch)
+    _write_estimate(folder, estimate, job)
+    clear_journal(folder.path)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
+    folder.write_metrics(metrics)
+    folder.publish()
+    if stream is not None:
+        stream.finish(estimate, folder.path)
+    quality = DepthQuality(job.recording, estimate.scale.mode)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    numbers = write_map(folder, result, job.recording, job.progress)
+    depth = quality.summary(job.settings.depth.refine != "none")
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    views = write_map_views(folder, job.settings.output.viewer_triangles)
+    if job.settings.output.report:
+        examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
+        write_report(folder, examples, views)
+    if job.rerun is not None:
+        write_rerun(job.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
+
+
+def _journal(job: Job, folder: Path) -> Journal | None:
+    """Where the state of the pass is kept; not of a live drive, whose images are gone,
+    and not of one whose first frames are in another folder."""
+    keep = job.settings.output.keep
+    if keep == "nothing" or job.stream is not None or isinstance(job.recording, Continued):
+        return None
+    journal = Journal(folder, job.checkpoint_of, with_keyframes=keep == "keyframes")
+    if job.checkpoint is not None:
+        journal.begin_after(job.checkpoint.state.seen)
+    return journal
+
+
+def _write_estimate(folder: RunFolder, result: SlamResult, job: Job) -> None:
+    """Trajectories, graph, loops and places, and what ``run --continue`` needs."""
+    for name in ("network", "odometry", "optimised"):
+        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+    if result.reference is not None:
+        folder.write_trajectory("reference", result.reference)
+    write_places(folder, result, job.recording.name)
+    lidar = lidar_trajectory(result)
+    if lidar is not None:
+        folder.write_trajectory("trajectory_lidar", lidar)
+    result.graph.write_g2o(folder.path / "graph.g2o")
+    folder.write_text("loops.json", as_json(result.loops.details()))
+    folder.write(PLACES, _places(result, job.recording.intrinsics).write)
+    keep = job.settings.output.keep
+    if keep != "nothing":
+        folder.write(DRIVE, job.checkpoint_of(result.state).write)
+    if keep == "keyframes":
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
+
+
+def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
+    """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
+    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.observations.views)
+    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
+    return Places(intrinsics, views, T_world_camera)
+
+
+def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseException) -> None:
+    """Write the reason of the failure to the folder; errors of writing it are ignored, so the first one is raised."""
+    known = isinstance(error, SlamError | ErfsfmError | Terminated)
+    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    log.failed(reason)
+    with suppress(SlamError, OSError):
+        folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
+        if report:
+            write_report(folder, [], None)

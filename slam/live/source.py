@@ -1,0 +1,125 @@
+"""Where frames come from while they are taken: a camera, a stream, a video at its own speed, a folder being filled."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from erfsfm.readers.images import read_image
+from erfsfm.readers.video import VIDEO_SUFFIXES
+from slam.errors import SequenceError, sequence_errors
+from slam.frames import Image
+from slam.sequences.camera_file import DEFAULT_FPS
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
+_POLL_S = 0.01
+
+
+class Source(Protocol):
+    """Images as they come, each with its stamp in seconds."""
+
+    width: int
+    height: int
+    fps: float
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
+        ...
+
+
+class FolderSource:
+    """A folder that another program fills; image ``k`` in order of names was taken at ``k / fps``."""
+
+    def __init__(self, folder: Path, wait_s: float) -> None:
+        """Wait up to ``wait_s`` for the first image.
+
+        Raises:
+            SequenceError: none came, or it cannot be read.
+        """
+        self._folder, self.fps = folder, DEFAULT_FPS
+        deadline = time.monotonic() + wait_s
+        while not (names := self._names()):
+            if time.monotonic() > deadline:
+                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {', '.join(_IMAGES)}")
+            time.sleep(_POLL_S)
+        first = self._read(names[0], deadline)
+        self.height, self.width = first.shape[:2]
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """Every image once it is whole, in order of names; a name before the last one that was read is left out."""
+        count, last = 0, ""
+        while not stopped.is_set():
+            fresh = [name for name in self._names() if name > last]
+            for name in fresh[:1]:
+                image = self._read(name, time.monotonic() + 1.0)
+                yield count / self.fps, image
+                count, last = count + 1, name
+            if not fresh:
+                time.sleep(_POLL_S)
+
+    def _names(self) -> list[str]:
+        try:
+            return sorted(path.name for path in self._folder.iterdir() if path.suffix.lower() in _IMAGES)
+        except OSError as error:
+            raise SequenceError(f"{self._folder} cannot be read any more: {error.strerror or error}") from error
+
+    @sequence_errors()
+    def _read(self, name: str, deadline: float) -> Image:
+        """An image; one that is still being written is read again until ``deadline``."""
+        while True:
+            try:
+                return read_image(self._folder / name)
+            except Exception:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(_POLL_S)
+
+
+class VideoSource:
+    """What OpenCV opens: a camera by number, a stream by address, a pipe, or a file, which plays at its own speed."""
+
+    def __init__(self, name: str) -> None:
+        """Open it.
+
+        Raises:
+            SequenceError: it cannot be opened or gives no image.
+        """
+        self._name = name
+        self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
+        self.fps = DEFAULT_FPS
+        self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(name)
+        self._first = self._next()
+        if self._first is None:
+            raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
+        self.height, self.width = self._first.shape[:2]
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """Images at their time: in a file that of its frame rate, elsewhere that of their arrival."""
+        began, count, image = time.monotonic(), 0, self._first
+        while image is not None and not stopped.is_set():
+            stamp = count / self.fps if self._is_file else time.monotonic() - began
+            if self._is_file and stopped.wait(max(began + stamp - time.monotonic(), 0.0)):
+                break
+            yield stamp, image
+            count, image = count + 1, self._next()
+        self._capture.release()
+
+    def _next(self) -> Image | None:
+        read, image = self._capture.read()
+        return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
+
+
+def open_source(camera: str, wait_s: float) -> Source:
+    """A source by what the user named; its ``fps``, of files, may be set before the first image.
+
+    Raises:
+        SequenceError: it cannot be opened, or no image comes within ``wait_s``.
+    """
+    folder = Path(camera)
+    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera)

@@ -1,0 +1,105 @@
+"""The pose of the newest frame at a cost that does not grow with the drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from erfsfm.pose_noise import PoseNoise
+from slam.config import ScaleMode, SlamConfig
+from slam.frames import Intrinsics, Predictor
+from slam.frontend.scale.scale_estimate import resolve_mode
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.live import LiveSequence
+from slam.pipeline.observer import Observer
+from slam.pipeline.recent import closed, recent
+from slam.se3 import FloatArray
+
+State = Literal["starting", "tracking", "bridged", "relocalised"]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown."""
+
+    T_world_camera: FloatArray
+    state: State
+    unit: float | None
+
+
+class Tracker:
+    """Poses from the measurements of the last ``window`` frames; those before are left as they are.
+
+    Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
+    the last one was.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        intrinsics: Intrinsics,
+        camera_height_m: float | None,
+        config: SlamConfig,
+        noise: PoseNoise | None,
+        window: int = 100,
+        update: int = 10,
+    ) -> None:
+        """Prepare for the first frame."""
+        self._predictor, self._intrinsics, self._height_m = predictor, intrinsics, camera_height_m
+        self._config, self._noise = config, noise
+        self._window, self._update = window, update
+        self._mode: ScaleMode = resolve_mode(config.scale, camera_height_m)
+        self._T_world_camera: list[FloatArray] = []
+        self._T_previous_newest = np.eye(4)
+        self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
+        self._was_bridged = False
+
+    @property
+    def unit_name(self) -> str:
+        """Of all lengths."""
+        return "camera heights" if self._mode == "none" else "m"
+
+    def add(self, observer: Observer) -> list[Tracked]:
+        """The frames that the observer has finished since the last call."""
+        seen = observer.seen
+        first, count = len(self._T_world_camera), len(seen.roads)
+        for index in range(first, count):
+            self._step(observer, index)
+        if seen.snippets and (self._unit is None or count // self._update > first // self._update):
+            self._solve(observer, count)
+        return [
+            Tracked(self._T_world_camera[k], self._state(k in seen.unusable), self._unit) for k in range(first, count)
+        ]
+
+    def _state(self, is_bridged: bool) -> State:
+        before, self._was_bridged = self._was_bridged, is_bridged
+        if self._unit is None:
+            return "starting"
+        return "bridged" if is_bridged else "relocalised" if before else "tracking"
+
+    def _step(self, observer: Observer, index: int) -> None:
+        """Append the pose of a frame by its own step, or by the last one again."""
+        if not index:
+            self._T_world_camera.append(np.eye(4))
+            return
+        motion = next((m for m in reversed(observer.seen.motions[-4:]) if m.ends == (index - 1, index)), None)
+        if motion is not None and self._unit is not None:
+            self._T_previous_newest = motion.relative_pose.scaled(self._unit).T_from_to
+        self._T_world_camera.append(self._T_world_camera[-1] @ self._T_previous_newest)
+
+    def _solve(self, observer: Observer, count: int) -> None:
+        """Poses of the window by its own measurements, from its first one on."""
+        first = max(count - self._window, 0)
+        window = recent(observer.seen, first)
+        if not window.snippets:
+            return
+        observations = closed(window, self._predictor.sources, self._config.gaps)
+        frames = LiveSequence(self._intrinsics, self._height_m, np.arange(count - first, dtype=np.float64))
+        pipeline = SlamPipeline(frames, self._predictor, self._config, noise=self._noise)
+        measured = pipeline.measure(self._mode, observations)
+        T_world_camera = self._T_world_camera[first] @ measured.T_odometry
+        self._T_world_camera[first:] = list(T_world_camera)
+        self._T_previous_newest = np.linalg.inv(T_world_camera[-2]) @ T_world_camera[-1]
+        self._unit = float(measured.scale.per_frame[-1])

@@ -1,0 +1,169 @@
+"""Live runs: a folder being filled, a video at its own speed, sources that stall or die or are too fast."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam import run_slam
+from slam.errors import SequenceError, SlamError
+from slam.frames import Image
+from slam.live.messages import emitters
+from slam.live.reader import Reader
+from slam.live.run import LiveRequest, run_live
+from slam.live.source import FolderSource, VideoSource
+
+SETTINGS = ("mapping.enabled=false", "output.report=false")
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of a simulated street and their ``camera.yaml``."""
+    folder = tmp_path_factory.mktemp("street")
+    images = sorted((kitti_root / "sequences" / "sim" / "image_2").glob("*.png"))[:FRAMES]
+    (folder / "images").mkdir()
+    for path in images:
+        shutil.copy(path, folder / "images" / path.name)
+    shutil.copy(kitti_root / "camera.yaml", folder / "camera.yaml")
+    return folder
+
+
+def fill(source: Path, target: Path, messages: list[dict[str, Any]]) -> Thread:
+    """Put an image into a folder each time the one before was answered."""
+    names = sorted(path.name for path in source.iterdir())
+
+    def run() -> None:
+        for number, name in enumerate(names):
+            while len(messages) < number:
+                time.sleep(0.01)
+            partial = target / f".{name}.partial"
+            shutil.copy(source / name, partial)
+            partial.rename(target / name)
+
+    thread = Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    folder = run_live(request, messages.append)
+    offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
+    for name in ("trajectory_optimised.kitti.txt", "trajectory_odometry.tum.txt", "graph.g2o", "loops.json"):
+        assert (folder.path / name).read_bytes() == (offline.path / name).read_bytes()
+    *poses, last = messages
+    assert [message["frame"] for message in poses] == list(range(FRAMES))
+    assert all(message["dropped"] == 0 and message["latency_ms"] > 0 for message in poses)
+    assert {message["state"] for message in poses} <= {"starting", "tracking"} and poses[-1]["state"] == "tracking"
+    assert poses[-1]["unit"] == "m" and poses[-1]["scale"] > 0
+    corrected = np.array(last["T_world_camera"])
+    np.testing.assert_allclose(corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6)
+    assert last["ended"] == "nothing came for 1.5 s" and last["dropped"] == 0
+    assert folder.metrics()["status"] == "ok"
+
+
+class Scripted:
+    """A source of small images that does what its script says: waits, or dies."""
+
+    width, height, fps = 8, 6, 10.0
+
+    def __init__(self, waits_s: list[float], dies: bool = False) -> None:
+        self._waits_s, self._dies = waits_s, dies
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        for number, wait_s in enumerate(self._waits_s):
+            time.sleep(wait_s)
+            yield 0.1 * number, np.full((6, 8, 3), number, np.uint8)
+        if self._dies:
+            raise SequenceError("the cable was pulled")
+
+
+def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
+    reader = Reader(Scripted([0.0] * 50 + [0.3]), 5.0, lambda image: image)
+    taken = []
+    for arrival in reader:
+        taken.append(int(arrival.image[0, 0, 0]))
+        time.sleep(0.1)
+    assert taken[-1] == 50 and taken == sorted(taken) and len(taken) <= 4
+    assert reader.dropped == 51 - len(taken) and reader.ended == "the source ended"
+
+
+def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
+    stalls = Reader(Scripted([0.0, 3.0]), 0.2, lambda image: image)
+    assert len(list(stalls)) == 1 and stalls.ended == "nothing came for 0.2 s"
+    dies = Reader(Scripted([0.05, 0.05], dies=True), 5.0, lambda image: image)
+    assert len(list(dies)) == 2 and dies.ended == "the source died: the cable was pulled"
+
+
+def test_a_video_plays_at_its_own_speed(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (32, 24))
+    for number in range(8):
+        video.write(np.full((24, 32, 3), 30 * number, np.uint8))
+    video.release()
+    source = VideoSource(str(path))
+    source.fps = 20.0
+    stamps = [stamp for stamp, _ in source.images(Event())]
+    np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
+    assert (source.width, source.height) == (32, 24)
+
+
+def test_sources_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="no image comes from"):
+        VideoSource(str(tmp_path / "none.mp4"))
+    with pytest.raises(SequenceError, match=r"no image came to .* within 0\.1 s"):
+        FolderSource(tmp_path, 0.1)
+    with pytest.raises(SlamError, match="choose camera-height"):
+        run_live(
+            LiveRequest("0", overrides=("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]")), print
+        )
+
+
+def test_messages_are_published(tmp_path: Path) -> None:
+    zmq = pytest.importorskip("zmq")
+    stream, address = io.StringIO(), f"ipc://{tmp_path}/poses"
+    with emitters(stream, address) as emit, zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.connect(address)
+        socket.subscribe("")
+        while not socket.poll(20):  # until the subscription has arrived
+            emit({"type": "pose", "frame": 7})
+        assert socket.recv_json() == {"type": "pose", "frame": 7}
+    assert json.loads(stream.getvalue().splitlines()[0]) == {"type": "pose", "frame": 7}
+
+
+def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    output, target, messages = tmp_path / "run", tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "60"]
+    command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for _ in range(FRAMES):
+            messages.append(json.loads(process.stdout.readline()))
+        process.send_signal(signal.SIGINT)
+        rest, said = process.communicate()
+    assert process.returncode == 0, said
+    last = json.loads(rest.splitlines()[-1])
+    assert last["type"] == "trajectory" and last["ended"] == "it was interrupted"
+    assert len(last["stamps"]) == FRAMES == messages[-1]["frame"] + 1
+    assert json.loads((output / "metrics.json").read_text())["status"] == "ok"

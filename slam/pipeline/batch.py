@@ -120,8 +120,7 @@ class SlamPipeline:
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
         self._noise = noise
-        self._sequence = sequence
-        self._predictor = predictor
+        self._sequence, self._predictor = sequence, predictor
         self._config = decided(config, sequence.camera_height_m)
         self._progress = progress or (lambda stage, done, total: None)
         self._get_or_compute = get_or_compute

@@ -89,7 +89,7 @@ class ClosedObservations:
     window: WindowPoses
 
     @classmethod
-    def of(cls, seen: Observations, gaps: InterpolatedGaps, window: WindowPoses) -> ClosedObservations:
+    def of(cls, seen: Observations, gaps: InterpolatedGaps, window: WindowPoses | None = None) -> ClosedObservations:
         """Leave out views and keyframes of interpolated frames."""
         return cls(
             seen.roads,
@@ -100,7 +100,7 @@ class ClosedObservations:
             seen.examples,
             seen.failures,
             gaps,
-            window,
+            window or WindowPoses(),
         )
 
     @property

@@ -212,16 +212,9 @@ class Observer:
             SlamError: no snippet of usable frames.
         """
         self.flush()
-        seen = self._seen
-        gaps = interpolate_gaps(
-            len(seen.roads),
-            self._predictor.sources,
-            seen.snippets,
-            StepTable.of(seen.motions),
-            seen.unusable,
-            seen.repeated,
-            self._config.gaps,
-        )
+        seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
+        steps, count = StepTable.of(seen.motions), len(seen.roads)
+        gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config)
         return ClosedObservations.of(seen, gaps, self._keyframes.poses(seen))
 
     def _require_readable(self, error: SequenceError) -> None:

@@ -25,6 +25,7 @@ from slam.config_frontend import (
     ScaleConfig,
     ScaleMode,
 )
+from slam.config_window import WindowConfig
 
 __all__ = [
     "DepthConfig",
@@ -42,6 +43,7 @@ __all__ = [
     "ScaleConfig",
     "ScaleMode",
     "SlamConfig",
+    "WindowConfig",
     "dump_yaml",
     "load_config",
 ]
@@ -251,6 +253,7 @@ class SlamConfig(Section):
     depth: DepthConfig = DepthConfig()
     frontend: FrontendConfig = FrontendConfig()
     geometry: GeometryConfig = GeometryConfig()
+    window: WindowConfig = WindowConfig()
     gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,16 +20,18 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
+from slam.frontend.window.relative_poses import WindowPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 
 @dataclass(frozen=True)
 class Unscaled:
-    """Measurements in the networks' unit: steps of image geometry, the pose network's snippets, gaps."""
+    """Measurements in the networks' unit: steps of image geometry, snippets, gaps, and poses by keyframes."""
 
     steps: StepTable
     snippets: Sequence[SnippetPoses]
     interpolated: Sequence[RelativePose]
+    window: WindowPoses = field(default_factory=WindowPoses)
 
 
 def make_factors(
@@ -61,7 +63,18 @@ def make_factors(
     def scaled(poses: Sequence[RelativePose]) -> list[RelativePose]:
         return [pose.scaled(scale.unit_at(pose)) for pose in poses]
 
-    return [*scaled([*networks, *measured.interpolated]), *lidar_steps, *scaled(geometric)]
+    window = measured.window
+    others = [
+        [pose for pose in poses if not window.within(pose)] for poses in (networks, measured.interpolated, geometric)
+    ]
+    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *_windowed(window, scale)]
+
+
+def _windowed(window: WindowPoses, scale: Scale) -> list[RelativePose]:
+    """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
+    numbers = set(window.segments.values())
+    units = {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
+    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in window.poses]
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

@@ -33,6 +33,7 @@ from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place, warn_of_segments
 from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
+from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pipeline.positioning import Location, Positioning
@@ -119,9 +120,8 @@ class SlamPipeline:
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
         self._noise = noise
-        self._sequence = sequence
-        self._predictor = predictor
-        self._config = config
+        self._sequence, self._predictor = sequence, predictor
+        self._config = decided(config, sequence.camera_height_m)
         self._progress = progress or (lambda stage, done, total: None)
         self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
@@ -191,7 +191,7 @@ class SlamPipeline:
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
         lidar = self._register_lidar()
         by_lidar = [] if lidar is None else lidar_steps(lidar, self._config.lidar)
-        unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated)
+        unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
         scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
         factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])
         return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))

@@ -29,6 +29,8 @@ from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.tracking import Corners, TrackerState
+from slam.frontend.window.local_map import LocalMap, WindowKeyframe
+from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
 from slam.loops.descriptors import View
 from slam.pipeline.observations import Keyframe, Observations
 from slam.pipeline.observer import ObserverState, RecentFrame
@@ -115,6 +117,7 @@ SERIALISER = Serialiser(
     *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
     *(Corners, DynamicMask, HeadingPrior, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
+    *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe),
 )
 
 

@@ -17,6 +17,7 @@ from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import Measurements, SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.observer import Observer, ObserverState
 from slam.pose_graph import IncrementalPoseGraph
 from slam.prediction.assembly import make_predictor, open_depth
@@ -71,7 +72,7 @@ class Slam:
         if self._mode == "camera-height" and camera_height_m is None:
             raise SlamError("scale mode camera-height needs camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
-        config = config.model_copy(update={"mapping": without_map})
+        config = decided(config.model_copy(update={"mapping": without_map}), camera_height_m)
         self._weights_sha256 = weights_sha256
         self._sequence = LiveSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed

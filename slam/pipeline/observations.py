@@ -18,6 +18,7 @@ from slam.frontend.segments import Segment, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.window.relative_poses import WindowPoses
 from slam.loops.descriptors import View
 from slam.storage.spill import SpilledArray, SpillFile
 
@@ -88,9 +89,12 @@ class ClosedObservations:
     failures: list[tuple[int, int, str]]
     gaps: InterpolatedGaps
     segments: list[Segment]
+    window: WindowPoses
 
     @classmethod
-    def of(cls, seen: Observations, gaps: InterpolatedGaps, cuts: Collection[int] = ()) -> ClosedObservations:
+    def of(
+        cls, seen: Observations, gaps: InterpolatedGaps, cuts: Collection[int] = (), window: WindowPoses | None = None
+    ) -> ClosedObservations:
         """Leave out views and keyframes of interpolated frames."""
         return cls(
             seen.roads,
@@ -102,6 +106,7 @@ class ClosedObservations:
             seen.failures,
             gaps,
             find_segments(len(seen.roads), cuts, gaps.frames),
+            window or WindowPoses(),
         )
 
     @property

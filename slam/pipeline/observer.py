@@ -23,7 +23,9 @@ from slam.frontend.segments import find_cuts
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
+from slam.frontend.window.odometry import WindowState
 from slam.loops.descriptors import FeatureExtractor
+from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray, chain
@@ -54,11 +56,12 @@ class RecentFrame:
 
 @dataclass(frozen=True)
 class ObserverState:
-    """State of an observer after a frame."""
+    """State of an observer after a frame; ``keyframes`` is None where the drive is measured by steps alone."""
 
     seen: Observations
     gate: GateState
     odometry: OdometryState
+    keyframes: WindowState | None
     road_directions: tuple[FloatArray, ...]
     window: tuple[Frame, ...]
     recent: tuple[RecentFrame, ...]
@@ -123,6 +126,8 @@ class Observer:
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
+        keyframes = WindowState() if state is None else state.keyframes
+        self._keyframes = KeyframeTracking(config.window, intrinsics, seed, keyframes)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
@@ -183,15 +188,8 @@ class Observer:
     def state(self) -> ObserverState:
         """The state from which another observer continues as without an interruption."""
         self.flush()
-        return ObserverState(
-            self._seen,
-            self._gate.state(),
-            self._odometry.state(),
-            self._road.state(),
-            self._window,
-            self._recent,
-            self._unread,
-        )
+        parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
+        return ObserverState(self._seen, *parts, self._window, self._recent, self._unread)
 
     @property
     def frames(self) -> int:
@@ -215,20 +213,11 @@ class Observer:
             SlamError: no snippet of usable frames.
         """
         self.flush()
-        seen = self._seen
-        measured = [motion.ends for motion in seen.motions]
-        cuts = find_cuts(seen.failures, measured, {*seen.unusable, *seen.repeated})
-        gaps = interpolate_gaps(
-            len(seen.roads),
-            self._predictor.sources,
-            seen.snippets,
-            StepTable.of(seen.motions),
-            seen.unusable,
-            seen.repeated,
-            self._config.gaps,
-            cuts,
-        )
-        return ClosedObservations.of(seen, gaps, cuts)
+        seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
+        steps, count = StepTable.of(seen.motions), len(seen.roads)
+        cuts = find_cuts(seen.failures, list(steps.motions), {*seen.unusable, *seen.repeated})
+        gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
+        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(seen))
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -275,6 +264,7 @@ class Observer:
             steps = self._measure_steps(frame)
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
+        self._keyframes.decide(self._seen)
         if pending.snippet is not None:
             self._tasks.append(PendingTask("pose network", pending.snippet, self._seen.snippets.append))
         if rotation is not None:
@@ -286,6 +276,8 @@ class Observer:
         with self._stopwatch.stage("road"):
             road = self._plane.fit(depth)
         self._seen.roads.append(road)
+        with self._stopwatch.stage("keyframes"):
+            self._keyframes.add(frame, depth)
         height = road.height_unscaled if isinstance(road, GroundPlane) else None
         self._recent = (*self._recent, RecentFrame(frame, depth, height))[-self._frames_kept :]
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:

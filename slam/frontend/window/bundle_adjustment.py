@@ -1,0 +1,260 @@
+"""Bundle adjustment: cameras and points that fit all sightings best, by Levenberg-Marquardt on the Schur complement.
+
+As in Triggs et al. 2000, section 6.1: the points are eliminated, the cameras' reduced system is solved, the points
+follow. A camera is perturbed on the left, ``Exp(xi) T_camera_world``, rotation first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from slam.frames import Intrinsics
+from slam.frontend.window.projection import LEAST_DEPTH as _LEAST_DEPTH
+from slam.frontend.window.projection import pixel_jacobian
+from slam.se3 import FloatArray, make
+
+_FIRST_DAMPING = 1e-4
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
+# points whose sightings are eliminated together: they share few cameras
+_BLOCK = 512
+_SIX = np.arange(6)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """``S`` sightings of points by cameras: rows of both ``(S,)``, ``pixels`` ``(S, 2)``.
+
+    A point is seen at most once by a camera.
+    """
+
+    camera: NDArray[np.int64]
+    point: NDArray[np.int64]
+    pixels: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Sigma of a pixel coordinate; residuals beyond ``huber`` sigmas weigh less."""
+
+    pixel: float = 1.0
+    huber: float = 1.5
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Cameras ``T_camera_world`` ``(K, 4, 4)``, ``points`` ``(P, 3)`` in the world, ``residual_px`` ``(S,)``.
+
+    Behind a camera the residual is infinite. ``cost`` is half the robust sum of squared residuals over sigmas.
+    """
+
+    T_camera_world: FloatArray
+    points: FloatArray
+    residual_px: FloatArray
+    cost: float
+
+
+class BundleAdjustment:
+    """One problem: what is seen by whom, and which cameras are free."""
+
+    def __init__(self, sightings: Sightings, intrinsics: Intrinsics, free: NDArray[np.bool_], noise: Noise) -> None:
+        """Prepare to solve.
+
+        Args:
+            sightings: of all cameras.
+            intrinsics: of all cameras.
+            free: ``(K,)``, the cameras to adjust; the others stay.
+            noise: of the sightings.
+        """
+        self._seen = sightings
+        self._focal = np.array([intrinsics.fx, intrinsics.fy])
+        self._rays = intrinsics.rays(sightings.pixels)[:, :2]
+        self._noise = noise
+        self._column = np.where(free, np.cumsum(free) - 1, -1)
+        self._free = free
+        self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
+        self._of_camera = _summing(self._column[sightings.camera], int(free.sum()))
+        self._of_point = _summing(sightings.point, self._points)
+        self._blocks = self._eliminated_together()
+
+    def solve(self, T_camera_world: FloatArray, points: FloatArray, iterations: int, tolerance: float) -> Adjusted:
+        """Adjust from a start until the cost falls by less than ``tolerance`` of itself."""
+        T, X = T_camera_world.copy(), points.copy()
+        residuals = self.residuals(T, X)
+        cost = self._cost(residuals)
+        damping = _FIRST_DAMPING
+        system = None
+        for _ in range(iterations):
+            system = system or _System.of(self, T, X, residuals)
+            step = system.step(damping)
+            before = cost
+            if step is not None:
+                T_new, X_new = self._moved(T, X, *step)
+                residuals_new = self.residuals(T_new, X_new)
+                cost_new = self._cost(residuals_new)
+                if cost_new <= cost:
+                    T, X, residuals, cost, system = T_new, X_new, residuals_new, cost_new, None
+                    damping = max(0.1 * damping, _LEAST_DAMPING)
+                    if before - cost <= tolerance * before:
+                        break
+                    continue
+            damping *= 10.0
+            if damping > _MOST_DAMPING:
+                break
+        pixel = np.linalg.norm(residuals, axis=1) * self._noise.pixel
+        return Adjusted(T, X, np.where(self._depths(T, X) > _LEAST_DEPTH, pixel, np.inf), cost)
+
+    def residuals(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
+        """Of both pixel coordinates over their sigma ``(S, 2)``."""
+        X = self._in_cameras(T_camera_world, points)
+        z = np.maximum(X[:, 2:], _LEAST_DEPTH)
+        return np.asarray((X[:, :2] / z - self._rays) * self._focal / self._noise.pixel)
+
+    def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the residuals by their camera's perturbation ``(S, 2, 6)`` and their point ``(S, 2, 3)``."""
+        X = self._in_cameras(T_camera_world, points)
+        by_camera = pixel_jacobian(X, self._focal / self._noise.pixel)
+        return by_camera, by_camera[:, :, 3:] @ T_camera_world[self._seen.camera, :3, :3]
+
+    def _in_cameras(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
+        T = T_camera_world[self._seen.camera]
+        return np.asarray(np.einsum("sij,sj->si", T[:, :3, :3], points[self._seen.point]) + T[:, :3, 3])
+
+    def _depths(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
+        return self._in_cameras(T_camera_world, points)[:, 2]
+
+    def _cost(self, residuals: FloatArray) -> float:
+        """Huber's."""
+        length, k = np.linalg.norm(residuals, axis=1), self._noise.huber
+        return float(np.where(length < k, 0.5 * length**2, k * (length - 0.5 * k)).sum())
+
+    def weights(self, residuals: FloatArray) -> FloatArray:
+        """Square roots of Huber's weights ``(S, 1)``."""
+        length = np.linalg.norm(residuals, axis=1, keepdims=True)
+        return np.asarray(np.sqrt(np.minimum(self._noise.huber / np.maximum(length, 1e-12), 1.0)))
+
+    def _moved(
+        self, T_camera_world: FloatArray, points: FloatArray, by_camera: FloatArray, by_point: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        T = T_camera_world.copy()
+        moved = make(Rotation.from_rotvec(by_camera[:, :3]).as_matrix(), by_camera[:, 3:])
+        T[self._free] = moved @ T[self._free]
+        X = points.copy()
+        X[: self._points] += by_point
+        return T, X
+
+    def _eliminated_together(self) -> list[_Block]:
+        """Points in the order of the first camera that sees them, in blocks that share few cameras."""
+        camera, point = self._column[self._seen.camera], self._seen.point
+        rows = np.flatnonzero(camera >= 0)
+        first = np.full(self._points, np.iinfo(np.int64).max)
+        np.minimum.at(first, point[rows], camera[rows])
+        order = np.argsort(first, kind="stable")
+        place = np.empty(self._points, np.int64)
+        place[order] = np.arange(self._points)
+        blocks = []
+        by_place = rows[np.argsort(place[point[rows]], kind="stable")]
+        starts = np.searchsorted(place[point[by_place]], np.arange(0, self._points + _BLOCK, _BLOCK))
+        for n, (start, end) in enumerate(pairwise(starts)):
+            if start == end:
+                continue
+            sightings = by_place[start:end]
+            cameras, local = np.unique(camera[sightings], return_inverse=True)
+            points = order[n * _BLOCK : (n + 1) * _BLOCK]
+            blocks.append(_Block(sightings, cameras, local, points, place[point[sightings]] - n * _BLOCK))
+        return blocks
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Sightings of some points: rows, the ``cameras`` (columns) and ``points`` among them, and their local numbers."""
+
+    sightings: NDArray[np.int64]
+    cameras: NDArray[np.int64]
+    local_camera: NDArray[np.int64]
+    points: NDArray[np.int64]
+    local_point: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations: cameras ``U`` ``(F, 6, 6)``, points ``V`` ``(P, 3, 3)``, their coupling, right sides."""
+
+    blocks: list[_Block]
+    U: FloatArray
+    V: FloatArray
+    W: FloatArray  # (S, 6, 3)
+    camera_side: FloatArray
+    point_side: FloatArray
+
+    @classmethod
+    def of(cls, problem: BundleAdjustment, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _System:
+        root = problem.weights(residuals)
+        A, B = (root[:, :, None] * J for J in problem.jacobians(T, X))
+        r = (root * residuals)[:, :, None]
+        At, Bt = A.transpose(0, 2, 1), B.transpose(0, 2, 1)
+        cameras, points = problem._of_camera, problem._of_point
+        count = len(residuals)
+        return cls(
+            problem._blocks,
+            (cameras @ (At @ A).reshape(count, 36)).reshape(-1, 6, 6),
+            (points @ (Bt @ B).reshape(count, 9)).reshape(-1, 3, 3),
+            At @ B,
+            -(cameras @ (At @ r).reshape(count, 6)),
+            -(points @ (Bt @ r).reshape(count, 3)),
+        )
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
+        """Steps of cameras ``(F, 6)`` and points ``(P, 3)``; None where the system is singular."""
+        V_inverse = np.asarray(np.linalg.inv(_damped(self.V, damping)), np.float64)
+        S, side, blocks = self._reduced(damping, V_inverse)
+        try:
+            by_camera = cho_solve(cho_factor(S, check_finite=False), side, check_finite=False).reshape(-1, 6)
+        except LinAlgError:
+            return None
+        by_point = self.point_side.copy()
+        for block, W in blocks:
+            by_point[block.points] -= (by_camera[block.cameras].ravel() @ W).reshape(-1, 3)
+        return by_camera, np.einsum("pij,pj->pi", V_inverse, by_point)
+
+    def _reduced(
+        self, damping: float, V_inverse: FloatArray
+    ) -> tuple[FloatArray, FloatArray, list[tuple[_Block, FloatArray]]]:
+        """The cameras' system without the points, and the coupling of each block."""
+        F = len(self.U)
+        S, side = np.zeros((F, 6, F, 6)), self.camera_side.copy()
+        S[range(F), :, range(F), :] = _damped(self.U, damping)
+        coupled = []
+        for block in self.blocks:
+            W = np.zeros((len(block.cameras), 6, len(block.points), 3))
+            W[block.local_camera, :, block.local_point, :] = self.W[block.sightings]
+            WV = np.einsum("kapi,pij->kapj", W, V_inverse[block.points], optimize=True)
+            flat = 6 * len(block.cameras), 3 * len(block.points)
+            W, WV = W.reshape(flat), WV.reshape(flat)
+            shape = len(block.cameras), 6, len(block.cameras), 6
+            # cameras of a block are few, so that the product is small
+            S[np.ix_(block.cameras, _SIX, block.cameras, _SIX)] -= (WV @ W.T).reshape(shape)
+            side[block.cameras] -= (WV @ self.point_side[block.points].ravel()).reshape(-1, 6)
+            coupled.append((block, W))
+        return S.reshape(6 * F, 6 * F), side.ravel(), coupled
+
+
+def _damped(blocks: FloatArray, damping: float) -> FloatArray:
+    diagonal = np.einsum("kii->ki", blocks)
+    added = damping * np.maximum(diagonal, 1e-6) + 1e-12
+    return np.asarray(blocks + added[:, :, None] * np.eye(blocks.shape[1]))
+
+
+def _summing(group: NDArray[np.int64], groups: int) -> csr_array:
+    """The matrix ``(groups, S)`` that sums rows by their group; rows of group -1 are left out."""
+    rows = np.flatnonzero(group >= 0)
+    return csr_array((np.ones(len(rows)), (group[rows], rows)), shape=(groups, len(group)))

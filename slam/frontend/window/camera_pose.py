@@ -1,0 +1,101 @@
+"""Pose of one camera from known points: robust Gauss-Newton from guesses, consensus where they disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slam.frames import Intrinsics
+from slam.frontend.window.projection import LEAST_DEPTH, pixel_jacobian
+from slam.resection import consensus
+from slam.robust import mad_sigma
+from slam.se3 import FloatArray, apply, from_rotation_vector, make
+
+_ITERATIONS = 12
+_CONVERGED = 1e-7
+_LEAST_PIXEL_SIGMA = 0.1
+# below this inlier ratio the pose may be one that some wrong tracks agree on
+_DOUBTFUL_RATIO = 0.75
+_SAMPLES = 300
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """``T_camera_world``, ``residual_px`` ``(M,)``, infinite behind the camera, and ``sigmas`` ``(6,)``.
+
+    The sigmas are of a perturbation on the left, rotation first, for known points and independent errors.
+    """
+
+    T_camera_world: FloatArray
+    residual_px: FloatArray
+    sigmas: FloatArray
+
+
+def resect(
+    guesses: Sequence[FloatArray],
+    points: FloatArray,
+    pixels: FloatArray,
+    intrinsics: Intrinsics,
+    inlier_px: float,
+    seed: int = 0,
+) -> CameraPose:
+    """The pose with most inliers among those found from guesses ``T_camera_world``, and by consensus if in doubt.
+
+    Two guesses matter: from the prediction by the last motion alone, a wrong pose predicts the next wrong pose.
+
+    Args:
+        guesses: start poses, at least one.
+        points: in the world ``(M, 3)``, at least 6.
+        pixels: of the points ``(M, 2)``.
+        intrinsics: of the camera.
+        inlier_px: largest residual of an inlier.
+        seed: of RANSAC.
+    """
+
+    def support(pose: CameraPose) -> int:
+        return int((pose.residual_px < inlier_px).sum())
+
+    best = max((_refined(guess, points, pixels, intrinsics, inlier_px) for guess in guesses), key=support)
+    if support(best) < _DOUBTFUL_RATIO * len(points):
+        found = consensus(points, pixels, intrinsics.K, _SAMPLES, inlier_px, seed)
+        if found is not None:
+            start = make(cv2.Rodrigues(found[0])[0], found[1])
+            best = max(best, _refined(start, points, pixels, intrinsics, inlier_px), key=support)
+    return best
+
+
+def _refined(
+    T_camera_world: FloatArray, points: FloatArray, pixels: FloatArray, intrinsics: Intrinsics, inlier_px: float
+) -> CameraPose:
+    """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
+    T = T_camera_world.copy()
+    focal = np.array([intrinsics.fx, intrinsics.fy])
+    rays = intrinsics.rays(pixels)[:, :2]
+    residual, X = _residual(T, points, rays, focal)
+    for _ in range(_ITERATIONS):
+        norm = np.linalg.norm(residual, axis=1)
+        scale = max(0.5 * inlier_px, float(np.median(norm)))
+        weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
+        J = pixel_jacobian(X, focal)
+        JtW = (weight[:, None, None] * J).reshape(-1, 6).T
+        information = JtW @ J.reshape(-1, 6) + 1e-9 * np.eye(6)
+        step = np.asarray(np.linalg.solve(information, -JtW @ residual.ravel()), np.float64)
+        T = from_rotation_vector(step[:3], step[3:]) @ T
+        residual, X = _residual(T, points, rays, focal)
+        if np.abs(step).max() < _CONVERGED:
+            break
+    in_front = X[:, 2] > LEAST_DEPTH
+    sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
+    sigmas = sigma * np.sqrt(np.diag(np.linalg.inv(information)))
+    return CameraPose(T, np.where(in_front, np.linalg.norm(residual, axis=1), np.inf), sigmas)
+
+
+def _residual(
+    T_camera_world: FloatArray, points: FloatArray, rays: FloatArray, focal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    X = apply(T_camera_world, points)
+    z = np.maximum(X[:, 2], LEAST_DEPTH)
+    return (X[:, :2] / z[:, None] - rays) * focal, X

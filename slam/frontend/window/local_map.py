@@ -1,0 +1,244 @@
+"""Keyframes and the points they see: triangulation, known points found again, adjustment of the last keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import WindowConfig
+from slam.frames import DepthMap, Grey, Intrinsics
+from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.window.flow import Pixels, flow
+from slam.frontend.window.triangulation import triangulate
+from slam.se3 import FloatArray, apply, invert
+
+TrackIds = NDArray[np.int64]
+
+_IMAGES_KEPT = 20
+_MATCHED_LEVELS = 1
+_BORDER_PX = 8
+_LEAST_MATCHED = 8
+_SHARED = 5
+# a keyframe is near if its camera is within this of the median depth, and looks the same way up to this cosine
+_NEAR_DEPTHS = 0.5
+_NEAR_COSINE = 0.7
+_ALIGNED_PX = 2.0
+_PROJECTED_PX = 4.0
+_ALIGNED_KEYFRAMES = 4
+
+
+@dataclass(frozen=True)
+class WindowKeyframe:
+    """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
+
+    ``grey`` is None once the image is not kept any more; ``learned_depth`` ``(M,)`` is NaN where unknown.
+    """
+
+    index: int
+    T_camera_world: FloatArray
+    track_ids: TrackIds
+    pixels: FloatArray
+    learned_depth: FloatArray
+    grey: Grey | None
+
+    def with_depth(self, depth: DepthMap) -> WindowKeyframe:
+        """The same with learned depth ``(H, W)`` at its corners."""
+        height, width = depth.shape
+        u = np.clip(np.rint(self.pixels[:, 0]).astype(np.int64), 0, width - 1)
+        v = np.clip(np.rint(self.pixels[:, 1]).astype(np.int64), 0, height - 1)
+        return replace(self, learned_depth=depth[v, u].astype(np.float64))
+
+    def without(self, gone: TrackIds) -> WindowKeyframe:
+        """The same without some tracks."""
+        kept = ~np.isin(self.track_ids, gone)
+        return replace(
+            self,
+            track_ids=self.track_ids[kept],
+            pixels=self.pixels[kept],
+            learned_depth=self.learned_depth[kept],
+        )
+
+
+@dataclass
+class LocalMap:
+    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated."""
+
+    keyframes: list[WindowKeyframe] = field(default_factory=list)
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
+        """Which tracks have a point ``(M,)``."""
+        return np.asarray(np.isfinite(self.points[track_ids, 0]))
+
+    def new_tracks(self, count: int) -> TrackIds:
+        """Identifiers of new tracks."""
+        first = len(self.points)
+        self.points = np.vstack([self.points, np.full((count, 3), np.nan)])
+        return np.arange(first, first + count)
+
+    def add(self, keyframe: WindowKeyframe) -> None:
+        """Add the newest keyframe; images of old ones are not kept."""
+        self.keyframes.append(keyframe)
+        if len(self.keyframes) > _IMAGES_KEPT:
+            self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
+
+    def triangulate(self, intrinsics: Intrinsics, config: WindowConfig) -> None:
+        """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
+        newest = self.keyframes[-1]
+        track_ids = newest.track_ids[~self.known(newest.track_ids)]
+        if not len(track_ids):
+            return
+        poses, rays, point = [], [], []
+        for keyframe in self.keyframes[-config.keyframes - _SHARED :]:
+            _, a, b = np.intersect1d(keyframe.track_ids, track_ids, assume_unique=True, return_indices=True)
+            poses.append(np.repeat(keyframe.T_camera_world[None], len(a), axis=0))
+            rays.append(intrinsics.rays(keyframe.pixels[a]))
+            point.append(b)
+        T, ray, row = np.concatenate(poses), np.concatenate(rays), np.concatenate(point)
+        X, angle = triangulate(T, ray, row, len(track_ids))
+        Y = np.einsum("sij,sj->si", T[:, :3, :3], X[row]) + T[:, :3, 3]
+        in_front = Y[:, 2] > 0
+        offset = (Y[:, :2] / np.where(in_front, Y[:, 2], 1.0)[:, None] - ray[:, :2]) * [intrinsics.fx, intrinsics.fy]
+        error = np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)
+        worst = np.zeros(len(track_ids))
+        np.maximum.at(worst, row, error)
+        good = (angle > np.deg2rad(config.min_angle_deg)) & (worst < config.outlier_px)
+        self.points[track_ids[good]] = X[good]
+
+    def adjust(self, intrinsics: Intrinsics, config: WindowConfig) -> TrackIds:
+        """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.
+
+        Returns:
+            Tracks whose point or newest sighting was taken out as an outlier.
+        """
+        first = max(len(self.keyframes) - config.keyframes, 0)
+        seen = np.zeros(len(self.points), np.bool_)
+        seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
+        seen &= np.isfinite(self.points[:, 0])
+        fixed = self._sharing(seen, first, config.keyframes)
+        chosen = [*fixed, *range(first, len(self.keyframes))]
+        sightings, track_ids = self._sightings(chosen, seen)
+        free = np.ones(len(chosen), np.bool_)
+        free[: max(len(fixed), 1)] = False
+        noise = Noise(config.pixel_sigma, huber=config.huber_sigmas)
+        problem = BundleAdjustment(sightings, intrinsics, free, noise)
+        poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
+        solved = problem.solve(poses, self.points[track_ids], config.iterations, config.tolerance)
+        self.points[track_ids] = solved.points
+        bad = solved.residual_px > config.outlier_px
+        for row, k in enumerate(chosen):
+            gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
+            self.keyframes[k] = replace(self.keyframes[k].without(gone), T_camera_world=solved.T_camera_world[row])
+        dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
+        self.points[dead] = np.nan
+        newest = track_ids[sightings.point[bad & (sightings.camera == len(chosen) - 1)]]
+        return np.concatenate([dead, newest])
+
+    def _sharing(self, seen: NDArray[np.bool_], first: int, most: int) -> list[int]:
+        """The keyframes before ``first`` that share most of the points seen."""
+        shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
+        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:most]
+        return sorted(k for _, k in best)
+
+    def _sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
+        """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
+        cameras, track_ids, pixels = [], [], []
+        for row, k in enumerate(chosen):
+            keyframe = self.keyframes[k]
+            known = seen[keyframe.track_ids]
+            cameras.append(np.full(int(known.sum()), row))
+            track_ids.append(keyframe.track_ids[known])
+            pixels.append(keyframe.pixels[known])
+        camera, track, pixel = np.concatenate(cameras), np.concatenate(track_ids), np.concatenate(pixels)
+        twice = np.bincount(track, minlength=len(self.points))[track] > 1
+        points, row_of = np.unique(track[twice], return_inverse=True)
+        return Sightings(camera[twice], row_of, pixel[twice]), points
+
+    def aligned(
+        self,
+        grey: Grey,
+        T_camera_world: FloatArray,
+        track_ids: TrackIds,
+        pixels: Pixels,
+        intrinsics: Intrinsics,
+        config: WindowConfig,
+    ) -> Pixels:
+        """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""
+        pixels, pending = pixels.copy(), np.ones(len(track_ids), np.bool_)
+        for keyframe in self.keyframes[-_ALIGNED_KEYFRAMES:]:
+            _, a, b = np.intersect1d(keyframe.track_ids, track_ids, assume_unique=True, return_indices=True)
+            a, b = a[pending[b]], b[pending[b]]
+            if len(a) < _LEAST_MATCHED:
+                continue
+            found, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics, config)
+            kept &= np.linalg.norm(found - pixels[b], axis=1) < _ALIGNED_PX
+            pixels[b[kept]] = found[kept]
+            pending[b[kept]] = False
+        return pixels
+
+    def found_again(
+        self, grey: Grey, T_camera_world: FloatArray, track_ids: TrackIds, intrinsics: Intrinsics, config: WindowConfig
+    ) -> tuple[TrackIds, Pixels]:
+        """Known points that are not among the tracks of a new keyframe, found near their projections."""
+        missing = np.isfinite(self.points[:, 0])
+        missing[track_ids] = False
+        tracks, places = [], []
+        for keyframe in self._near(T_camera_world, track_ids):
+            rows = np.flatnonzero(missing[keyframe.track_ids])
+            X = apply(T_camera_world, self.points[keyframe.track_ids[rows]])
+            z = np.where(X[:, 2] > 0, X[:, 2], 1.0)
+            focal, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
+            projected = (X[:, :2] / z[:, None] * focal + centre).astype(np.float32)
+            limit = [intrinsics.width - _BORDER_PX, intrinsics.height - _BORDER_PX]
+            inside = (X[:, 2] > 0) & (projected > _BORDER_PX).all(axis=1) & (projected < limit).all(axis=1)
+            rows, projected = rows[inside], projected[inside]
+            if len(rows) < _LEAST_MATCHED:
+                continue
+            found, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics, config)
+            kept &= np.linalg.norm(found - projected, axis=1) < _PROJECTED_PX
+            tracks.append(keyframe.track_ids[rows[kept]])
+            places.append(found[kept])
+            missing[tracks[-1]] = False
+        if not tracks:
+            return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        return np.concatenate(tracks), np.concatenate(places)
+
+    def _near(self, T_camera_world: FloatArray, track_ids: TrackIds) -> list[WindowKeyframe]:
+        """Keyframes with images whose cameras are near and look the same way, the nearest first."""
+        known = track_ids[self.known(track_ids)]
+        kept = [keyframe for keyframe in self.keyframes if keyframe.grey is not None]
+        if not len(known) or not kept:
+            return []
+        depth = float(np.median(apply(T_camera_world, self.points[known])[:, 2]))
+        poses = np.array([keyframe.T_camera_world for keyframe in kept])
+        centres = invert(poses)[:, :3, 3] - invert(T_camera_world)[:3, 3]
+        distance = np.linalg.norm(centres, axis=1) / max(depth, 1e-9)
+        cosine = poses[:, 2, :3] @ T_camera_world[2, :3]
+        near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
+        order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
+        return [kept[k] for k in near[order]]
+
+
+def _matched(
+    keyframe: WindowKeyframe,
+    rows: NDArray[np.intp],
+    grey: Grey,
+    T_camera_world: FloatArray,
+    guesses: Pixels,
+    intrinsics: Intrinsics,
+    config: WindowConfig,
+) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Corners of a keyframe found in an image, the keyframe's image turned as the new camera is."""
+    if keyframe.grey is None:
+        return guesses, np.zeros(len(rows), np.bool_)
+    R_camera_keyframe = T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
+    H = intrinsics.K @ R_camera_keyframe @ np.linalg.inv(intrinsics.K)
+    size = intrinsics.width, intrinsics.height
+    turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    moved = np.column_stack([keyframe.pixels[rows], np.ones(len(rows))]) @ H.T
+    pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
+    return flow(turned, grey, pixels, guesses, config.window_px, _MATCHED_LEVELS, config.forward_backward_px)

@@ -1,0 +1,254 @@
+"""Camera poses by keyframes: corners are tracked from the last keyframe, cameras are resected against its points.
+
+As in PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015), with optical flow in place of descriptors. At
+30 frames a second the parallax of neighbouring frames is a pixel; geometry over longer baselines needs tracks that do
+not drift, so each corner is compared with its image in the keyframe, not with that in the frame before.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import WindowConfig
+from slam.frames import DepthMap, Frame, Intrinsics
+from slam.frontend.visual.epipolar import (
+    depth_in_current,
+    parallax_px,
+    rotation_between,
+    triangulated_depth,
+    unit_pose_by_essential,
+)
+from slam.frontend.window.camera_pose import CameraPose, resect
+from slam.frontend.window.flow import Pixels, flow, new_corners
+from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
+from slam.se3 import FloatArray, invert, make
+
+logger = logging.getLogger(__name__)
+
+_LEAST_START = 40
+_LEAST_START_TRACKS = 60
+_START_PX = 1.0
+_START_PARALLAX_PX = 4.0
+_START_KEYFRAMES = 3
+# a track this far from its projection has slipped
+_SLIPPED = 8.0 / 3.0
+_MOST_FLOW = 4.0
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Corners of a frame, ``track_ids`` ``(M,)`` and ``pixels`` ``(M, 2)``; its pose, None where it was lost."""
+
+    index: int
+    track_ids: TrackIds
+    pixels: Pixels
+    T_camera_world: FloatArray | None
+    keyframe: int  # the last one, by its place among the map's
+
+
+@dataclass
+class Segment:
+    """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points."""
+
+    map: LocalMap = field(default_factory=LocalMap)
+    frames: list[TrackedFrame] = field(default_factory=list)
+    started: bool = False
+
+
+@dataclass
+class WindowState:
+    """Maps of a drive so far; of the last one, what continues: places of the keyframe's corners ``(M, 2)``, poses."""
+
+    segments: list[Segment] = field(default_factory=list)
+    places: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    slipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
+    T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
+    lost: int = 0
+
+
+class WindowOdometry:
+    """Poses of the frames of one sequence in the unit of each segment's map."""
+
+    def __init__(
+        self, config: WindowConfig, intrinsics: Intrinsics, seed: int = 0, state: WindowState | None = None
+    ) -> None:
+        """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC."""
+        self._config = config
+        self._intrinsics = intrinsics
+        self._seed = seed
+        self._state = state or WindowState()
+
+    def state(self) -> WindowState:
+        """The state to resume from."""
+        return self._state
+
+    def add(self, frame: Frame, depth: DepthMap) -> None:
+        """Track and resect the next usable frame; make it a keyframe where that is wanted.
+
+        Args:
+            frame: at the size of the intrinsics.
+            depth: its learned z-depth ``(H, W)``, for the unit of the map.
+        """
+        self._follow(frame)
+        newest = self._state.segments[-1].map
+        if newest.keyframes[-1].index == frame.index:
+            newest.keyframes[-1] = newest.keyframes[-1].with_depth(depth)
+
+    def _follow(self, frame: Frame) -> None:
+        if not self._state.segments or self._state.lost > self._config.max_lost_frames:
+            self._begin(frame)
+            return
+        segment = self._state.segments[-1]
+        track_ids, pixels = self._track(segment, frame)
+        if segment.started:
+            self._locate(segment, frame, track_ids, pixels)
+        else:
+            self._start(segment, frame, track_ids, pixels)
+
+    def _begin(self, frame: Frame) -> None:
+        """A new map whose first keyframe is this frame; a map that never had points is forgotten."""
+        state = self._state
+        if state.segments and not state.segments[-1].started:
+            state.segments.pop()
+        state.segments.append(Segment())
+        state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
+        self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+    def _track(self, segment: Segment, frame: Frame) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe found in a frame; the others stay near their last places."""
+        state, config, keyframe = self._state, self._config, segment.map.keyframes[-1]
+        rows = np.flatnonzero(~state.slipped)
+        if keyframe.grey is None or not len(rows):
+            return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        guesses = state.places[rows]
+        found, kept = flow(
+            keyframe.grey,
+            frame.grey,
+            keyframe.pixels[rows].astype(np.float32),
+            guesses,
+            config.window_px,
+            config.pyramid_levels,
+            config.forward_backward_px,
+        )
+        shift = np.median(found[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
+        state.places[rows] = np.where(kept[:, None], found, guesses + shift)
+        return keyframe.track_ids[rows[kept]], found[kept]
+
+    def _start(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+        """The first points, once the parallax to the first keyframe gives them."""
+        first, intrinsics = segment.map.keyframes[0], self._intrinsics
+        if len(track_ids) < _LEAST_START_TRACKS:
+            self._begin(frame)
+            return
+        segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
+        rows = np.searchsorted(first.track_ids, track_ids)
+        rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
+        unexplained = parallax_px(rays_first, rays, rotation_between(rays_first, rays), intrinsics)
+        if np.median(unexplained) < self._config.start_parallax_ratio * intrinsics.width:
+            return
+        motion = unit_pose_by_essential(rays_first, rays, _START_PX / intrinsics.fx, self._seed)
+        if motion is None:
+            return
+        depth = triangulated_depth(rays_first, rays, motion)
+        parallax = parallax_px(rays_first, rays, motion.R_current_previous, intrinsics)
+        solid = (depth > 0) & (depth_in_current(rays_first, depth, motion) > 0) & (parallax > _START_PARALLAX_PX)
+        if solid.sum() < _LEAST_START or solid.mean() < 0.5:
+            return
+        unit = float(np.median(depth[solid]))
+        segment.map.points[track_ids[solid]] = rays_first[solid] * (depth[solid] / unit)[:, None]
+        segment.started = True
+        logger.info("frame %d: a map of %d points begins", frame.index, int(solid.sum()))
+        self._state.T_camera_world = make(motion.R_current_previous, motion.direction / unit)
+        self._add_keyframe(segment, frame, track_ids, pixels)
+        segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
+
+    def _locate(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+        """The camera's pose from known points."""
+        state, known = self._state, segment.map.known(track_ids)
+        pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
+        if pose is None:
+            state.lost += 1
+            state.T_last_step = np.eye(4)
+            segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, len(segment.map.keyframes) - 1))
+            return
+        state.lost = 0
+        before, state.T_camera_world = state.T_camera_world, pose.T_camera_world
+        state.T_last_step = state.T_camera_world @ invert(before)
+        slipped = track_ids[known][pose.residual_px > _SLIPPED * self._config.inlier_px]
+        state.slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
+        kept = ~np.isin(track_ids, slipped)
+        track_ids, pixels = track_ids[kept], pixels[kept]
+        if self._wants_keyframe(segment, track_ids, pixels):
+            self._add_keyframe(segment, frame, track_ids, pixels)
+        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+
+    def _resected(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
+        """From the last pose and from the predicted one; None with too few inliers."""
+        if len(track_ids) < self._config.min_points:
+            return None
+        T_last = self._state.T_camera_world
+        guesses = T_last, self._state.T_last_step @ T_last
+        points, inlier_px = segment.map.points[track_ids], self._config.inlier_px
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, inlier_px, self._seed)
+        return pose if (pose.residual_px < inlier_px).sum() >= self._config.min_points else None
+
+    def _wants_keyframe(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> bool:
+        keyframe, config = segment.map.keyframes[-1], self._config
+        if len(track_ids) < max(config.keyframe_tracks_ratio * len(keyframe.track_ids), config.min_points):
+            return True
+        before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
+        R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
+        rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
+        limit = config.keyframe_parallax_ratio * self._intrinsics.width
+        moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
+        parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
+        return parallax > limit or moved > _MOST_FLOW * limit
+
+    def _add_keyframe(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+        """Old corners aligned and found again, new ones between them, then triangulation and bundle adjustment."""
+        state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
+        T = state.T_camera_world
+        if segment.started:
+            pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics, config)
+            again, found = local.found_again(frame.grey, T, track_ids, intrinsics, config)
+            track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
+        fresh = new_corners(
+            frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px, config.corner_quality
+        )
+        track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
+        pixels = np.concatenate([pixels, fresh])
+        order = np.argsort(track_ids)
+        track_ids, places = track_ids[order], pixels[order].astype(np.float64)
+        unknown = np.full(len(track_ids), np.nan)
+        if segment.started and len(local.keyframes) == 1:
+            self._add_first_keyframes(segment)
+        local.add(WindowKeyframe(frame.index, T, track_ids, places, unknown, frame.grey))
+        if segment.started:
+            local.triangulate(intrinsics, config)
+            local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics, config))
+            state.T_camera_world = local.keyframes[-1].T_camera_world
+        state.places = local.keyframes[-1].pixels.astype(np.float32)
+        state.slipped = np.zeros(len(state.places), np.bool_)
+
+    def _add_first_keyframes(self, segment: Segment) -> None:
+        """Some of the frames between the first two keyframes: more views of the first points."""
+        between = segment.frames[:-1]
+        for row in np.unique(np.linspace(0, len(between) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]):
+            frame = between[row]
+            known = segment.map.known(frame.track_ids)
+            if known.sum() < self._config.min_points:
+                continue
+            points, pixels = segment.map.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
+            pose = resect((np.eye(4),), points, pixels, self._intrinsics, self._config.inlier_px, self._seed)
+            unknown = np.full(len(frame.track_ids), np.nan)
+            places = frame.pixels.astype(np.float64)
+            segment.map.add(WindowKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, None))
+
+    def _tracked(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
+        last = len(segment.map.keyframes) - 1
+        return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world, last)

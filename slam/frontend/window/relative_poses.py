@@ -1,0 +1,127 @@
+"""Relative poses from the maps of the window: keyframe to keyframe, and keyframe to the frames after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from slam.config import WindowConfig
+from slam.frames import Intrinsics, RelativePose
+from slam.frontend.visual.two_view import CORNER_CORRELATION
+from slam.frontend.window.camera_pose import resect
+from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
+from slam.frontend.window.odometry import Segment, WindowState
+from slam.se3 import FloatArray, apply, invert
+
+WINDOW_SOURCE = "window"
+_LEAST_DEPTHS = 20
+_LEAST_LENGTH = 1e-6
+
+
+@dataclass(frozen=True)
+class WindowPoses:
+    """Relative ``poses``, unscaled, and the segment of every frame that has one, by frame."""
+
+    poses: Sequence[RelativePose] = ()
+    segments: Mapping[int, int] = field(default_factory=dict)
+
+    def within(self, pose: RelativePose) -> bool:
+        """Whether both frames of a measurement have poses in one map."""
+        first, last = (self.segments.get(frame) for frame in pose.ends)
+        return first is not None and first == last
+
+    def frames_of(self, segment: int) -> list[int]:
+        """The frames of a segment."""
+        return [frame for frame, number in self.segments.items() if number == segment]
+
+
+def window_poses(state: WindowState, intrinsics: Intrinsics, config: WindowConfig, seed: int = 0) -> WindowPoses:
+    """All relative poses of the maps so far, in the unit of learned depth.
+
+    Args:
+        state: after some frame.
+        intrinsics: of all images.
+        config: least sigmas, inliers.
+        seed: of RANSAC.
+    """
+    poses: list[RelativePose] = []
+    segments: dict[int, int] = {}
+    for number, segment in enumerate(part for part in state.segments if part.started):
+        found = _segment_poses(segment, intrinsics, config, seed)
+        poses += found
+        segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+    return WindowPoses(poses, segments)
+
+
+def _segment_poses(segment: Segment, intrinsics: Intrinsics, config: WindowConfig, seed: int) -> list[RelativePose]:
+    local = segment.map
+    unit, keyframes = learned_unit(local), local.keyframes
+    place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
+    found: list[RelativePose] = []
+    for before, after in pairwise(keyframes):
+        seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, config, seed)
+        sigmas = None if seen is None else seen[1]
+        found.append(_relative(before, after.index, after.T_camera_world, sigmas, unit, config))
+    T_guess = keyframes[0].T_camera_world
+    for frame in segment.frames:
+        if frame.index in place:
+            T_guess = keyframes[place[frame.index]].T_camera_world
+            continue
+        pixels = frame.pixels.astype(np.float64)
+        guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
+        located = _seen_from(local, frame.track_ids, pixels, guess, intrinsics, config, seed)
+        if located is not None:
+            T_guess, sigmas = located
+            nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
+            found.append(_relative(nearest, frame.index, T_guess, sigmas, unit, config))
+    return found
+
+
+def learned_unit(local: LocalMap) -> float:
+    """Learned depth over depth in the map, the median over all sightings by keyframes; 1 where there are few."""
+    ratios = []
+    for keyframe in local.keyframes:
+        depth = apply(keyframe.T_camera_world, local.points[keyframe.track_ids])[:, 2]
+        with np.errstate(invalid="ignore"):
+            ratio = keyframe.learned_depth / depth
+            ratios.append(ratio[np.isfinite(ratio) & (ratio > 0)])
+    joined = np.concatenate(ratios)
+    return float(np.median(joined)) if len(joined) >= _LEAST_DEPTHS else 1.0
+
+
+def _seen_from(
+    local: LocalMap,
+    track_ids: TrackIds,
+    pixels: FloatArray,
+    T_guess: FloatArray,
+    intrinsics: Intrinsics,
+    config: WindowConfig,
+    seed: int,
+) -> tuple[FloatArray, FloatArray] | None:
+    """``T_camera_world`` by the map's points and its sigmas ``(6,)``; None with too few inliers."""
+    known = local.known(track_ids)
+    if known.sum() < config.min_points:
+        return None
+    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, config.inlier_px, seed)
+    if (pose.residual_px < config.inlier_px).sum() < config.min_points:
+        return None
+    return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas
+
+
+def _relative(
+    keyframe: WindowKeyframe,
+    index: int,
+    T_camera_world: FloatArray,
+    sigmas: FloatArray | None,
+    unit: float,
+    config: WindowConfig,
+) -> RelativePose:
+    """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
+    T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
+    length = float(np.linalg.norm(T_from_to[:3, 3]))
+    floors = np.repeat([np.deg2rad(config.rotation_sigma_deg), config.relative_sigma * max(length, _LEAST_LENGTH)], 3)
+    own = 10.0 * floors if sigmas is None else sigmas
+    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), WINDOW_SOURCE).scaled(unit)

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+
+from slam.frames import Intrinsics
+from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.se3 import FloatArray, apply, from_rotation_vector, invert
+
+INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)
+
+
+def scene(cameras: int = 6, points: int = 60, noise_px: float = 0.0) -> tuple[FloatArray, FloatArray, Sightings]:
+    """Cameras on a walk, points before them, and two thirds of all sightings."""
+    rng = np.random.default_rng(1)
+    centres = np.cumsum(rng.normal(0.0, 0.15, (cameras, 3)), axis=0)
+    T_camera_world = invert(from_rotation_vector(rng.normal(0.0, 0.1, (cameras, 3)), centres))
+    X = rng.uniform((-2.0, -2.0, 3.0), (2.0, 2.0, 6.0), (points, 3))
+    camera, point = (rows.ravel() for rows in np.meshgrid(range(cameras), range(points), indexing="ij"))
+    seen = rng.random(len(camera)) < 2 / 3
+    camera, point = camera[seen], point[seen]
+    places = np.concatenate([apply(T_camera_world[c], X[[p]]) for c, p in zip(camera, point, strict=True)])
+    pixels = places @ INTRINSICS.K.T
+    noise = rng.normal(0.0, noise_px, (len(camera), 2))
+    return T_camera_world, X, Sightings(camera, point, pixels[:, :2] / pixels[:, 2:] + noise)
+
+
+def disturbed(T_camera_world: FloatArray, X: FloatArray, fixed: int) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(2)
+    moved = T_camera_world.copy()
+    small = from_rotation_vector(*rng.normal(0.0, 0.01, (2, len(moved) - fixed, 3)))
+    moved[fixed:] = small @ moved[fixed:]
+    return moved, X + rng.normal(0.0, 0.05, X.shape)
+
+
+def test_jacobians_are_the_derivatives_of_the_residuals() -> None:
+    T, X, sightings = scene()
+    problem = BundleAdjustment(sightings, INTRINSICS, np.ones(len(T), np.bool_), Noise(0.5))
+    by_camera, by_point = problem.jacobians(T, X)
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = 1e-6
+        ahead, behind = (from_rotation_vector(s * step[:3], s * step[3:]) @ T for s in (1.0, -1.0))
+        numeric = (problem.residuals(ahead, X) - problem.residuals(behind, X)) / 2e-6
+        np.testing.assert_allclose(by_camera[:, :, axis], numeric, atol=1e-4)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        numeric = (problem.residuals(T, X + step) - problem.residuals(T, X - step)) / 2e-6
+        np.testing.assert_allclose(by_point[:, :, axis], numeric, atol=1e-4)
+
+
+def test_finds_cameras_and_points_again() -> None:
+    T, X, sightings = scene()
+    free = np.arange(len(T)) >= 2
+    problem = BundleAdjustment(sightings, INTRINSICS, free, Noise())
+    solved = problem.solve(*disturbed(T, X, 2), iterations=30, tolerance=1e-12)
+    np.testing.assert_allclose(solved.T_camera_world, T, atol=1e-6)
+    twice = np.bincount(sightings.point, minlength=len(X)) > 1
+    np.testing.assert_allclose(solved.points[twice], X[twice], atol=1e-5)
+    assert solved.residual_px.max() < 1e-4
+
+
+def test_is_the_least_squares_solution_and_leaves_fixed_cameras() -> None:
+    T, X, sightings = scene(noise_px=0.5)
+    free = np.arange(len(T)) >= 2
+    problem = BundleAdjustment(sightings, INTRINSICS, free, Noise(huber=1e9))
+    solved = problem.solve(*disturbed(T, X, 2), iterations=40, tolerance=1e-14)
+    residual = problem.residuals(solved.T_camera_world, solved.points)
+    by_camera, by_point = problem.jacobians(solved.T_camera_world, solved.points)
+    gradient = np.zeros((len(X), 3))
+    np.add.at(gradient, sightings.point, np.einsum("sij,si->sj", by_point, residual))
+    assert np.abs(gradient).max() < 1e-3
+    gradient_of_camera = np.zeros((len(T), 6))
+    np.add.at(gradient_of_camera, sightings.camera, np.einsum("sij,si->sj", by_camera, residual))
+    assert np.abs(gradient_of_camera[free]).max() < 1e-2
+    np.testing.assert_array_equal(solved.T_camera_world[~free], T[~free])
+
+
+def test_a_wrong_sighting_moves_little() -> None:
+    T, X, sightings = scene(noise_px=0.2)
+    free = np.arange(len(T)) >= 2
+    pixels = sightings.pixels.copy()
+    pixels[::20] += 30.0
+    wrong = Sightings(sightings.camera, sightings.point, pixels)
+
+    def error(noise: Noise) -> float:
+        solved = BundleAdjustment(wrong, INTRINSICS, free, noise).solve(T, X, 30, 1e-9)
+        return float(np.linalg.norm(solved.T_camera_world[:, :3, 3] - T[:, :3, 3], axis=1).max())
+
+    assert error(Noise(0.2)) < 0.3 * error(Noise(0.2, huber=1e9))
+
+
+@pytest.mark.parametrize("points", [40, 700])
+def test_points_eliminated_in_blocks_give_the_same(points: int) -> None:
+    T, X, sightings = scene(points=points)
+    problem = BundleAdjustment(sightings, INTRINSICS, np.arange(len(T)) >= 2, Noise())
+    solved = problem.solve(*disturbed(T, X, 2), iterations=30, tolerance=1e-12)
+    np.testing.assert_allclose(solved.T_camera_world, T, atol=1e-6)

@@ -1,0 +1,120 @@
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.config import WindowConfig
+from slam.frontend.window.local_map import LocalMap, WindowKeyframe
+from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
+from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses, window_poses
+from slam.se3 import FloatArray, rotation_angle, umeyama
+from slam.sequences.catalogue import open_sequence
+from slam.storage.serialisation import Serialiser
+
+_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
+assert _SPEC is not None
+assert _SPEC.loader is not None
+room = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(room)
+
+CONFIG = WindowConfig(max_corners=200)
+
+
+def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
+    odometry = WindowOdometry(CONFIG, room.INTRINSICS)
+    for k, T in enumerate(T_world_camera):
+        odometry.add(room.frame(k, T, 0 if seeds is None else seeds[k]), room.depth_map(T))
+    return odometry.state()
+
+
+def poses(state: WindowState) -> WindowPoses:
+    return window_poses(state, room.INTRINSICS, CONFIG)
+
+
+def chained(found: WindowPoses) -> dict[int, FloatArray]:
+    T = {found.poses[0].from_index: np.eye(4)}
+    for pose in found.poses:
+        T[pose.to_index] = T[pose.from_index] @ pose.T_from_to
+    return T
+
+
+def test_a_hand_held_camera_is_followed() -> None:
+    truth = room.walk(70)
+    state = tracked(truth)
+    found = poses(state)
+    T = chained(found)
+    assert sorted(T) == list(range(70))
+    assert {pose.source for pose in found.poses} == {WINDOW_SOURCE}
+    assert 4 <= len(state.segments[0].map.keyframes) <= 30
+    estimate = np.stack([T[k] for k in range(70)])
+    similarity = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True)
+    error = np.linalg.norm(similarity.apply_to_poses(estimate)[:, :3, 3] - truth[:, :3, 3], axis=1)
+    extent = np.linalg.norm(truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0), axis=1).mean()
+    assert np.sqrt((error**2).mean()) < 0.04 * extent
+    turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ truth[:, :3, :3])
+    assert np.rad2deg(turned).max() < 0.6
+    # learned depth over depth gives the unit: 2 for the far wall, 4.4 for the near one
+    assert 0.2 < similarity.scale < 0.55
+
+
+@pytest.mark.parametrize("motion", ["standing", "turning"])
+def test_without_parallax_there_is_no_map_and_no_drift(motion: str) -> None:
+    turn = 0.0 if motion == "standing" else 0.004
+    truth = room.walk(25, step_m=0.0, turn=turn)
+    if motion == "standing":
+        truth[:] = np.eye(4)
+    state = tracked(truth)
+    assert not any(segment.started for segment in state.segments)
+    assert poses(state).poses == []
+
+
+def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
+    walked = room.walk(30)
+    state = tracked(np.concatenate([walked, np.repeat(walked[-1:], 25, axis=0)]))
+    keyframes = state.segments[0].map.keyframes
+    assert keyframes[-1].index <= 31
+    T = chained(poses(state))
+    stood = np.linalg.norm(np.stack([T[k][:3, 3] - T[32][:3, 3] for k in range(32, 55)]), axis=1)
+    travelled = np.linalg.norm(T[29][:3, 3])
+    assert stood.max() < 0.005 * travelled
+
+
+def test_another_scene_begins_another_map() -> None:
+    walked = room.walk(80)
+    found = poses(tracked(walked, [0] * 35 + [7] * 45))
+    assert len(set(found.segments.values())) == 2
+    assert max(frame for frame, number in found.segments.items() if number == 0) < 35
+    assert not any(pose.from_index < 35 <= pose.to_index for pose in found.poses)
+
+
+def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
+    truth = room.walk(40)
+    whole = poses(tracked(truth))
+    serialiser = Serialiser(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe)
+    serialiser.write(tmp_path / "state", tracked(truth[:25]))
+    odometry = WindowOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
+    for k in range(25, 40):
+        odometry.add(room.frame(k, truth[k]), room.depth_map(truth[k]))
+    resumed = poses(odometry.state())
+    for one, other in zip(whole.poses, resumed.poses, strict=True):
+        np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
+        np.testing.assert_array_equal(one.sigmas, other.sigmas)
+
+
+@pytest.mark.data
+def test_a_real_hand_held_recording(data_root: Path) -> None:
+    recording = data_root / "handheld_kitchen"
+    sequence = open_sequence(recording / "images")
+    indices = range(0, 240, 3)
+    truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)[indices, :, 3]
+    odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
+    unknown = np.full((sequence.intrinsics.height, sequence.intrinsics.width), np.nan, np.float32)
+    for k in indices:
+        odometry.add(sequence.frame(k), unknown)
+    T = chained(window_poses(odometry.state(), sequence.intrinsics, WindowConfig()))
+    assert sorted(T) == list(indices)
+    estimate = np.stack([T[k] for k in indices])
+    similarity = umeyama(truth, estimate[:, :3, 3], with_scale=True)
+    error = np.linalg.norm(similarity.apply_to_poses(estimate)[:, :3, 3] - truth, axis=1)
+    assert np.sqrt((error**2).mean()) < 0.04

@@ -340,11 +340,8 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     try:
         app()
-    except (ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm: {one_line(str(error))}", err=True)
-        sys.exit(1)
-    except MemoryError:
-        typer.echo(f"erfsfm: {OUT_OF_MEMORY}", err=True)
+    except (ErfsfmError, OSError, MemoryError) as error:
+        typer.echo(f"erfsfm: {OUT_OF_MEMORY if isinstance(error, MemoryError) else one_line(str(error))}", err=True)
         sys.exit(1)
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):

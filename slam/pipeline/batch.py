@@ -30,7 +30,7 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.loops.descriptors import View
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.doubts import warn_of_a_frozen_end, warn_of_another_place, warn_of_segments
+from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
 from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
@@ -162,8 +162,7 @@ class SlamPipeline:
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
-        warn_of_segments(observations)
-        warn_of_a_frozen_end(len(self._sequence), observations, state)
+        warn_of_doubts(len(self._sequence), observations, state)
         measured = self.measure(mode, observations)
         loops = self.close_loops(observations.views, measured)
         graph, T_optimised, location = self._optimise(measured, loops)

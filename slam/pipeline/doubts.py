@@ -11,8 +11,9 @@ from slam.pipeline.observer import ObserverState
 logger = logging.getLogger(__name__)
 
 
-def warn_of_a_frozen_end(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
-    """No new image shows whether the camera stood or the video froze."""
+def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
+    """Warn of segments, whose places are guesses, and of a frozen end: no new image shows whether the camera stood."""
+    _warn_of_segments(seen)
     end = frames - 1
     for first, last in runs(state.seen.repeated):
         if last == end and end not in seen.interpolated:
@@ -25,7 +26,7 @@ def warn_of_a_frozen_end(frames: int, seen: ClosedObservations, state: ObserverS
             )
 
 
-def warn_of_segments(seen: ClosedObservations) -> None:
+def _warn_of_segments(seen: ClosedObservations) -> None:
     """Where a segment begins, its place relative to the ones before is a guess."""
     for segment in seen.segments[1:]:
         logger.warning(

@@ -2,7 +2,7 @@
 
 Errors are over the frames that show the road, each segment of the drive aligned on its own (similarity).
 
-Example: python tools/broken_drives.py --fault black --fault cut
+Example: python tools/broken_drives.py --fault black --fault wiper
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def ate(
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run broken drives and print one row of a table each."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fault", action="append", choices=list(FAULTS))
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--weights", default="sim")

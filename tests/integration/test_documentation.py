@@ -31,6 +31,7 @@ import yaml
 import erfsfm.cli
 import slam.cli
 from erfsfm.networks.presets import build
+from slam.batch.manifest import drives_of
 from slam.frames import Intrinsics
 from slam.sequences.catalogue import open_sequence
 
@@ -76,6 +77,10 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/calibration renders them"),
+    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/live has folders and videos that go on"),
+    (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/batch does"),
+    (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
+    (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/localisation has short ones"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
 if importlib.util.find_spec("onnxruntime") is None:
@@ -281,6 +286,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for image in images:
             video.write(cv2.imread(str(image)))
         video.release()
+        fixes = [f"{k / 10},{49 + k * 1e-5},8.4,114" for k in range(FRAMES)]
+        Path("track.csv").write_text("\n".join(["stamp,latitude,longitude,altitude", *fixes]))
         for file in ("old", "exp_pose_model_best"):
             old_checkpoint(Path(f"{file}.pth.tar"), "posenet")
         old_checkpoint(Path("dispnet_model_best.pth.tar"), "depthnet")
@@ -373,8 +380,12 @@ def test_every_python_block_runs(block: Block, at_work: Path) -> None:
 
 
 @pytest.mark.parametrize("block", blocks("yaml", "yml"))
-def test_every_camera_file_opens(block: Block, tmp_path: Path) -> None:
+def test_every_camera_file_and_manifest_opens(block: Block, tmp_path: Path) -> None:
     camera = yaml.safe_load(block.text)
+    if "drives" in camera:
+        (tmp_path / "drives.yaml").write_text(block.text)
+        assert len(drives_of(tmp_path / "drives.yaml", ["all"], [])) == len(camera["drives"])
+        return
     assert "fx" in camera, f"{block}: this test reads camera.yaml only; add this kind of YAML"
     for k in range(6):
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((camera["height"], camera["width"], 3), 90 + k, np.uint8))

@@ -100,6 +100,8 @@ def test_seed_and_device_are_offered_only_where_they_do_something(call: Call) ->
         offered[verb] = {option for option in ("--seed", "--device") if option in text}
     assert {verb: options for verb, options in offered.items() if options} == {
         "run": {"--seed", "--device"},
+        "batch": {"--seed", "--device"},
+        "live": {"--seed", "--device"},
         "simulate": {"--seed"},
     }
 

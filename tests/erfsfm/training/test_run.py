@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -489,6 +489,17 @@ def test_a_depth_that_stays_constant_stops_the_run(
     assert load_model(tmp_path / "run" / "last").record.step == 3
 
 
+@pytest.fixture
+def as_in_the_foreground() -> Iterator[None]:
+    """What a shell starts in the background ignores SIGINT; nohup ignores SIGHUP."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("as_in_the_foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_signal_ends_a_training_in_order(
     small: Small, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, code: int

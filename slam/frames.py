@@ -43,6 +43,11 @@ class Intrinsics(Pinhole):
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
+    def project(self, points_camera: FloatArray) -> FloatArray:
+        """Pixels ``(..., 2)`` of points ``(..., 3)`` before the camera."""
+        x, y, z = np.moveaxis(points_camera, -1, 0)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
     def pixel_grid(self) -> FloatArray:
         """Every pixel ``(H, W, 2)`` as (u, v)."""
         v, u = np.mgrid[: self.height, : self.width]

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
+from erfsfm.errors import DataError
 from erfsfm.readers.images import read_image
 from erfsfm.readers.video import VIDEO_SUFFIXES
 from slam.errors import SequenceError, sequence_errors
@@ -75,7 +76,7 @@ class FolderSource:
         while True:
             try:
                 return read_image(self._folder / name)
-            except Exception:
+            except DataError:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(_POLL_S)

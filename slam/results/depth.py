@@ -9,7 +9,7 @@ import numpy as np
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
 from slam.pipeline.keyframe_depth import KeyframeDepth
-from slam.results.map_error import HasTrueDepth
+from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply
 from slam.sequences.excerpt import Excerpt
@@ -78,10 +78,9 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
 def projected(points_lidar: FloatArray, T_camera_lidar: FloatArray, intrinsics: Intrinsics) -> DepthMap:
     """z-depth ``(H, W)`` of LiDAR points ``(P, 3)`` in the image, the nearest at each pixel, 0 where there is none."""
     points = apply(T_camera_lidar, np.asarray(points_lidar, np.float64))
-    x, y, z = points[points[:, 2] > 0.1].T
-    u = np.rint(intrinsics.fx * x / z + intrinsics.cx).astype(int)
-    v = np.rint(intrinsics.fy * y / z + intrinsics.cy).astype(int)
+    points = points[points[:, 2] > NEAREST_M]
+    u, v = np.rint(intrinsics.project(points)).astype(int).T
     inside = (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
     depth = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)
-    np.minimum.at(depth, (v[inside], u[inside]), z[inside].astype(np.float32))
+    np.minimum.at(depth, (v[inside], u[inside]), points[inside, 2].astype(np.float32))
     return np.where(np.isfinite(depth), depth, np.float32(0))

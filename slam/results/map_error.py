@@ -23,6 +23,7 @@ logger = logging.getLogger(__name__)
 
 _ERRORS = ("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall")
 _NAMES = (*_ERRORS, "in_field", "by_distance")
+NEAREST_M = 0.1  # z-depth of a LiDAR point that can be in the image
 _DEPTH_RANGE_M = 50.0
 _MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
 
@@ -98,10 +99,9 @@ class LidarTruth:
         self._limits[frame] = _elevations(points, ranges)
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
         camera = sequence.intrinsics
-        depth = np.where(points[:, 2] > 0.1, points[:, 2], np.inf)
-        u = camera.fx * points[:, 0] / depth + camera.cx
-        v = camera.fy * points[:, 1] / depth + camera.cy
-        inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5) & np.isfinite(depth)
+        inside = points[:, 2] > NEAREST_M
+        pixels = camera.project(points[inside])
+        inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
         return Surface(apply(sequence.reference[frame], points), inside)
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:

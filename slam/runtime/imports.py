@@ -26,123 +26,78 @@ def import_open3d() -> ModuleType:
 
 
 def import_rerun() -> ModuleType:
-    """Import the rerun SDK, an optional extra.
-
-    Raises:
-        SlamError: if it is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("rerun")
-    except (ImportError, OSError) as error:
-        raise SlamError(f"--rerun needs rerun ({error}): pip install 'erfsfm-slam[rerun]', or rerun-sdk") from error
+    """Import the rerun SDK, an optional extra; `SlamError` if it cannot be loaded."""
+    (rerun,) = _import_extra("--rerun needs rerun", "'erfsfm-slam[rerun]', or rerun-sdk", "rerun")
+    return rerun
 
 
-def import_onnx() -> tuple[ModuleType, ModuleType]:
-    """Import onnx and ONNX Runtime, an optional extra.
-
-    Raises:
-        SlamError: if one is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("onnx"), importlib.import_module("onnxruntime")
-    except (ImportError, OSError) as error:
-        raise SlamError(
-            f"depth.source=onnx needs onnx and onnxruntime ({error}): pip install 'erfsfm-slam[onnx]'"
-        ) from error
+def import_onnx() -> tuple[ModuleType, ...]:
+    """Import onnx and ONNX Runtime, an optional extra; `SlamError` if one cannot be loaded."""
+    return _import_extra("depth.source=onnx needs onnx and onnxruntime", "'erfsfm-slam[onnx]'", "onnx", "onnxruntime")
 
 
 def import_laspy() -> ModuleType:
-    """Import laspy with its LAZ codec, an optional extra.
-
-    Raises:
-        SlamError: if one is not installed or cannot be loaded.
-    """
-    try:
-        importlib.import_module("lazrs")
-        return importlib.import_module("laspy")
-    except (ImportError, OSError) as error:
-        raise SlamError(f"LAS and LAZ need laspy and lazrs ({error}): pip install 'erfsfm-slam[las]'") from error
+    """Import laspy with its LAZ codec, an optional extra; `SlamError` if one cannot be loaded."""
+    _, laspy = _import_extra("LAS and LAZ need laspy and lazrs", "'erfsfm-slam[las]'", "lazrs", "laspy")
+    return laspy
 
 
 def import_rasterio() -> ModuleType:
-    """Import rasterio, an optional extra.
-
-    Raises:
-        SlamError: if it is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("rasterio")
-    except (ImportError, OSError) as error:
-        raise SlamError(f"GeoTIFF needs rasterio ({error}): pip install 'erfsfm-slam[geotiff]'") from error
+    """Import rasterio, an optional extra; `SlamError` if it cannot be loaded."""
+    (rasterio,) = _import_extra("GeoTIFF needs rasterio", "'erfsfm-slam[geotiff]'", "rasterio")
+    return rasterio
 
 
-def import_rosbags() -> tuple[ModuleType, ModuleType, ModuleType]:
+def import_rosbags() -> tuple[ModuleType, ...]:
     """Import the readers of ROS 1 and ROS 2 bags and the message types of rosbags, an optional extra.
 
     Raises:
         SequenceError: if it is not installed or cannot be loaded.
     """
-    try:
-        rosbag1, rosbag2, typesys = (
-            importlib.import_module(f"rosbags.{name}") for name in ("rosbag1", "rosbag2", "typesys")
-        )
-    except (ImportError, OSError) as error:
-        raise SequenceError(f"bags need rosbags ({error}): pip install 'erfsfm-slam[ros]'") from error
-    return rosbag1, rosbag2, typesys
+    names = ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys")
+    return _import_extra("bags need rosbags", "'erfsfm-slam[ros]'", *names, error_type=SequenceError)
 
 
 def import_feather() -> ModuleType:
-    """Import pyarrow's reader of feather files, an optional extra.
-
-    Raises:
-        SequenceError: if it is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("pyarrow.feather")
-    except (ImportError, OSError) as error:
-        raise SequenceError(f"Argoverse 2 needs pyarrow ({error}): pip install 'erfsfm-slam[argoverse]'") from error
+    """Import pyarrow's reader of feather files, an optional extra; `SequenceError` if it cannot be loaded."""
+    (feather,) = _import_extra(
+        "Argoverse 2 needs pyarrow", "'erfsfm-slam[argoverse]'", "pyarrow.feather", error_type=SequenceError
+    )
+    return feather
 
 
 def import_zmq() -> ModuleType:
-    """Import pyzmq, an optional extra.
-
-    Raises:
-        SlamError: if it is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("zmq")
-    except (ImportError, OSError) as error:
-        raise SlamError(f"--publish needs pyzmq ({error}): pip install 'erfsfm-slam[live]'") from error
+    """Import pyzmq, an optional extra; `SlamError` if it cannot be loaded."""
+    (zmq,) = _import_extra("--publish needs pyzmq", "'erfsfm-slam[live]'", "zmq")
+    return zmq
 
 
-def import_dask() -> tuple[ModuleType, ModuleType]:
-    """Import cloudpickle and Dask's distributed scheduler, an optional extra.
-
-    Raises:
-        SlamError: if one is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("cloudpickle"), importlib.import_module("distributed")
-    except (ImportError, OSError) as error:
-        raise SlamError(
-            f"several workers and schedulers need Dask ({error}): pip install 'erfsfm-slam[cluster]'"
-        ) from error
+def import_dask() -> tuple[ModuleType, ...]:
+    """Import cloudpickle and Dask's distributed scheduler, an optional extra; `SlamError` if one cannot be loaded."""
+    return _import_extra(
+        "several workers and schedulers need Dask", "'erfsfm-slam[cluster]'", "cloudpickle", "distributed"
+    )
 
 
-def import_remotezip() -> tuple[ModuleType, ModuleType, ModuleType]:
+def import_remotezip() -> tuple[ModuleType, ...]:
     """Import remotezip, requests and the exceptions of urllib3 below them, an optional extra.
 
     Raises:
         DownloadError: if one is not installed or cannot be loaded.
     """
+    names = ("remotezip", "requests", "urllib3.exceptions")
+    needs = "download needs remotezip and requests"
+    return _import_extra(needs, "'erfsfm-slam[download]'", *names, error_type=DownloadError)
+
+
+def _import_extra(
+    needs: str, install: str, *names: str, error_type: type[Exception] = SlamError
+) -> tuple[ModuleType, ...]:
+    """Import modules of an optional extra; if one cannot be loaded, say what needs them and what to install."""
     try:
-        names = ("remotezip", "requests", "urllib3.exceptions")
-        remotezip, requests, exceptions = (importlib.import_module(name) for name in names)
+        return tuple(importlib.import_module(name) for name in names)
     except (ImportError, OSError) as error:
-        raise DownloadError(
-            f"download needs remotezip and requests ({error}): pip install 'erfsfm-slam[download]'"
-        ) from error
-    return remotezip, requests, exceptions
+        raise error_type(f"{needs} ({error}): pip install {install}") from error
 
 
 def import_open3d_beside() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
 
 from slam.config import SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics
-from slam.frontend.window.odometry import WindowOdometry, WindowState
+from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
 from slam.pipeline.observations import Observations
 
@@ -47,12 +48,16 @@ class KeyframeTracking:
         if self._odometry is not None and self._config.use == "auto" and is_vehicle(seen, self._config):
             self._odometry = None
 
-    def poses(self, seen: Observations) -> WindowPoses:
-        """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""
+    def maps(self, seen: Observations) -> tuple[Segment, ...]:
+        """All maps so far; none of a vehicle, nor before that is decided."""
         undecided = self._config.use == "auto" and is_vehicle(seen, self._config) is None
         if self._odometry is None or undecided:
-            return WindowPoses()
-        return window_poses(self._odometry.state(), self._intrinsics, self._config, self._seed)
+            return ()
+        return tuple(segment for segment in self._odometry.state().segments if segment.started)
+
+    def poses(self, maps: Sequence[Segment]) -> WindowPoses:
+        """Relative poses of all frames of some maps."""
+        return window_poses(maps, self._intrinsics, self._config, self._seed)
 
 
 def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:

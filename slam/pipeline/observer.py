@@ -217,7 +217,8 @@ class Observer:
         steps, count = StepTable.of(seen.motions), len(seen.roads)
         cuts = find_cuts(seen.failures, list(steps.motions), {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
-        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(seen))
+        maps = self._keyframes.maps(seen)
+        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(maps), maps)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

@@ -94,4 +94,6 @@ def _depth(least: NDArray[np.float16], most: NDArray[np.float16]) -> NDArray[np.
     """Depth ``(H, W)`` in camera heights from the bounds of its inverse; 0 where they are too far apart."""
     low, high = least.astype(np.float32), most.astype(np.float32)
     narrow = (low > 0) & (high < LARGEST_RATIO * low)
-    return np.where(narrow, 1 / np.sqrt(np.where(narrow, low * high, 1)), 0).astype(np.float32)
+    depth = np.zeros_like(low)
+    depth[narrow] = 1 / np.sqrt(low[narrow] * high[narrow])
+    return depth

@@ -51,9 +51,7 @@ def train(
 ) -> Path:
     """Train, validate, keep the best.
 
-    With several devices, Lightning starts this program again for each further one; all processes but the first of the
-    first node exit here. On every node the program is started once, with the environment that Lightning, torchrun or
-    SLURM reads; they share the output folder.
+    Of several processes (see `rank_of`) all but the first exit here; those of other nodes share the output folder.
 
     Args:
         config: the experiment.

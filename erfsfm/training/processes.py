@@ -1,7 +1,7 @@
 """Which of all processes of a training this one is.
 
-With several devices Lightning starts the program again for each further one of its node. On every node it is started once,
-with the environment that Lightning, torchrun or SLURM reads.
+With several devices Lightning starts the program again for each further one of its node. On every node it is started
+once, with the environment that Lightning, torchrun or SLURM reads.
 """
 
 from __future__ import annotations

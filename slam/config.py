@@ -194,7 +194,7 @@ class MappingConfig(Section):
         default=245,
         ge=1,
         le=256,
-        description="level of all colours from which on a pixel above the horizon is sky",
+        description="level of all colours from which on a pixel above the horizon is sky, if the upper border is too",
     )
     sky_blueness: int = Field(
         default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"

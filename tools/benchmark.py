@@ -103,7 +103,8 @@ def _command(options: argparse.Namespace) -> str:
     words = ["python", "tools/benchmark.py", options.mode]
     words += ["--kitti", "KITTI"] if options.kitti else []
     drives = getattr(options, "drives", ())
-    words += ["--drives", *(f"KITTI_RAW/{drive.name}" for drive in drives)] if drives else []
+    names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
+    words += ["--drives", *names] if names else []
     for name in (
         "weights",
         "routes",

@@ -24,11 +24,12 @@ def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
 
 
 class KeyframeTracking:
-    """Tracks keyframes beside the steps, until those are of a vehicle."""
+    """Tracks keyframes: beside the steps until those say whether they are a vehicle's, then in place of one of both."""
 
     def __init__(self, config: WindowConfig, intrinsics: Intrinsics, seed: int, state: WindowState | None) -> None:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
         self._config, self._intrinsics, self._seed = config, intrinsics, seed
+        self._is_carried = False
         self._odometry: WindowOdometry | None = None
         if config.use != "never" and state is not None:
             self._odometry = WindowOdometry(config, intrinsics, seed, state)
@@ -37,20 +38,33 @@ class KeyframeTracking:
         """The state to resume from."""
         return None if self._odometry is None else self._odometry.state()
 
-    def add(self, frame: Frame, depth: DepthMap) -> None:
-        """The next usable frame with its learned depth ``(H, W)``."""
+    def follow(self, frame: Frame) -> None:
+        """Track the next usable frame."""
         if self._odometry is not None:
-            self._odometry.add(frame, depth)
+            self._odometry.follow(frame)
+
+    def learn(self, frame: Frame, depth: DepthMap) -> None:
+        """Learned depth ``(H, W)`` of that frame."""
+        if self._odometry is not None:
+            self._odometry.learn(frame, depth)
 
     def decide(self, seen: Observations) -> None:
         """End the tracking where the first steps are those of a vehicle."""
-        if self._odometry is not None and self._config.use == "auto" and is_vehicle(seen, self._config):
+        if self._odometry is None or self._is_carried:
+            return
+        vehicle = False if self._config.use == "always" else is_vehicle(seen, self._config)
+        self._is_carried = vehicle is False
+        if vehicle:
             self._odometry = None
+
+    def measures(self, first: int, last: int) -> bool:
+        """Whether keyframes alone measure the motion between the last two frames; not before that is decided."""
+        return self._odometry is not None and self._is_carried and self._odometry.locates(first, last)
 
     def poses(self, seen: Observations) -> WindowPoses:
         """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""
-        undecided = self._config.use == "auto" and is_vehicle(seen, self._config) is None
-        if self._odometry is None or undecided:
+        self.decide(seen)
+        if self._odometry is None or not self._is_carried:
             return WindowPoses()
         return window_poses(self._odometry.state(), self._intrinsics, self._config, self._seed)
 

@@ -214,10 +214,10 @@ class Observer:
         """
         self.flush()
         seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
-        steps, count = StepTable.of(seen.motions), len(seen.roads)
-        cuts = find_cuts(seen.failures, list(steps.motions), {*seen.unusable, *seen.repeated})
+        steps, count, window = StepTable.of(seen.motions), len(seen.roads), self._keyframes.poses(seen)
+        cuts = find_cuts(seen.failures, {*steps.motions, *window.steps}, {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
-        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(seen))
+        return ClosedObservations.of(seen, gaps, cuts, window)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -260,8 +260,10 @@ class Observer:
 
     def _process(self, pending: PendingFrame) -> None:
         frame = pending.frame
+        with self._stopwatch.stage("keyframes"):
+            self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            steps = self._measure_steps(frame)
+            steps = [] if self._by_keyframes(frame) else self._measure_steps(frame)
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
         self._keyframes.decide(self._seen)
@@ -276,14 +278,19 @@ class Observer:
         with self._stopwatch.stage("road"):
             road = self._plane.fit(depth)
         self._seen.roads.append(road)
-        with self._stopwatch.stage("keyframes"):
-            self._keyframes.add(frame, depth)
+        self._keyframes.learn(frame, depth)
         height = road.height_unscaled if isinstance(road, GroundPlane) else None
         self._recent = (*self._recent, RecentFrame(frame, depth, height))[-self._frames_kept :]
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
             with self._stopwatch.stage("loops"):
                 self._seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
+
+    def _by_keyframes(self, current: Frame) -> bool:
+        """Whether keyframes measure the motion from the frame before, so that no step is needed."""
+        before = current.index - 1
+        doubtful = {*self._seen.repeated[-1:], *list(self._seen.unusable)[-1:]}
+        return doubtful.isdisjoint((before, current.index)) and self._keyframes.measures(before, current.index)
 
     def _measure_steps(self, current: Frame) -> list[tuple[Frame, Motion]]:
         """Measure steps from earlier frames; returns those with triangulated points, with their first frames."""

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from slam.config import WindowConfig
-from slam.frames import Intrinsics, RelativePose
+from slam.frames import Ends, Intrinsics, RelativePose
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.frontend.window.camera_pose import resect
 from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
@@ -32,6 +32,11 @@ class WindowPoses:
         """Whether both frames of a measurement have poses in one map."""
         first, last = (self.segments.get(frame) for frame in pose.ends)
         return first is not None and first == last
+
+    @property
+    def steps(self) -> set[Ends]:
+        """Neighbouring frames that both have poses in one map."""
+        return {(k, k + 1) for k, number in self.segments.items() if self.segments.get(k + 1) == number}
 
     def frames_of(self, segment: int) -> list[int]:
         """The frames of a segment."""

@@ -38,6 +38,7 @@ from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.requirements import require_possible
+from slam.pipeline.solution import Measurements, Solution
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -51,17 +52,6 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 EXAMPLES = 5
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """All relative poses with their noise, and the trajectories chained from them ``(N, 4, 4)``."""
-
-    T_network: FloatArray
-    lidar: LidarPath | None
-    scale: Scale
-    factors: list[RelativePose]
-    T_odometry: FloatArray
 
 
 @dataclass(frozen=True)
@@ -163,26 +153,32 @@ class SlamPipeline:
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
         warn_of_doubts(len(self._sequence), observations, state)
-        measured = self.measure(mode, observations)
-        loops = self.close_loops(observations.views, measured)
-        graph, T_optimised, location = self._optimise(measured, loops)
+        solved = self.solve(mode, observations)
+        measured = solved.measured
         return SlamResult(
             network=self._trajectory(measured.T_network),
             odometry=self._trajectory(measured.T_odometry),
-            optimised=self._trajectory(T_optimised),
+            optimised=self._trajectory(solved.T_world_camera),
             lidar=measured.lidar,
             reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
             state=state,
             observations=observations,
             scale=measured.scale,
             factors=measured.factors,
-            loops=loops.without(graph.dropped),
-            graph=graph,
+            loops=solved.loops,
+            graph=solved.graph,
             map=None,
             stopwatch=self._watch,
             first=self.first,
-            location=location,
+            location=solved.location,
         )
+
+    def solve(self, mode: ScaleMode, observations: ClosedObservations) -> Solution:
+        """Relative poses, loops and the trajectory that fits both; ``SlamError`` where the graph has no solution."""
+        measured = self.measure(mode, observations)
+        loops = self.close_loops(observations.views, measured)
+        graph, T_optimised, location = self._optimise(measured, loops)
+        return Solution(measured, loops.without(graph.dropped), graph, T_optimised, location)
 
     def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
         """The front end: rotations, scale and lengths, then all factors and the odometry chained from them."""

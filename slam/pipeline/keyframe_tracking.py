@@ -8,9 +8,14 @@ import numpy as np
 
 from slam.config import SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics
+from slam.frontend.window.local_map import LocalMap
 from slam.frontend.window.odometry import WindowOdometry, WindowState
-from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.pipeline.observations import Observations
+from slam.se3 import FloatArray, invert
+
+# looked back for the frame before, and keyframes that give the unit
+_FRAMES, _KEYFRAMES = 40, 20
 
 
 def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
@@ -57,9 +62,28 @@ class KeyframeTracking:
         if vehicle:
             self._odometry = None
 
-    def measures(self, first: int, last: int) -> bool:
-        """Whether keyframes alone measure the motion between the last two frames; not before that is decided."""
-        return self._odometry is not None and self._is_carried and self._odometry.locates(first, last)
+    def measures(self, seen: Observations, index: int) -> bool:
+        """Whether keyframes alone measure the motion to the last frame: not before the decision, nor beside a gap or a
+        repeated image."""
+        doubtful = {*seen.repeated[-1:], *list(seen.unusable)[-1:]}
+        if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
+            return False
+        return self._odometry.locates(index - 1, index)
+
+    def step(self, index: int) -> tuple[int, FloatArray] | None:
+        """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
+        state = self.state()
+        if state is None or not self._is_carried or not state.segments:
+            return None
+        segment = state.segments[-1]
+        placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
+        located = [(place, T_map) for place, T_map in placed if T_map is not None]
+        if len(located) < 2 or located[-1][0] != index:
+            return None
+        (before, T_before_map), (_, T_frame_map) = located[-2:]
+        T_before_frame = T_before_map @ invert(T_frame_map)
+        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
+        return before, T_before_frame
 
     def poses(self, seen: Observations) -> WindowPoses:
         """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""

@@ -201,10 +201,9 @@ class Observer:
         """What was measured so far."""
         return self._seen
 
-    @property
-    def has_snippets(self) -> bool:
-        """Whether the pose network has measured anything yet."""
-        return bool(self._seen.snippets)
+    def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
+        """As `KeyframeTracking.step`, of a finished frame."""
+        return self._keyframes.step(index)
 
     def closed(self) -> ClosedObservations:
         """Everything measured so far with its gaps interpolated; more frames may follow.
@@ -263,7 +262,7 @@ class Observer:
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            steps = [] if self._by_keyframes(frame) else self._measure_steps(frame)
+            steps = [] if self._keyframes.measures(self._seen, frame.index) else self._measure_steps(frame)
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
         self._keyframes.decide(self._seen)
@@ -285,12 +284,6 @@ class Observer:
             with self._stopwatch.stage("loops"):
                 self._seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
-
-    def _by_keyframes(self, current: Frame) -> bool:
-        """Whether keyframes measure the motion from the frame before, so that no step is needed."""
-        before = current.index - 1
-        doubtful = {*self._seen.repeated[-1:], *list(self._seen.unusable)[-1:]}
-        return doubtful.isdisjoint((before, current.index)) and self._keyframes.measures(before, current.index)
 
     def _measure_steps(self, current: Frame) -> list[tuple[Frame, Motion]]:
         """Measure steps from earlier frames; returns those with triangulated points, with their first frames."""

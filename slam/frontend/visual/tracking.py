@@ -21,8 +21,6 @@ from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
-# backwards, a corner is searched from its known place
-_BACKWARD_LEVELS = 1
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
 
@@ -179,7 +177,7 @@ class CornerTracker:
             tried, forward = tried[found], forward[found]
             if len(tried) == 0:
                 continue
-            backward, found_back = _lucas_kanade(target.image, first, forward, target, points[tried])
+            backward, found_back = _lucas_kanade(target.image, first, forward, target)
             error = np.abs(backward - points[tried]).max(axis=1)
             returned = found_back & (error < self._config.forward_backward_px)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
@@ -206,19 +204,16 @@ def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
     return _Target(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
-def _lucas_kanade(
-    start: Grey, end: Grey, pixels: Pixels, target: _Target, guesses: Pixels | None = None
-) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Tracked pixels ``(M, 2)``, near their guesses where there are any, and which of them were found."""
+def _lucas_kanade(start: Grey, end: Grey, pixels: Pixels, target: _Target) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Tracked pixels ``(M, 2)``, and which of them were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         start,
         end,
         pixels.reshape(-1, 1, 2),
-        None if guesses is None else guesses.reshape(-1, 1, 2).copy(),
+        None,
         winSize=(target.side, target.side),
-        maxLevel=target.levels if guesses is None else _BACKWARD_LEVELS,
+        maxLevel=target.levels,
         criteria=_CRITERIA,
-        flags=0 if guesses is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     return moved.reshape(-1, 2), status.ravel().astype(bool)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shlex
 import sys
 from dataclasses import asdict
@@ -13,10 +12,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm import __version__
+from erfsfm import __version__, command_line
 from erfsfm.cli_pack import pack
-from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
-from erfsfm.signals import Terminated
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -27,10 +24,8 @@ app = typer.Typer(
 evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
 app.add_typer(evaluate_app, name="evaluate")
 
-_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
-
 Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(help="seed of the random numbers")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
 UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
 Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
@@ -99,11 +94,18 @@ def predict(
     from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
     from erfsfm.readers.images import list_images
 
+    if output.is_file():
+        raise DataError(f"{output} is a file: give a folder as --output")
     files = list_images(images) if images.is_dir() else [images]
     if not files:
         raise DataError(f"{images} holds no png or jpg to predict from")
     if output.resolve() in {file.parent.resolve() for file in files}:
         raise DataError(f"{output} holds the images themselves: choose another --output, or they would be overwritten")
+    for file in files:
+        if (output / f"{file.stem}.png").is_file() and not (output / f"{file.stem}.npy").is_file():
+            raise DataError(
+                f"{output / file.stem}.png is no earlier prediction and would be replaced: choose another --output"
+            )
     predictor = DepthPosePredictor.from_weights(weights, device)
     output.mkdir(parents=True, exist_ok=True)
     for file in files:
@@ -336,15 +338,5 @@ def _print_result(rows: list[dict[str, Any]], as_json: bool) -> None:
 
 def main() -> None:
     """Run the command line: known errors become one line and exit code 1."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-    try:
-        app()
-    except (ErfsfmError, OSError, MemoryError) as error:
-        typer.echo(f"erfsfm: {OUT_OF_MEMORY if isinstance(error, MemoryError) else one_line(str(error))}", err=True)
-        sys.exit(1)
-    except SystemExit as end:
-        if end.code == _INTERRUPTED or isinstance(end, Terminated):
-            why = str(end) if isinstance(end, Terminated) else "interrupted"
-            typer.echo(f"erfsfm: {why}; what was written stays", err=True)
-        raise
+    command_line.run(app, "erfsfm")

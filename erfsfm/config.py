@@ -31,8 +31,8 @@ class NetworkConfig(Section):
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
     masks: bool = Field(default=False, description="explainability masks from a second head of the pose network")
-    height: int = Field(default=128, ge=32, description="height of the network input, pixels")
-    width: int = Field(default=416, ge=32, description="width of the network input, pixels")
+    height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
+    width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
 
 
 class DataConfig(Section):
@@ -77,7 +77,7 @@ class DataConfig(Section):
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
     )
     cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images and labels, MB per process")
-    workers: int = Field(default=1, ge=0, description="data loader processes; 0: in the training process")
+    workers: int = Field(default=1, ge=0, le=128, description="data loader processes; 0: in the training process")
 
 
 class LossConfig(Section):
@@ -168,7 +168,7 @@ class TrainingConfig(Section):
         description="longest time of the loop, earlier parts of a resumed run included; the schedule follows steps or "
         "time, whichever is farther; 0: no limit",
     )
-    batch: int = Field(default=4, ge=1, description="snippets per step and device")
+    batch: int = Field(default=4, ge=1, le=1024, description="snippets per step and device")
     devices: int = Field(
         default=1, ge=1, description="GPUs, or processes on a CPU; batch normalisation is synchronised on GPUs alone"
     )
@@ -204,7 +204,7 @@ class TrainingConfig(Section):
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = Field(
         default="32-true", description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, with a warning"
     )
-    seed: int = Field(default=0, ge=0, description="of initial weights, draws of snippets and augmentation")
+    seed: int = Field(default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation")
 
 
 class ExperimentConfig(Section):

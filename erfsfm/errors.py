@@ -2,6 +2,7 @@
 
 _LONGEST = 700
 _LAST = 200
+_OF_WORKER = "Original Traceback (most recent call last)"
 
 
 OUT_OF_MEMORY = (
@@ -10,7 +11,12 @@ OUT_OF_MEMORY = (
 
 
 def one_line(text: str) -> str:
-    """A message without line breaks; the middle of a very long one is left out."""
+    """A message without line breaks; the middle of a very long one is left out.
+
+    Of an error of a data loader's process, to which PyTorch adds its traceback, only the message stays.
+    """
+    if _OF_WORKER in text:
+        text = text.strip().splitlines()[-1].partition(": ")[2]
     line = " ".join(text.splitlines())
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - _LAST]} ... {line[-_LAST:]}"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -12,9 +11,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm import __version__
-from erfsfm.errors import OUT_OF_MEMORY, ErfsfmError, one_line
-from erfsfm.signals import Terminated
+from erfsfm import __version__, command_line
 from slam.batch.cli import verbs as batch_verbs
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs
@@ -32,8 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
 )
-
-_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
@@ -280,21 +275,7 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
 
 def main() -> None:
     """Run the command line: a known error becomes one line and exit code 1."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     terminal = logging.StreamHandler(sys.stderr)
     terminal.setLevel(logging.WARNING)  # run.log has the rest
     logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
-    try:
-        app(prog_name="erfsfm-slam")
-    except (SlamError, ErfsfmError, OSError) as error:
-        typer.echo(f"erfsfm-slam: {one_line(str(error))}", err=True)
-        sys.exit(1)
-    except MemoryError:
-        typer.echo(f"erfsfm-slam: {OUT_OF_MEMORY}", err=True)
-        sys.exit(1)
-    except SystemExit as end:
-        if end.code == _INTERRUPTED:
-            typer.echo("erfsfm-slam: interrupted; what was written stays", err=True)
-        elif isinstance(end, Terminated):
-            typer.echo(f"erfsfm-slam: {end}; what was written stays", err=True)
-        raise
+    command_line.run(app, "erfsfm-slam")

@@ -17,6 +17,7 @@ from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
+from erfsfm.files import read_text
 from erfsfm.readers.images import read_image, resize_image
 
 _STILL_M = 0.1
@@ -42,7 +43,11 @@ def read_split(split: str, root: Path) -> list[RawFrame]:
     base = _root_of_dates(root)
     path = Path(split)
     if path.is_file() and path.suffix not in (".yaml", ".yml"):
-        frames = [RawFrame.parse(line, base) for line in path.read_text().splitlines() if line.strip()]
+        try:
+            lines = read_text(path).splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"split {path} cannot be read: it is no text of a frame a line ({error})") from error
+        frames = [RawFrame.parse(line, base) for line in lines if line.strip()]
     else:
         frames = [_raw_frame(recording, index, base) for recording, index in read_split_file(split).test_frames()]
     if not frames:

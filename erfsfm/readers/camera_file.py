@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -12,6 +14,10 @@ from erfsfm.readers.pinhole import Pinhole, impossible, require_plausible
 from erfsfm.yaml_file import read_yaml
 
 CAMERA_FILE = "camera.yaml"
+logger = logging.getLogger(__name__)
+
+_HIGHEST_M = 1000.0
+_USUAL_HEIGHTS_M = (0.1, 10.0)
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
 
@@ -39,8 +45,9 @@ class CameraFile(BaseModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if not isinstance(self.camera_height_m, str | None) and not self.camera_height_m > 0:
-            raise ValueError(f"camera_height_m: must be greater than 0 or 'unknown', is {self.camera_height_m}")
+        height_m = self.camera_height_m
+        if not isinstance(height_m, str | None) and not 0 < height_m <= _HIGHEST_M:
+            raise ValueError(f"camera_height_m: must be greater than 0, to {_HIGHEST_M:g}, or 'unknown', is {height_m}")
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)
@@ -50,6 +57,8 @@ class CameraFile(BaseModel):
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
             raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
+        if self.model == "fov" and not 0 < self.distortion[0] < math.pi:
+            raise ValueError(f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}")
         return self
 
     @property
@@ -96,6 +105,11 @@ def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
     except ValidationError as error:
         raise DataError(f"{where}: {_complaints(error)}") from error
     require_plausible(camera.pinhole, where)
+    height_m = camera.height_or(None)
+    if height_m is not None and not _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1]:
+        logger.warning(
+            "%s: camera_height_m is %g: check that it is the height above the road in metres", where, height_m
+        )
     return camera
 
 

@@ -113,6 +113,8 @@ def _is_image(path: Path) -> bool:
 
 
 def _file_bytes(path: Path) -> bytes:
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise DataError(f"cannot read image {path}: it is a pipe or a device")
     try:
         return read_bytes(path, MAX_IMAGE_BYTES)
     except OSError as error:

@@ -35,7 +35,7 @@ class CalibrationFile:
         """Read a file.
 
         Raises:
-            DataError: it is missing or cannot be read.
+            DataError: it is missing or cannot be read, or two rows of one name differ.
         """
         self.path = path
         if not path.is_file():
@@ -45,8 +45,11 @@ class CalibrationFile:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DataError(f"cannot read calibration {path}: {error}") from error
-        rows = (line.partition(":") for line in text.splitlines() if line.strip())
+        rows = [line.partition(":") for line in text.splitlines() if line.strip()]
         self._rows = {key.strip(): value.split() for key, _, value in rows}
+        doubled = [key.strip() for key, _, value in rows if self._rows[key.strip()] != value.split()]
+        if doubled:
+            raise DataError(f"{path} has two rows {doubled[0]} with other numbers: keep the right one")
 
     def __contains__(self, key: str) -> bool:
         """Whether the file has a row of this name."""
@@ -79,6 +82,8 @@ class CalibrationFile:
     def T_camera_cam0(self, key: str) -> FloatArray:
         """Rectified camera 0 to the rectified camera of projection matrix ``key``, ``(4, 4)``, metres."""
         P = self.matrix(key, (3, 4))
+        if not abs(np.linalg.det(P[:, :3])) > 0:
+            raise DataError(f"{self.path} row {key} is no K [I | t] with positive focal lengths; restore the file")
         t_camera_cam0: FloatArray = np.linalg.inv(P[:, :3]) @ P[:, 3]
         return _rigid(np.eye(3), t_camera_cam0)
 

@@ -63,7 +63,7 @@ class OdometryRoot:
             return None
         try:
             return int(json.loads(path.read_text(encoding="utf-8"))["seed"])
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             raise DataError(f"{path} must hold the simulation's seed: {error!r}; simulate again") from error
 
     def recording_name(self, sequence: str) -> str:

@@ -15,8 +15,10 @@ VELODYNE_COLUMNS = 4
 def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.float64]:
     """The points of a file of float32 ``(P, 3)``, metres, in the LiDAR frame; x, y, z are the first of ``columns``.
 
+    Points that are not finite are left out.
+
     Raises:
-        DataError: it cannot be read, or is cut off.
+        DataError: it cannot be read, is cut off, or has no finite point.
     """
     try:
         values = np.fromfile(path, dtype=np.float32)
@@ -24,4 +26,8 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
         raise DataError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
     if len(values) == 0 or len(values) % columns:
         raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {values.nbytes} bytes")
-    return values.reshape(-1, columns)[:, :3].astype(np.float64)
+    points = values.reshape(-1, columns)[:, :3].astype(np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise DataError(f"{path} has no point with finite coordinates; restore the scan or remove it")
+    return points[finite]

@@ -54,7 +54,7 @@ def batch(
     planned = drives_of(drives, sequence or ["all"], options)
     each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
     output.mkdir(parents=True, exist_ok=True)
-    with dask_workers(workers, scheduler) as spread, progress_bar() as progress:
+    with dask_workers(min(workers, len(planned)), scheduler) as spread, progress_bar() as progress:
         outcomes = run_drives(planned, output, Limits(each, memory), spread, progress)
     write_summary(output, outcomes)
     _print(summary_table(outcomes))
@@ -63,7 +63,9 @@ def batch(
     typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / PAGE}, {output / CSV}")
     if failed:
         _print(failure_table(outcomes))
-        raise RunError(f"{failed} of {len(outcomes)} drives failed; the others are whole")
+        first = next(outcome for outcome in outcomes if outcome.status == "failed")
+        rest = "; the others are whole" if failed < len(outcomes) else ""
+        raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")
 
 
 def _print(table: Table) -> None:

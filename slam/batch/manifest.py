@@ -64,7 +64,7 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     try:
         rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _yaml_rows(path)
     except (ErfsfmError, OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SequenceError(f"the manifest cannot be read: {error}") from error
+        raise SequenceError(f"the manifest {path} cannot be read: {error}") from error
     if not rows:
         raise SequenceError(f"{path} names no drive: give a list of {', '.join(_KEYS)}")
     return _named(

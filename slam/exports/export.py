@@ -16,6 +16,7 @@ from slam.exports.occupancy import occupancy_grid
 from slam.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
 from slam.exports.raster import height_raster, write_raster
 from slam.exports.surface import prepared
+from slam.exports.target import check_target
 from slam.formats.colmap import write_colmap
 from slam.formats.g2o import check_g2o
 from slam.formats.gltf import write_gltf
@@ -36,7 +37,6 @@ _WRITERS: dict[str, dict[str, Writer]] = {
     "mesh": {".ply": write_ply, ".obj": write_obj, ".glb": write_gltf, ".gltf": write_gltf},
     "cloud": {".ply": write_ply, ".las": write_las, ".laz": write_las},
 }
-_FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
 
 
 def export(
@@ -72,11 +72,7 @@ def export(
     """
     options = options or ExportOptions()
     options.check(what, up)
-    if what in _FOLDERS:
-        if output.is_file():
-            raise RunError(f"{output} is a file: {_FOLDERS[what]} is several files, give the name of a folder")
-    elif output.is_dir():
-        raise RunError(f"{output} is a folder: give the name of a file to write")
+    check_target(folder, what, output)
     if what in _WRITERS:
         _export_map(folder, what, output, up, options, progress)
     elif what == "trajectory":

@@ -13,7 +13,7 @@ import numpy as np
 from erfsfm.errors import ErfsfmError
 from slam.errors import RunError, SlamError
 from slam.formats.ply import Ply, write_ply
-from slam.formats.transforms import write_transforms
+from slam.formats.transforms import TRANSFORMS, write_transforms
 from slam.frames import Image, Sequence
 from slam.loops.places import PLACES, Places
 from slam.results.comparison import lookup
@@ -75,7 +75,7 @@ def write_scene(
         logger.warning("%d of %d frames have no usable image: left out", len(trajectory) - len(poses), len(trajectory))
     if cloud is not None:
         write_ply(output / _POINTS, cloud)
-    write_transforms(output / "transforms.json", sequence.intrinsics, poses, None if cloud is None else _POINTS)
+    write_transforms(output / TRANSFORMS, sequence.intrinsics, poses, None if cloud is None else _POINTS)
 
 
 def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:

@@ -29,7 +29,7 @@ _TAKEN_BY = {
     "origin": ("raster",),
     "dataset": ("nerfstudio",),
 }
-_LATITUDE, _LONGITUDE = 90.0, 180.0
+_LATITUDE, _LONGITUDE, _HEADING = 90.0, 180.0, 360.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class ExportOptions:
         if what == "graph" and up != "y-down":
             raise RunError("a graph is exported as the run has it: leave --up out or give --up y-down")
         if what in ("raster", "occupancy") and up == "y-up":
-            raise RunError(f"a {what} is seen from above, x right and y ahead: leave --up out or give --up z")
+            raise RunError(f"{what}: seen from above, x right and y ahead: leave --up out or give --up z")
 
 
 def parse_crop(text: str | None) -> Crop | None:
@@ -123,7 +123,7 @@ def parse_origin(text: str | None) -> Origin | None:
         return None
     wanted = "LAT,LON,HEADING in degrees, heading clockwise from north, such as 49.0110,8.4160,90"
     latitude, longitude, heading = _numbers(text, 3, "--origin", wanted, math.isfinite)
-    if abs(latitude) > _LATITUDE or abs(longitude) > _LONGITUDE:
+    if abs(latitude) > _LATITUDE or abs(longitude) > _LONGITUDE or abs(heading) > _HEADING:
         raise RunError(f"--origin {text} is no place on the earth: write {wanted}")
     return Origin(latitude, longitude, heading)
 

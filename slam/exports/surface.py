@@ -16,6 +16,7 @@ from slam.runtime.imports import import_open3d
 from slam.se3 import FloatArray
 
 _GREY = 128
+_MOST_CUBES = 1e9  # along an axis: Open3D counts them in 32 bits
 
 
 def prepared(ply: Ply, options: ExportOptions) -> Ply:
@@ -61,6 +62,9 @@ def cropped(ply: Ply, crop: Crop) -> Ply:
 
 def _thinned(ply: Ply, voxel: float) -> Ply:
     """One vertex or point a cube of this side: the mean of those inside, and of their colours."""
+    wide = float(np.ptp(ply.points, axis=0).max())
+    if wide / voxel > _MOST_CUBES:
+        raise RunError(f"--voxel {voxel:g} is too small for a map that is {wide:.3g} wide: give a larger length")
     if ply.triangles is None:
         return _through_open3d(ply, lambda cloud: cloud.voxel_down_sample(voxel))
     thin = _through_open3d(ply, lambda mesh: mesh.simplify_vertex_clustering(voxel))
@@ -83,10 +87,7 @@ def _through_open3d(ply: Ply, change: Any) -> Ply:
         source.colors = vector(colours / 255.0)
         if ply.normals is not None:
             source.normals = vector(ply.normals)
-    try:
-        result = change(source)
-    except RuntimeError as error:  # a cube far smaller than the map is wide
-        raise RunError(f"the map cannot be resampled: {' '.join(str(error).split())}") from error
+    result = change(source)
     if is_mesh:
         result.remove_degenerate_triangles().remove_unreferenced_vertices().compute_vertex_normals()
         points, normals, shades = result.vertices, result.vertex_normals, result.vertex_colors

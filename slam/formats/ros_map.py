@@ -8,11 +8,20 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from erfsfm.files import read_text
 from slam.errors import RunError
 from slam.storage.files import write_atomically
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
+
+
+def describes_map(path: Path) -> bool:
+    """Whether a YAML file is the description of such a map."""
+    try:
+        return "occupied_thresh:" in read_text(path)
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: tuple[float, float], resolution: float) -> None:

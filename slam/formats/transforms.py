@@ -18,6 +18,7 @@ from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
 
+TRANSFORMS = "transforms.json"
 T_CAMERA_OPENGL: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5
 

@@ -67,14 +67,15 @@ def make_factors(
     others = [
         [pose for pose in poses if not window.within(pose)] for poses in (networks, measured.interpolated, geometric)
     ]
-    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *_windowed(window, scale)]
+    by_window = scaled_poses(window.poses, window, scale)
+    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *by_window]
 
 
-def _windowed(window: WindowPoses, scale: Scale) -> list[RelativePose]:
+def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
     numbers = set(window.segments.values())
     units = {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
-    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in window.poses]
+    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in poses]
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

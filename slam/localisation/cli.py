@@ -36,11 +36,13 @@ def localize(
     """
     from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
     from slam.localisation.localiser import image_numbers, localise
-    from slam.localisation.tables import localisation_json, localisation_table, write_localisations
+    from slam.localisation.tables import check_output, localisation_json, localisation_table, write_localisations
     from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
 
     run_folder = RunFolder.open(map)
+    if output is not None:
+        check_output(output)
     numbers = image_numbers(images, frames, every)
     known = None if truth is None else (MapTruth.of(run_folder), true_poses(truth, images, numbers))
     with progress_bar() as progress:
@@ -49,6 +51,8 @@ def localize(
             found.append(localisation)
             progress("images", len(found), len(numbers))
     errors = None if known is None else [known[0].error(*pair) for pair in zip(found, known[1], strict=True)]
+    if output is not None:
+        write_localisations(output, found, numbers)
     if as_json:
         typer.echo(json.dumps(localisation_json(found, errors), indent=2))
     else:
@@ -57,5 +61,3 @@ def localize(
             typer.echo(note)
         if errors is not None:
             typer.echo(summary_line(summary(errors)))
-    if output is not None:
-        write_localisations(output, found, numbers)

@@ -79,13 +79,22 @@ def localise(
         places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
-    for path in paths if numbers is None else [paths[number] for number in numbers]:
+    chosen = paths if numbers is None else [paths[number] for number in numbers]
+    unreadable = 0
+    for path in chosen:
         try:
             image = read_image(path)
+        except DataError as error:
+            unreadable += 1
+            if unreadable == len(chosen):
+                raise  # not one of them is an image
+            yield Localisation(path.name, reason=str(error))
+            continue
+        try:
             if undistortion is not None:
                 image = undistortion.apply(image)
             yield localiser.locate(path.name, image)
-        except (SequenceError, DataError) as error:
+        except SequenceError as error:
             yield Localisation(path.name, reason=str(error))
 
 

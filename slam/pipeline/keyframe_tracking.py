@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from slam.config import SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics
 from slam.frontend.window.local_map import LocalMap
-from slam.frontend.window.odometry import WindowOdometry, WindowState
+from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.pipeline.observations import Observations
 from slam.se3 import FloatArray, invert
@@ -85,12 +86,16 @@ class KeyframeTracking:
         T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
         return before, T_before_frame
 
-    def poses(self, seen: Observations) -> WindowPoses:
-        """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""
+    def maps(self, seen: Observations) -> tuple[Segment, ...]:
+        """All maps so far; none of a vehicle, nor before that is decided."""
         self.decide(seen)
         if self._odometry is None or not self._is_carried:
-            return WindowPoses()
-        return window_poses(self._odometry.state(), self._intrinsics, self._config, self._seed)
+            return ()
+        return tuple(segment for segment in self._odometry.state().segments if segment.started)
+
+    def poses(self, maps: Sequence[Segment]) -> WindowPoses:
+        """Relative poses of all frames of some maps."""
+        return window_poses(maps, self._intrinsics, self._config, self._seed)
 
 
 def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:

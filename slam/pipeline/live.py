@@ -205,7 +205,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.seen.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        solved = self._pipeline.solve(self._mode, self._observer.closed())
+        solved = self._pipeline.solve(self._mode, self._pipeline.close_maps(self._observer.closed()))
         self._tracker.correct(solved.T_world_camera, float(solved.measured.scale.per_frame[-1]))
         return solved.loops
 

@@ -213,10 +213,11 @@ class Observer:
         """
         self.flush()
         seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
-        steps, count, window = StepTable.of(seen.motions), len(seen.roads), self._keyframes.poses(seen)
+        steps, count, maps = StepTable.of(seen.motions), len(seen.roads), self._keyframes.maps(seen)
+        window = self._keyframes.poses(maps)
         cuts = find_cuts(seen.failures, {*steps.motions, *window.steps}, {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
-        return ClosedObservations.of(seen, gaps, cuts, window)
+        return ClosedObservations.of(seen, gaps, cuts, window, maps)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

@@ -141,15 +141,16 @@ def _is_run(metrics: Path) -> bool:
 def _is_rest(path: Path) -> bool:
     """Whether it is a partial file of a killed run."""
     name = unfinished_name(path)
-    return name is not None and _is_own(name)
+    return name is not None and is_own(name)
 
 
 def _files(folder: Path) -> list[Path]:
     """Files of a run, whole or partial."""
-    return [path for path in folder.iterdir() if _is_own(path.name) or _is_rest(path)]
+    return [path for path in folder.iterdir() if is_own(path.name) or _is_rest(path)]
 
 
-def _is_own(name: str) -> bool:
+def is_own(name: str) -> bool:
+    """Whether a run writes a file of this name."""
     return name in _OWN or JOURNAL_FILE.fullmatch(name) is not None
 
 

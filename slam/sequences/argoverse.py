@@ -56,7 +56,7 @@ def open_argoverse(log: Path, asked: Path | None) -> RecordedSequence:
         (T_ego_camera,) = _poses({key: [value] for key, value in mount.items()})
         driven = _read(log / _POSES)
         known = np.array([int(ns) / _NANOSECONDS for ns in driven["timestamp_ns"]])
-        T_any_camera = poses_near(_poses(driven) @ T_ego_camera, known, stamps)
+        T_any_camera = poses_near(_poses(driven) @ T_ego_camera, known, stamps, log / _POSES)
     except (KeyError, TypeError, ValueError) as error:
         raise SequenceError(f"the tables in {log} are not those of Argoverse 2: {error!r}; copy them again") from error
     describe_unknown(T_any_camera, log / _POSES)

@@ -121,6 +121,8 @@ def _root(dataset: Path | None, name: str | None) -> Path:
         path, origin = dataset.expanduser(), "--dataset"
     if not path.exists():
         raise SequenceError(f"no data set at {path} ({origin}): check the path")
+    if not (path.is_file() or path.is_dir()):
+        raise SequenceError(f"{path} ({origin}) is neither a file nor a folder: give a recording")
     return path
 
 

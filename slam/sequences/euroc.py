@@ -131,7 +131,7 @@ def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> 
     sensor = folder / "sensor.yaml"
     T_body_sensor = _read_sensor(sensor).T_body_sensor if sensor.is_file() else np.eye(4)
     T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
-    T_any_camera = poses_near(T_any_body @ T_body_camera, known, stamps)
+    T_any_camera = poses_near(T_any_body @ T_body_camera, known, stamps, table)
     describe_unknown(T_any_camera, table)
     return T_any_camera
 

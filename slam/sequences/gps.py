@@ -35,7 +35,10 @@ def read_gps(path: Path) -> GpsTrack:
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     lines = text.splitlines()
-    rows = _nmea_rows(lines, path) if text.lstrip().startswith("$") else _csv_rows(lines, path)
+    try:
+        rows = _nmea_rows(lines, path) if text.lstrip().startswith("$") else _csv_rows(lines, path)
+    except csv.Error as error:
+        raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
     if not len(table):
         raise SequenceError(f"{path} holds no GPS fix: CSV with a header {','.join(_COLUMNS)}, or NMEA is read")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from slam import se3
+from slam.errors import SequenceError
 from slam.frames import runs
 from slam.se3 import FloatArray
 
@@ -46,10 +47,18 @@ def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: Floa
     return se3.make(R, t)
 
 
-def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray) -> FloatArray:
-    """Poses as of `interpolated_poses`; NaN where the nearest known pose is more than 0.1 s away."""
+def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
+    """Poses as of `interpolated_poses`; NaN where the nearest known pose is more than 0.1 s away.
+
+    Raises:
+        SequenceError: the stamps of the poses, which were read from ``path``, do not increase.
+    """
     if len(known) < 2:
         return np.full((len(stamps), 4, 4), np.nan)
+    if not (np.diff(known) > 0).all():
+        raise SequenceError(
+            f"{path} row {int(np.argmin(np.diff(known) > 0)) + 2}: stamps must increase; correct the row"
+        )
     before = np.clip(np.searchsorted(known, stamps, side="right") - 1, 0, len(known) - 2)
     gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
     T_near = interpolated_poses(T_any_camera, known, stamps)

@@ -19,7 +19,7 @@ from erfsfm.files import read_text
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
-from slam.se3 import FloatArray
+from slam.se3 import FloatArray, is_se3
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import too_long
@@ -28,6 +28,10 @@ from slam.sequences.poses import known_poses, rebased
 logger = logging.getLogger(__name__)
 
 MAX_GAP_S = 10.0
+_POSSIBLE_PERIODS_S = (1e-5, 1e4)  # stamps in nanoseconds or microseconds give more
+_USUAL_PERIODS_S = (1e-3, 5.0)
+_RIGID_TOLERANCE = 0.01
+_LONG_PAUSE_S, _LONG_PAUSE_PERIODS = 30.0, 50.0
 ScanReader = Callable[[], FloatArray]  # the points (P, 3) of a LiDAR scan, metres, in the LiDAR
 
 
@@ -99,7 +103,14 @@ class RecordedSequence:
     reference: FloatArray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Rebase the poses."""
+        """Check the rate of the frames and rebase the poses.
+
+        Raises:
+            SequenceError: the stamps cannot be seconds, or the LiDAR's calibration is not rigid.
+        """
+        _require_plausible_rate(self.name, self.stamps)
+        if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
+            raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
         self.reference = self.true_poses(0, len(self))
 
     def __len__(self) -> int:
@@ -157,6 +168,20 @@ class RecordedSequence:
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
         return labels(self.sources, len(self))
+
+
+def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
+    """Refuse stamps that cannot be seconds, such as nanoseconds, and warn of unlikely ones and of long pauses."""
+    if len(stamps) < 2:
+        return
+    periods = np.diff(stamps)
+    period, longest = float(np.median(periods)), float(periods.max())
+    if not _POSSIBLE_PERIODS_S[0] <= period <= _POSSIBLE_PERIODS_S[1]:
+        raise SequenceError(f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit")
+    if not _USUAL_PERIODS_S[0] <= period <= _USUAL_PERIODS_S[1]:
+        logger.warning("%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period)
+    if longest > max(_LONG_PAUSE_S, _LONG_PAUSE_PERIODS * period):
+        logger.warning("%s: its stamps pause for %g s before frame %d", name, longest, int(periods.argmax()) + 1)
 
 
 def require_frame(name: str, index: int, frames: int) -> None:

@@ -121,7 +121,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     if not path.is_file():
         return None
     truth = read_trajectory(path, format="tum")
-    T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps)
+    T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps, path)
     describe_unknown(T_any_camera, path)
     return T_any_camera
 

@@ -88,7 +88,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
         T_known = poses_of(rows[:, 1:4], rows[:, 4:])
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise SequenceError(f"{path} needs rows of stamp, position and quaternion: {error}") from error
-    T_any_camera = poses_near(T_known, rows[:, 0], stamps)
+    T_any_camera = poses_near(T_known, rows[:, 0], stamps, path)
     describe_unknown(T_any_camera, path)
     return T_any_camera
 

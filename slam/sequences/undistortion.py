@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,12 @@ from slam.frames import Image, Intrinsics
 from slam.se3 import FloatArray
 from slam.sequences.recording import ImageSource
 
+logger = logging.getLogger(__name__)
+
 _ZOOM_STEP = 1.02
 _ZOOM_LIMITS = (0.2, 8.0)
+_UNLIKELY_ZOOM, _FOLDED_ZOOM = 1.5, 3.0
+_CHECK = "check the coefficients and the model in the camera file"
 
 
 class Undistortion:
@@ -34,6 +40,15 @@ class Undistortion:
         self._coefficients = np.asarray(camera.distortion, dtype=np.float64)
         self._model = camera.model
         zoom = self._shortest_zoom(camera.width, camera.height)
+        if zoom > _FOLDED_ZOOM:
+            raise SequenceError(f"distortion {list(camera.distortion)} folds the image: {_CHECK}")
+        if zoom > _UNLIKELY_ZOOM:
+            logger.warning(
+                "distortion %s leaves only the middle %.0f %% of the image's width: %s",
+                list(camera.distortion),
+                100 / zoom,
+                _CHECK,
+            )
         self.intrinsics = Intrinsics(
             camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
         )
@@ -92,8 +107,7 @@ class Undistortion:
             zoom, radius, fits = zoom / _ZOOM_STEP, further, True
         if not fits:
             raise SequenceError(
-                f"distortion {self._coefficients.tolist()} leaves no image free of black borders: "
-                f"check the coefficients and the model in the camera file"
+                f"distortion {self._coefficients.tolist()} leaves no image free of black borders: {_CHECK}"
             )
         return zoom * _ZOOM_STEP
 

@@ -198,7 +198,7 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
         found = StampedMessages(bag, topic)
         messages = (found.read(k) for k in range(len(found)))
         T_any_body = np.stack([transform_of(m.pose.pose if hasattr(m, "pose") else m.transform) for m in messages])
-        T_any_camera = poses_near(T_any_body @ T_body_camera, found.stamps, stamps)
+        T_any_camera = poses_near(T_any_body @ T_body_camera, found.stamps, stamps, bag.path)
         describe_unknown(T_any_camera, bag.path)
         return T_any_camera
     return None

@@ -38,6 +38,8 @@ from slam.sequences.simulation.town import build_town
 
 VERSION = 1  # of the world: the same options give the same bytes within a version
 FPS = 10.0
+MOST_FRAMES = 100_000
+_MOST_PIXELS = 2**25
 FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 
@@ -65,8 +67,12 @@ class SimulationOptions:
                 raise SequenceError(f"hazards are {', '.join(get_args(Hazard))}; got {hazard!r}")
         if self.seed < 0:
             raise SequenceError(f"seed must be 0 or more; got {self.seed}")
-        if min(self.width, self.height) < 8:
-            raise SequenceError(f"images must be 8 x 8 or larger; got {self.width} x {self.height}")
+        if self.frames > MOST_FRAMES:
+            raise SequenceError(f"a drive has {MOST_FRAMES:,} frames at most; got {self.frames:,}")
+        if min(self.width, self.height) < 8 or self.width * self.height > _MOST_PIXELS:
+            raise SequenceError(
+                f"images must be 8 x 8 or larger, of {_MOST_PIXELS:,} pixels at most; got {self.width} x {self.height}"
+            )
 
 
 def parse_options(route: str, frames: int, seed: int, width: int, height: int, hazards: str) -> SimulationOptions:
@@ -273,7 +279,7 @@ def write_kitti_root(
         SequenceError: if ``output`` holds something already, or cannot be written.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise SequenceError(f"{output} exists and is not empty; remove it or choose another output")
+        raise SequenceError(f"{output} is {'not empty' if output.is_dir() else 'a file'}; remove it or choose another")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         partial = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))

@@ -127,6 +127,28 @@ def test_errors_are_clear_and_leave_nothing(
 
 
 @pytest.mark.parametrize(
+    ("what", "name", "why"),
+    [
+        ("trajectory", "run/trajectory_network.tum.txt", "is a file of the run itself"),
+        ("mesh", "run/map_mesh.ply", "is a file of the run itself"),
+        ("trajectory", "camera.yaml", r"exists and does not end in \.txt or \.tum"),
+        ("graph", "camera.yaml", r"exists and does not end in \.g2o"),
+        ("occupancy", "camera.yaml", "exists and is no map of ROS"),
+        ("nerfstudio", "drive", "images holds other images"),
+    ],
+)
+def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str) -> None:
+    folder = make_run()
+    (tmp_path / "drive/images").mkdir(parents=True)
+    (tmp_path / "camera.yaml").write_text("width: 40\n")
+    before = {path: path.read_bytes() for path in folder.path.iterdir()}
+    with pytest.raises(RunError, match=why):
+        export(folder, what, tmp_path / name)
+    assert {path: path.read_bytes() for path in folder.path.iterdir()} == before
+    assert (tmp_path / "camera.yaml").read_text() == "width: 40\n"
+
+
+@pytest.mark.parametrize(
     ("what", "missing"),
     [
         ("mesh", "map_mesh.ply"),

@@ -198,7 +198,7 @@ def test_other_vertex_fields_survive(make_recorded: MakeRecorded, sheet: Ply, tm
         ("mesh", ExportOptions(voxel=0.0), "--voxel 0.0 must be a positive length"),
         ("mesh", ExportOptions(voxel=float("nan")), "must be a positive length"),
         ("mesh", ExportOptions(voxel=100.0), "--voxel 100 leaves no triangle"),
-        ("cloud", ExportOptions(voxel=1e-12), "cannot be resampled"),
+        ("cloud", ExportOptions(voxel=1e-12), "is too small for a map that is .* wide"),
         ("raster", ExportOptions(resolution=1e-5), "--resolution 1e-05 gives .* cells"),
         ("mesh", ExportOptions(dataset=Path("x")), "--dataset does nothing for mesh: it is for nerfstudio"),
     ],

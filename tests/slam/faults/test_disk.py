@@ -98,28 +98,12 @@ class _File:
             self._disk.note("close", self._path)
 
 
-def call(main: Callable[[], None], words: list[object]) -> int:
-    """Exit code of a command line."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:
-        patch.setattr(sys, "argv", ["program", *map(str, words)])
-        main()
-    return int(stopped.value.code or 0)
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 Verb = tuple[Callable[[], None], list[object]]
-
-
-@pytest.fixture(scope="module")
-def whole(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with a map."""
-    output = tmp_path_factory.mktemp("whole") / "run"
-    words = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:6", "--output", output]
-    assert call(slam_main, [*words, "--set", "mapping.voxel_size_m=0.5", "--set", "depth.refine=none"]) == 0
-    return output
+Call = Callable[[Callable[[], None], list[Any]], int]
 
 
 @pytest.fixture
@@ -146,7 +130,7 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("operation", OPERATIONS)
 @pytest.mark.parametrize("name", ["run", "simulate", "export mesh", "export colmap", "plot", "predict"])
 def test_one_failing_operation(
-    name: str, operation: str, verbs: dict[str, Verb], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    name: str, operation: str, verbs: dict[str, Verb], call: Call, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     main, words = verbs[name]
     out = tmp_path / "out"
@@ -173,7 +157,7 @@ def test_one_failing_operation(
         assert set(wrong) <= {"run/metrics.json", "run/run.log"}
 
 
-def test_an_earlier_run_outlives_a_full_disk(verbs: dict[str, Verb], tmp_path: Path) -> None:
+def test_an_earlier_run_outlives_a_full_disk(verbs: dict[str, Verb], call: Call, tmp_path: Path) -> None:
     main, words = verbs["run"]
     assert call(main, words) == 0
     before = contents(tmp_path / "out" / "run")
@@ -183,7 +167,11 @@ def test_an_earlier_run_outlives_a_full_disk(verbs: dict[str, Verb], tmp_path: P
 
 
 def test_a_state_that_cannot_be_kept_is_one_warning(
-    verbs: dict[str, Verb], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    verbs: dict[str, Verb],
+    call: Call,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(batch, "EVERY_FRAMES", 2)
     note = FailingDisk.note
@@ -202,7 +190,7 @@ def test_a_state_that_cannot_be_kept_is_one_warning(
 
 
 def test_a_real_disk_that_is_full(
-    verbs: dict[str, Verb], whole: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    verbs: dict[str, Verb], call: Call, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Also what C libraries write; only where mounting is allowed."""
     disk = tmp_path / "out"

@@ -72,6 +72,26 @@ def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: in
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("step", ["1e8", "1e-9", "nan"])
+def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camera_yaml: str, step: str) -> None:
+    images(tmp_path, [f"{k}.png" for k in range(4)])
+    (tmp_path / "camera.yaml").write_text(camera_yaml)
+    (tmp_path / "times.txt").write_text("".join(f"{k * float(step):.12f}\n" for k in range(4)))
+    with pytest.raises(SequenceError, match=r"s apart: check its stamps|must be numbers that increase"):
+        open_sequence(tmp_path)
+
+
+def test_unlikely_stamps_and_pauses_are_warned_of(
+    tmp_path: Path, images, camera_yaml: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    images(tmp_path, [f"{k}.png" for k in range(4)])
+    (tmp_path / "camera.yaml").write_text(camera_yaml + "camera_height_m: 100\n")
+    (tmp_path / "times.txt").write_text("0\n100\n200\n9000\n")
+    open_sequence(tmp_path)
+    assert "its frames are 100 s apart" in caplog.text and "pause for 8800 s before frame 3" in caplog.text
+    assert "camera_height_m is 100" in caplog.text
+
+
 def test_brackets_in_a_name(tmp_path: Path, images, camera_yaml: str) -> None:
     folder = tmp_path / "br[ack]ets"
     images(folder, ["0.png", "1.png"])

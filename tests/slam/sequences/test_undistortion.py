@@ -91,6 +91,9 @@ def test_folding_lens_is_refused_or_cropped() -> None:
     hopeless = lens("barrel").model_copy(update={"distortion": (400.0, 0.0, 0.0, 0.0)})
     with pytest.raises(SequenceError, match="leaves no image free of black borders"):
         Undistortion(hopeless)
+    folded = lens("barrel").model_copy(update={"distortion": (-9.0, 3.0, 0.0, 0.0)})
+    with pytest.raises(SequenceError, match=r"distortion \[-9.* folds the image"):
+        Undistortion(folded)
 
 
 class Blank:

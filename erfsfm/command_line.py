@@ -1,0 +1,79 @@
+"""What both command lines share: their words are checked once, and every error is one line and an exit code."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NoReturn
+
+import typer
+
+from erfsfm.errors import OUT_OF_MEMORY, OneLineError, one_line
+from erfsfm.signals import Terminated
+
+SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
+_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
+_OPTION = re.compile(r"--[a-z][a-z-]*=")
+_MAY_BE_EMPTY = ("--hazards", "--hazards=")
+# what libraries in C++ say when memory ran out, whatever they raise
+_MEMORY = re.compile(
+    r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
+    r"|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
+    re.IGNORECASE,
+)
+
+
+def run(app: Callable[..., object], name: str) -> None:
+    """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "ERROR"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
+        os.environ.setdefault(name_of_level, quiet)  # what they would say of a file is said in our own line
+    try:
+        app(args=_checked(sys.argv[1:], name), prog_name=name)
+    except SystemExit as end:
+        if end.code == _INTERRUPTED or isinstance(end, Terminated):
+            why = str(end) if isinstance(end, Terminated) else "interrupted"
+            _say(f"{name}: {why}; what was written stays")
+        raise
+    except Exception as error:  # the last place where an error can become one line
+        if os.environ.get(SHOW_TRACEBACK):
+            raise
+        _end(f"{name}: {_explained(error)}", 1)
+
+
+def _checked(words: Sequence[str], name: str) -> list[str]:
+    """The words with ``~/`` as the home folder; an empty one, as of a shell variable that is not set, is refused."""
+    checked = []
+    for before, word in zip(["", *words], words):
+        option = _OPTION.match(word)
+        start, value = (option.group(), word[option.end() :]) if option else ("", word)
+        if not value and before not in _MAY_BE_EMPTY and start not in _MAY_BE_EMPTY:
+            where = start.rstrip("=") or (before if before.startswith("--") else "one of its words")
+            _end(f"{name}: {where} is empty: give a value or leave it out (is a shell variable not set?)", 2)
+        checked.append(start + (str(Path(value).expanduser()) if value.startswith("~/") else value))
+    return checked
+
+
+def _explained(error: Exception) -> str:
+    if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
+        return OUT_OF_MEMORY
+    if isinstance(error, OneLineError | OSError):
+        return one_line(str(error))
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    what = one_line(f"{type(error).__name__}: {error}")
+    return f"unexpected {what} ({Path(place.filename).name}:{place.lineno}); set {SHOW_TRACEBACK}=1 and report this"
+
+
+def _end(line: str, code: int) -> NoReturn:
+    _say(line)
+    sys.exit(code)
+
+
+def _say(line: str) -> None:
+    with suppress(OSError, ValueError):  # nobody is listening
+        typer.echo(line, err=True)

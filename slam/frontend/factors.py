@@ -20,7 +20,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.frontend.window.relative_poses import WindowPoses
+from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 
@@ -89,7 +89,10 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
     arriving: dict[int, RelativePose] = {}
     for factor in factors:
         first, last = factor.ends
-        if factor.source != NETWORK_SOURCE and (last not in arriving or arriving[last].from_index <= first < last):
+        if factor.source == NETWORK_SOURCE or first >= last:
+            continue
+        # after a gap, a place in the map is known better than any motion over the gap
+        if last not in arriving or _precedence(factor) >= _precedence(arriving[last]):
             arriving[last] = factor
     increments = invert(T_network[:-1]) @ T_network[1:]
     increments[:, :3, 3] *= scale.per_frame[:-1, None]
@@ -100,6 +103,10 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
         T_world_camera[k] = T_world_camera[first] @ T_first_camera
         T_world_camera[k, :3, :3] = nearest_rotation(T_world_camera[k, :3, :3])
     return T_world_camera
+
+
+def _precedence(factor: RelativePose) -> tuple[bool, int]:
+    return factor.source == WINDOW_SOURCE, factor.from_index
 
 
 def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[RelativePose]:

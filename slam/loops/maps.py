@@ -24,7 +24,7 @@ from slam.se3 import FloatArray, apply, invert, rotation_angle
 logger = logging.getLogger(__name__)
 
 # those of support count keyframes in place of frames
-_THRESHOLDS = {
+THRESHOLDS = {
     "max_hamming": 100,
     "min_inliers": 15,
     "min_inlier_ratio": 0.3,
@@ -89,7 +89,7 @@ def find_map_loops(
         config: size of the vocabulary, RANSAC, spread of inliers, drift.
         seed: of RANSAC.
     """
-    own = config.model_copy(update=_THRESHOLDS)
+    own = config.model_copy(update=THRESHOLDS)
     candidates = similar_views(views, apart, _CANDIDATES, own.words)
     verifier = LoopVerifier(own, intrinsics, seed=seed)
     verdicts = side_by_side(lambda c: _verified(c.earlier, c.later, c.score, views, verifier, own), candidates)

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from slam.config import SlamConfig
 from slam.frames import Intrinsics, RelativePose, RelativeSimilarity, TrackingEvent
 from slam.frontend.window.joining import SharedCorners, join
-from slam.frontend.window.local_map import WindowKeyframe
+from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
 from slam.loops.closure import LoopClosures
@@ -83,6 +83,15 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     return MapClosure(poses, tuple(loops), tuple(rejected), found.candidates, found.measured, joins)
 
 
+def views_of(local: LocalMap) -> list[View]:
+    """The keyframes of a map: corners with their points in the camera."""
+    found = []
+    for keyframe in local.keyframes:
+        points = apply(keyframe.T_camera_world, local.points[keyframe.track_ids]).astype(np.float32)
+        found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points))
+    return found
+
+
 class _Rows:
     """The keyframes of all maps, row by row."""
 
@@ -95,12 +104,7 @@ class _Rows:
 
     def views(self) -> list[View]:
         """Corners with their points in the camera."""
-        found = []
-        for keyframe, number in zip(self.keyframes, self.maps, strict=True):
-            points = apply(keyframe.T_camera_world, self.segments[number].map.points[keyframe.track_ids])
-            pixels = keyframe.pixels.astype(np.float32)
-            found.append(View(keyframe.index, pixels, keyframe.descriptors, points.astype(np.float32)))
-        return found
+        return [view for segment in self.segments for view in views_of(segment.map)]
 
     def apart(self) -> NDArray[np.bool_]:
         """Which keyframes share few tracks ``(K, K)``."""

@@ -127,7 +127,7 @@ class Observer:
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
         keyframes = WindowState() if state is None else state.keyframes
-        self._keyframes = KeyframeTracking(config.window, intrinsics, seed, keyframes)
+        self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )

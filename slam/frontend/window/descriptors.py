@@ -6,6 +6,8 @@ two thresholds, so that Hamming's distance is that of the sums of coded differen
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ _RADIUS_PX = 15
 _BLUR_PX = 2.0
 
 
-def describe(grey: Grey, pixels: FloatArray) -> Descriptors:
+def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
     """Descriptors ``(M, 32)`` of corners ``(M, 2)``, each turned into its own direction."""
     if not len(pixels):
         return np.zeros((0, BYTES), np.uint8)
@@ -36,7 +38,7 @@ def describe(grey: Grey, pixels: FloatArray) -> Descriptors:
     return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)
 
 
-def _directions_deg(grey: Grey, pixels: FloatArray) -> FloatArray:
+def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray:
     """From each corner to the centroid of the grey levels around it (Rosin 1999), degrees in [0, 360)."""
     y, x = np.mgrid[-_RADIUS_PX : _RADIUS_PX + 1, -_RADIUS_PX : _RADIUS_PX + 1]
     inside = x**2 + y**2 <= _RADIUS_PX**2

@@ -13,7 +13,7 @@ from slam.config import WindowConfig
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.window.descriptors import Descriptors
-from slam.frontend.window.flow import Pixels, flow
+from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.triangulation import triangulate
 from slam.se3 import FloatArray, apply, invert
 
@@ -68,6 +68,12 @@ class WindowKeyframe:
             learned_depth=self.learned_depth[rows],
             descriptors=self.descriptors[rows],
         )
+
+
+def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
+    """Corners ``(M, 2)`` of an image without tracks."""
+    none = np.zeros((0, 2), np.float32)
+    return new_corners(grey, none, config.max_corners, config.corner_spacing_px, config.corner_quality)
 
 
 @dataclass

@@ -89,6 +89,44 @@ class WindowOdometry:
         """The state to resume from."""
         return self._state
 
+    def lost_map(self) -> Segment | None:
+        """The map in which the camera was lost, until it is found again or another map has points."""
+        started = [segment for segment in self._state.segments if segment.started]
+        is_lost = bool(started) and (self._state.lost > 0 or not self._state.segments[-1].started)
+        return started[-1] if is_lost else None
+
+    def relocalise(
+        self,
+        frame: Frame,
+        depth: DepthMap,
+        T_camera_world: FloatArray,
+        track_ids: TrackIds,
+        pixels: Pixels,
+        place: int,
+    ) -> None:
+        """Go on in the lost map with the frame that was added last, which becomes a keyframe.
+
+        Args:
+            frame: at the size of the intrinsics.
+            depth: its learned z-depth ``(H, W)``.
+            T_camera_world: in the lost map.
+            track_ids: of its points ``(M,)``, each once.
+            pixels: where the frame sees them ``(M, 2)``.
+            place: the frame of the keyframe with most of these points.
+        """
+        state = self._state
+        if state.segments[-1].started:
+            self._note(state.segments[-1].frames[-state.lost].index, "lost")
+            state.segments[-1].frames.pop()
+        else:
+            state.segments.pop()
+        self._note(frame.index, "relocalised", place, len(track_ids))
+        segment = state.segments[-1]
+        state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
+        self._add_keyframe(segment, frame, track_ids, pixels)
+        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+        segment.map.keyframes[-1] = segment.map.keyframes[-1].with_depth(depth)
+
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
         if not self._state.segments or self._state.lost > self._config.max_lost_frames:

@@ -8,6 +8,7 @@ import pytest
 from slam.config import SlamConfig, WindowConfig
 from slam.frontend.window.odometry import WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.sequences.catalogue import open_sequence
@@ -78,6 +79,31 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
     for pose, loop in zip(after.poses.loops, after.loops, strict=True):
         T = invert(truth[pose.from_index]) @ truth[pose.to_index]
         assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.similarity.T_from_to[:3, :3])) < 3.0
+
+
+def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
+    walked = there_and_back(110, roll=0.4, closer=0.3)
+    truth = np.concatenate([walked[:60], walked[82:]])
+    seeds = [0] * 60 + [9] * 6 + [0] * 22
+    tracking = KeyframeTracking(
+        WindowConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
+    )
+    for k, T in enumerate(truth):
+        frame = room.frame(k, T, seeds[k])
+        tracking.follow(frame)
+        tracking.learn(frame, room.depth_map(T))
+    state = tracking.state()
+    assert state is not None
+    _, lost, found = state.events
+    assert (lost.event, lost.frame) == ("lost", 60)
+    assert (found.event, found.frame) == ("relocalised", 66)
+    assert found.other is not None
+    assert found.other < 40
+    poses = tracking.poses(state.segments)
+    assert set(poses.segments) == {*range(60), *range(66, 88)}
+    position, rotation = errors(poses, truth)
+    assert position < 0.01
+    assert rotation < 0.3
 
 
 def test_another_scene_is_no_loop() -> None:

@@ -78,6 +78,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/calibration renders them"),
+    (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is on no package index; tests/slam/live runs its callbacks"),

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Collection, Hashable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ T = TypeVar("T")
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
+Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
 Ends = tuple[int, int]  # the two frames of a step or a factor
 LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may drop these
 
@@ -198,6 +199,42 @@ class RelativePose:
     def graph_sigmas(self) -> FloatArray:
         """Sigmas ``(6,)`` for a graph, which assumes independent errors of its factors."""
         return self.sigmas if self.correlated_sigmas is None else self.correlated_sigmas
+
+
+@dataclass(frozen=True)
+class RelativeSimilarity:
+    """A measured similarity between two cameras whose units of length differ: ``p_from = scale R p_to + t``.
+
+    ``T_from_to`` ``(4, 4)`` is in the unit of the first camera, as are the ``sigmas`` ``(7,)`` of rotation and
+    translation; the last sigma is that of the logarithm of the scale.
+    """
+
+    from_index: int
+    to_index: int
+    T_from_to: FloatArray
+    scale: float
+    sigmas: FloatArray
+
+
+@dataclass(frozen=True)
+class TrackingEvent:
+    """What became of the tracking of keyframes at a frame.
+
+    A map began, the camera was lost from this frame on, it was found again at the place of an ``other`` frame, or the
+    map that begins here was joined with that of an ``other`` frame. ``support`` is the number of points, or of loops.
+    """
+
+    frame: int
+    event: Event
+    other: int | None = None
+    support: int | None = None
+
+    def __str__(self) -> str:
+        """For logs and reports."""
+        at = "" if self.other is None else f" at the place of frame {self.other}"
+        what = "loops" if self.event == "map joined" else "points"
+        by = "" if self.support is None else f", by {self.support} {what}"
+        return f"frame {self.frame}: {self.event}{at}{by}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The pose graph: relative poses in, the most likely trajectory out. The only module that imports gtsam.
+"""The pose graph: relative poses in, the most likely trajectory out.
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
 that order. A Huber kernel limits outliers. Redescending kernels do not recover from a drifted start, so Cauchy is only

@@ -20,7 +20,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.frontend.window.relative_poses import WindowPoses
+from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 
@@ -67,14 +67,15 @@ def make_factors(
     others = [
         [pose for pose in poses if not window.within(pose)] for poses in (networks, measured.interpolated, geometric)
     ]
-    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *_windowed(window, scale)]
+    by_window = scaled_poses(window.poses, window, scale)
+    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *by_window]
 
 
-def _windowed(window: WindowPoses, scale: Scale) -> list[RelativePose]:
+def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
     numbers = set(window.segments.values())
     units = {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
-    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in window.poses]
+    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in poses]
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
@@ -88,7 +89,10 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
     arriving: dict[int, RelativePose] = {}
     for factor in factors:
         first, last = factor.ends
-        if factor.source != NETWORK_SOURCE and (last not in arriving or arriving[last].from_index <= first < last):
+        if factor.source == NETWORK_SOURCE or first >= last:
+            continue
+        # after a gap, a place in the map is known better than any motion over the gap
+        if last not in arriving or _precedence(factor) >= _precedence(arriving[last]):
             arriving[last] = factor
     increments = invert(T_network[:-1]) @ T_network[1:]
     increments[:, :3, 3] *= scale.per_frame[:-1, None]
@@ -99,6 +103,10 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
         T_world_camera[k] = T_world_camera[first] @ T_first_camera
         T_world_camera[k, :3, :3] = nearest_rotation(T_world_camera[k, :3, :3])
     return T_world_camera
+
+
+def _precedence(factor: RelativePose) -> tuple[bool, int]:
+    return factor.source == WINDOW_SOURCE, factor.from_index
 
 
 def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[RelativePose]:

@@ -71,6 +71,29 @@ def find_candidates(
     return found
 
 
+def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int, words: int) -> list[Candidate]:
+    """For each view at most ``count`` earlier ones that share words with it, the most similar first.
+
+    Args:
+        views: in time order.
+        allowed: ``(V, V)``, which pairs may be candidates.
+        count: of candidates.
+        words: size of the vocabulary.
+    """
+    everything = _all_descriptors(views)
+    if len(views) < 2 or len(everything) == 0:
+        return []
+    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, words)), words)
+    weighted = _weighted(counts, _inverse_frequency(counts))
+    found = []
+    for later in range(1, len(views)):
+        scores = (weighted[[later]] @ weighted[:later].T).toarray().ravel()
+        scores[~allowed[later, :later]] = 0.0
+        best = np.argsort(-scores, kind="stable")[:count]
+        found += [Candidate(int(k), later, float(scores[k])) for k in best if scores[k] > 0]
+    return found
+
+
 class PlaceIndex:
     """Finds the views of a drive that are similar to a new one."""
 

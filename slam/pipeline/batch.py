@@ -14,7 +14,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.frames import Frame, Predictor, RelativePose, runs
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.factors import Unscaled, chain_odometry, make_factors
+from slam.frontend.factors import Unscaled, chain_odometry, make_factors, scaled_poses
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
@@ -27,13 +27,14 @@ from slam.frontend.scale.scale_estimate import (
 )
 from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
-from slam.loops.descriptors import View
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
 from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
+from slam.pipeline.map_closure import close_maps
+from slam.pipeline.measurements import Measurements
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pipeline.positioning import Location, Positioning
@@ -51,17 +52,6 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 EXAMPLES = 5
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """All relative poses with their noise, and the trajectories chained from them ``(N, 4, 4)``."""
-
-    T_network: FloatArray
-    lidar: LidarPath | None
-    scale: Scale
-    factors: list[RelativePose]
-    T_odometry: FloatArray
 
 
 @dataclass(frozen=True)
@@ -158,13 +148,14 @@ class SlamPipeline:
         if self._config.mapping.enabled:
             import_open3d_beside()
         observations, state = self._observe(journal, frames, watch)
+        observations = self.close_maps(observations)
         mode = self.require_possible()
         for first, last in runs(observations.interpolated):
             reason = observations.interpolated[first]
             logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
         warn_of_doubts(len(self._sequence), observations, state)
         measured = self.measure(mode, observations)
-        loops = self.close_loops(observations.views, measured)
+        loops = self.close_loops(observations, measured)
         graph, T_optimised, location = self._optimise(measured, loops)
         return SlamResult(
             network=self._trajectory(measured.T_network),
@@ -195,10 +186,19 @@ class SlamPipeline:
         factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])
         return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))
 
-    def close_loops(self, views: Sequence[View], measured: Measurements) -> LoopClosures:
-        """Loops among all views, after the last frame."""
+    def close_maps(self, seen: ClosedObservations) -> ClosedObservations:
+        """The same after loops among the keyframes of all maps."""
+        if not seen.maps or not self._config.loops.enabled:
+            return seen
         with self._watch.stage("loops"):
-            scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in views]
+            return seen.with_closure(close_maps(seen.maps, self._sequence.intrinsics, self._config, self._seed))
+
+    def close_loops(self, seen: ClosedObservations, measured: Measurements) -> LoopClosures:
+        """Loops after the last frame: those of the closed maps, or else among all views."""
+        if seen.closure is not None:
+            return seen.closure.closures(scaled_poses(seen.window.loops, seen.window, measured.scale))
+        with self._watch.stage("loops"):
+            scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in seen.views]
             intrinsics, config = self._sequence.intrinsics, self._config.loops
             return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
 

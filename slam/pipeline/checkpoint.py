@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 
 from slam.errors import RunError
-from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses
+from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
@@ -117,7 +117,7 @@ SERIALISER = Serialiser(
     *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
     *(Corners, DynamicMask, HeadingPrior, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
-    *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe),
+    *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
 )
 
 

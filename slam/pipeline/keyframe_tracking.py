@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
 
-from slam.config import SlamConfig, WindowConfig
+from slam.config import LoopsConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics
-from slam.frontend.window.odometry import WindowOdometry, WindowState
+from slam.frontend.window.descriptors import describe
+from slam.frontend.window.local_map import LocalMap, corners_of
+from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.loops.descriptors import View
+from slam.loops.relocalisation import Relocaliser
+from slam.pipeline.map_closure import views_of
 from slam.pipeline.observations import Observations
+from slam.se3 import invert
+
+# a lost camera is looked for at every third frame
+_RELOCALISED_FRAMES = 3
 
 
 def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
@@ -26,9 +36,17 @@ def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
 class KeyframeTracking:
     """Tracks keyframes beside the steps, until those are of a vehicle."""
 
-    def __init__(self, config: WindowConfig, intrinsics: Intrinsics, seed: int, state: WindowState | None) -> None:
+    def __init__(
+        self,
+        config: WindowConfig,
+        loops: LoopsConfig,
+        intrinsics: Intrinsics,
+        seed: int,
+        state: WindowState | None,
+    ) -> None:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
-        self._config, self._intrinsics, self._seed = config, intrinsics, seed
+        self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
+        self._places: Relocaliser | None = None
         self._odometry: WindowOdometry | None = None
         if config.use != "never" and state is not None:
             self._odometry = WindowOdometry(config, intrinsics, seed, state)
@@ -39,20 +57,46 @@ class KeyframeTracking:
 
     def add(self, frame: Frame, depth: DepthMap) -> None:
         """The next usable frame with its learned depth ``(H, W)``."""
-        if self._odometry is not None:
-            self._odometry.add(frame, depth)
+        if self._odometry is None:
+            return
+        self._odometry.add(frame, depth)
+        lost = self._odometry.lost_map()
+        if lost is None:
+            self._places = None
+        elif self._loops.enabled and frame.index % _RELOCALISED_FRAMES == 0:
+            self._relocalise(self._odometry, lost.map, frame, depth)
+
+    def _relocalise(self, odometry: WindowOdometry, lost: LocalMap, frame: Frame, depth: DepthMap) -> None:
+        """Look for the camera among all keyframes of the map in which it was lost."""
+        if self._places is None:
+            T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
+            self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._loops, self._seed)
+        corners = corners_of(frame.grey, self._config)
+        unknown = np.full((len(corners), 3), np.nan, np.float32)
+        found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
+        if found is None:
+            return
+        seen = zip(found.keyframes.tolist(), found.keyframe_corners.tolist(), strict=True)
+        tracks = np.array([lost.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen])
+        tracks, first = np.unique(tracks, return_index=True)
+        place = lost.keyframes[found.nearest].index
+        odometry.relocalise(frame, depth, found.T_camera_map, tracks, corners[found.corners[first]], place)
 
     def decide(self, seen: Observations) -> None:
         """End the tracking where the first steps are those of a vehicle."""
         if self._odometry is not None and self._config.use == "auto" and is_vehicle(seen, self._config):
             self._odometry = None
 
-    def poses(self, seen: Observations) -> WindowPoses:
-        """Relative poses of all frames so far; none of a vehicle, nor before that is decided."""
+    def maps(self, seen: Observations) -> tuple[Segment, ...]:
+        """All maps so far; none of a vehicle, nor before that is decided."""
         undecided = self._config.use == "auto" and is_vehicle(seen, self._config) is None
         if self._odometry is None or undecided:
-            return WindowPoses()
-        return window_poses(self._odometry.state(), self._intrinsics, self._config, self._seed)
+            return ()
+        return tuple(segment for segment in self._odometry.state().segments if segment.started)
+
+    def poses(self, maps: Sequence[Segment]) -> WindowPoses:
+        """Relative poses of all frames of some maps."""
+        return window_poses(maps, self._intrinsics, self._config, self._seed)
 
 
 def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:

@@ -15,9 +15,10 @@ from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
-from slam.pipeline.batch import Measurements, SlamPipeline
+from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.keyframe_tracking import decided
+from slam.pipeline.measurements import Measurements
 from slam.pipeline.observer import Observer, ObserverState
 from slam.pose_graph import IncrementalPoseGraph
 from slam.prediction.assembly import make_predictor, open_depth
@@ -202,9 +203,11 @@ class Slam:
 
     def close_loops(self) -> LoopClosures:
         """Search loops among all frames so far and add the consistent ones to the graph."""
-        measured = self._measure()
-        if measured is not None:
-            self._loops = self._pipeline.close_loops(self._observer.closed().views, measured)
+        self._observer.flush()
+        if self._observer.has_snippets:
+            seen = self._pipeline.close_maps(self._observer.closed())
+            measured = self._pipeline.measure(self._mode, seen)
+            self._loops = self._pipeline.close_loops(seen, measured)
             self._per_frame = measured.scale.per_frame
             self._solve(measured)
         return self._loops

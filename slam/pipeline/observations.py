@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -18,8 +18,10 @@ from slam.frontend.segments import Segment, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.window.odometry import Segment as MapSegment
 from slam.frontend.window.relative_poses import WindowPoses
 from slam.loops.descriptors import View
+from slam.pipeline.map_closure import MapClosure
 from slam.storage.spill import SpilledArray, SpillFile
 
 
@@ -78,7 +80,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class ClosedObservations:
-    """The observations of a pass with its gaps interpolated; of interpolated frames only steps are kept."""
+    """The observations of a pass with its gaps interpolated; of interpolated frames only steps are kept.
+
+    ``window`` are the poses by ``maps`` of keyframes; of a drive measured by steps alone there are none. ``closure`` is
+    None before the maps are closed.
+    """
 
     roads: list[GroundPlane | MeasurementFailure]
     road_steps: dict[Ends, RoadStep]
@@ -90,10 +96,17 @@ class ClosedObservations:
     gaps: InterpolatedGaps
     segments: list[Segment]
     window: WindowPoses
+    maps: tuple[MapSegment, ...]
+    closure: MapClosure | None = None
 
     @classmethod
     def of(
-        cls, seen: Observations, gaps: InterpolatedGaps, cuts: Collection[int] = (), window: WindowPoses | None = None
+        cls,
+        seen: Observations,
+        gaps: InterpolatedGaps,
+        cuts: Collection[int] = (),
+        window: WindowPoses | None = None,
+        maps: tuple[MapSegment, ...] = (),
     ) -> ClosedObservations:
         """Leave out views and keyframes of interpolated frames."""
         return cls(
@@ -107,7 +120,18 @@ class ClosedObservations:
             gaps,
             find_segments(len(seen.roads), cuts, gaps.frames),
             window or WindowPoses(),
+            maps,
         )
+
+    def with_closure(self, closure: MapClosure) -> ClosedObservations:
+        """The same with poses by closed maps, which also relate segments of the drive that lie in one map."""
+        found: list[Segment] = []
+        for segment in self.segments:
+            if found and closure.poses.relates(segment.first):
+                found[-1] = replace(found[-1], last=segment.last)
+            else:
+                found.append(segment)
+        return replace(self, window=closure.poses, segments=found, closure=closure)
 
     @property
     def snippets(self) -> list[SnippetPoses]:

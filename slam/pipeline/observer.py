@@ -127,7 +127,7 @@ class Observer:
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
         keyframes = WindowState() if state is None else state.keyframes
-        self._keyframes = KeyframeTracking(config.window, intrinsics, seed, keyframes)
+        self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
@@ -217,7 +217,8 @@ class Observer:
         steps, count = StepTable.of(seen.motions), len(seen.roads)
         cuts = find_cuts(seen.failures, list(steps.motions), {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
-        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(seen))
+        maps = self._keyframes.maps(seen)
+        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(maps), maps)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""

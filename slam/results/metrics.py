@@ -68,11 +68,28 @@ def estimate_metrics(
             **gps_metrics(result, gps_in_graph),
             "graph": _graph(result),
             "loops": result.loops.summary(),
+            **_tracking(result),
             **null("depth", "the run ended before its map was whole"),
             **null("map", "the run ended before its map was whole"),
         }
     )
     return metrics
+
+
+def _tracking(result: SlamResult) -> dict[str, Any]:
+    """Keyframes, their maps, and what became of them."""
+    state = result.state.keyframes
+    if state is None or not result.observations.maps:
+        return null("tracking", "this drive has no map of keyframes: it is measured from step to step")
+    closure = result.observations.closure
+    events = sorted([*state.events, *(() if closure is None else closure.joins)], key=lambda event: event.frame)
+    return {
+        "tracking": {
+            "keyframes": sum(len(segment.map.keyframes) for segment in result.observations.maps),
+            "maps": len(set(result.observations.window.segments.values())),
+            "events": [asdict(event) for event in events],
+        }
+    }
 
 
 def whole_metrics(

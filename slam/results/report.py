@@ -131,6 +131,7 @@ def write_report(
         no_map=_absence(metrics, "map"),
         loops=report_tables.loops(metrics, folder.path / "loops.json"),
         no_loops=_absence(metrics, "loops"),
+        tracking=report_tables.tracking(metrics),
         graph=report_tables.graph(metrics),
         timing=report_tables.timing(metrics),
         alignments=report_tables.alignments(metrics),

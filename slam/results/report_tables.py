@@ -204,6 +204,24 @@ def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
     }
 
 
+def tracking(metrics: Metrics) -> dict[str, Any] | None:
+    """``counts`` of keyframes and maps, and a ``table`` of what became of them; None without keyframes."""
+    tree, _ = lookup(metrics, "tracking")
+    if tree is None:
+        return None
+    rows = [
+        tuple("" if event.get(key) is None else str(event[key]) for key in ("frame", "event", "other", "support"))
+        for event in tree.get("events") or []
+        if isinstance(event, Mapping)
+    ]
+    more = [f"{len(rows) - MOST_LOOPS} more in metrics.json."] if len(rows) > MOST_LOOPS else []
+    head = ("frame", "event", "at the place of frame", "points or loops")
+    return {
+        "counts": f"{number(tree, 'keyframes').text} keyframes, {number(tree, 'maps').text} maps",
+        "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
+    }
+
+
 def graph(metrics: Metrics) -> dict[str, Any] | None:
     """``nodes`` and ``factors`` of the pose graph, and its ``coverage`` or the ``reasons`` why there is none."""
     if lookup(metrics, "graph")[0] is None:

@@ -115,6 +115,23 @@ class LoopCounts(_Part):
     rejected: list[LoopEnds] | None = None
 
 
+class EventRecord(_Part):
+    """What became of the tracking of keyframes at a frame."""
+
+    frame: Count
+    event: str
+    other: Count | None = None
+    support: Count | None = None
+
+
+class TrackingRecord(_Part):
+    """Keyframes and their maps."""
+
+    keyframes: Count | None = None
+    maps: Count | None = None
+    events: list[EventRecord] = []
+
+
 class GraphRecord(_Part):
     """Size of the graph and coverage of its noise."""
 
@@ -137,6 +154,7 @@ class MetricsFile(_Part):
     trajectories: dict[str, TrajectoryErrors | str | None] | None = None
     graph: GraphRecord | None = None
     loops: LoopCounts | None = None
+    tracking: TrackingRecord | None = None
     depth: dict[str, dict[str, object] | str | None] | None = None
     map: dict[str, object] | None = None
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from slam.config import WindowConfig
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.window.flow import Pixels, flow
+from slam.frontend.window.descriptors import Descriptors
+from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.triangulation import triangulate
 from slam.se3 import FloatArray, apply, invert
 
@@ -35,7 +36,8 @@ _ALIGNED_KEYFRAMES = 4
 class WindowKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
-    ``grey`` is None once the image is not kept any more; ``learned_depth`` ``(M,)`` is NaN where unknown.
+    ``learned_depth`` ``(M,)`` is NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once the image is
+    not kept any more.
     """
 
     index: int
@@ -43,6 +45,7 @@ class WindowKeyframe:
     track_ids: TrackIds
     pixels: FloatArray
     learned_depth: FloatArray
+    descriptors: Descriptors
     grey: Grey | None
 
     def with_depth(self, depth: DepthMap) -> WindowKeyframe:
@@ -54,13 +57,23 @@ class WindowKeyframe:
 
     def without(self, gone: TrackIds) -> WindowKeyframe:
         """The same without some tracks."""
-        kept = ~np.isin(self.track_ids, gone)
+        return self.with_corners(np.flatnonzero(~np.isin(self.track_ids, gone)), self.track_ids)
+
+    def with_corners(self, rows: NDArray[np.intp], track_ids: TrackIds) -> WindowKeyframe:
+        """The same with some of its corners, whose tracks are rows of other ``track_ids`` ``(M,)``, in their order."""
         return replace(
             self,
-            track_ids=self.track_ids[kept],
-            pixels=self.pixels[kept],
-            learned_depth=self.learned_depth[kept],
+            track_ids=track_ids[rows],
+            pixels=self.pixels[rows],
+            learned_depth=self.learned_depth[rows],
+            descriptors=self.descriptors[rows],
         )
+
+
+def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
+    """Corners ``(M, 2)`` of an image without tracks."""
+    none = np.zeros((0, 2), np.float32)
+    return new_corners(grey, none, config.max_corners, config.corner_spacing_px, config.corner_quality)
 
 
 @dataclass
@@ -121,7 +134,7 @@ class LocalMap:
         seen &= np.isfinite(self.points[:, 0])
         fixed = self._sharing(seen, first, config.keyframes)
         chosen = [*fixed, *range(first, len(self.keyframes))]
-        sightings, track_ids = self._sightings(chosen, seen)
+        sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
         free[: max(len(fixed), 1)] = False
         noise = Noise(config.pixel_sigma, huber=config.huber_sigmas)
@@ -144,7 +157,7 @@ class LocalMap:
         best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:most]
         return sorted(k for _, k in best)
 
-    def _sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
+    def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:
         """Sightings of the points seen by at least two of the chosen keyframes, and the points' tracks."""
         cameras, track_ids, pixels = [], [], []
         for row, k in enumerate(chosen):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config import WindowConfig
-from slam.frames import DepthMap, Frame, Intrinsics
+from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.visual.epipolar import (
     depth_in_current,
     parallax_px,
@@ -23,6 +23,7 @@ from slam.frontend.visual.epipolar import (
     unit_pose_by_essential,
 )
 from slam.frontend.window.camera_pose import CameraPose, resect
+from slam.frontend.window.descriptors import describe
 from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
 from slam.se3 import FloatArray, invert, make
@@ -69,6 +70,7 @@ class WindowState:
     T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
+    events: list[TrackingEvent] = field(default_factory=list)
 
 
 class WindowOdometry:
@@ -99,6 +101,44 @@ class WindowOdometry:
         if newest.keyframes[-1].index == frame.index:
             newest.keyframes[-1] = newest.keyframes[-1].with_depth(depth)
 
+    def lost_map(self) -> Segment | None:
+        """The map in which the camera was lost, until it is found again or another map has points."""
+        started = [segment for segment in self._state.segments if segment.started]
+        is_lost = bool(started) and (self._state.lost > 0 or not self._state.segments[-1].started)
+        return started[-1] if is_lost else None
+
+    def relocalise(
+        self,
+        frame: Frame,
+        depth: DepthMap,
+        T_camera_world: FloatArray,
+        track_ids: TrackIds,
+        pixels: Pixels,
+        place: int,
+    ) -> None:
+        """Go on in the lost map with the frame that was added last, which becomes a keyframe.
+
+        Args:
+            frame: at the size of the intrinsics.
+            depth: its learned z-depth ``(H, W)``.
+            T_camera_world: in the lost map.
+            track_ids: of its points ``(M,)``, each once.
+            pixels: where the frame sees them ``(M, 2)``.
+            place: the frame of the keyframe with most of these points.
+        """
+        state = self._state
+        if state.segments[-1].started:
+            self._note(state.segments[-1].frames[-state.lost].index, "lost")
+            state.segments[-1].frames.pop()
+        else:
+            state.segments.pop()
+        self._note(frame.index, "relocalised", place, len(track_ids))
+        segment = state.segments[-1]
+        state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
+        self._add_keyframe(segment, frame, track_ids, pixels)
+        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+        segment.map.keyframes[-1] = segment.map.keyframes[-1].with_depth(depth)
+
     def _follow(self, frame: Frame) -> None:
         if not self._state.segments or self._state.lost > self._config.max_lost_frames:
             self._begin(frame)
@@ -115,6 +155,8 @@ class WindowOdometry:
         state = self._state
         if state.segments and not state.segments[-1].started:
             state.segments.pop()
+        elif state.segments:
+            self._note(state.segments[-1].frames[-state.lost].index, "lost")
         state.segments.append(Segment())
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
@@ -162,7 +204,7 @@ class WindowOdometry:
         unit = float(np.median(depth[solid]))
         segment.map.points[track_ids[solid]] = rays_first[solid] * (depth[solid] / unit)[:, None]
         segment.started = True
-        logger.info("frame %d: a map of %d points begins", frame.index, int(solid.sum()))
+        self._note(frame.index, "map begun", support=int(solid.sum()))
         self._state.T_camera_world = make(motion.R_current_previous, motion.direction / unit)
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
@@ -227,7 +269,7 @@ class WindowOdometry:
         unknown = np.full(len(track_ids), np.nan)
         if segment.started and len(local.keyframes) == 1:
             self._add_first_keyframes(segment)
-        local.add(WindowKeyframe(frame.index, T, track_ids, places, unknown, frame.grey))
+        local.add(WindowKeyframe(frame.index, T, track_ids, places, unknown, describe(frame.grey, places), frame.grey))
         if segment.started:
             local.triangulate(intrinsics, config)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics, config))
@@ -238,8 +280,8 @@ class WindowOdometry:
     def _add_first_keyframes(self, segment: Segment) -> None:
         """Some of the frames between the first two keyframes: more views of the first points."""
         between = segment.frames[:-1]
-        for row in np.unique(np.linspace(0, len(between) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]):
-            frame = between[row]
+        chosen = np.linspace(0, len(between) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
+        for frame in (between[row] for row in np.unique(chosen) if between):
             known = segment.map.known(frame.track_ids)
             if known.sum() < self._config.min_points:
                 continue
@@ -247,7 +289,15 @@ class WindowOdometry:
             pose = resect((np.eye(4),), points, pixels, self._intrinsics, self._config.inlier_px, self._seed)
             unknown = np.full(len(frame.track_ids), np.nan)
             places = frame.pixels.astype(np.float64)
-            segment.map.add(WindowKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, None))
+            first = segment.map.keyframes[0]
+            same = first.descriptors[np.searchsorted(first.track_ids, frame.track_ids)]
+            keyframe = WindowKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, same, None)
+            segment.map.add(keyframe)
+
+    def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
+        """Keep an event and log it."""
+        self._state.events.append(TrackingEvent(frame, event, other, support))
+        logger.info("%s", self._state.events[-1])
 
     def _tracked(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         last = len(segment.map.keyframes) - 1

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
 from slam.config import WindowConfig
-from slam.frames import Intrinsics, RelativePose
+from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.frontend.window.camera_pose import resect
 from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
-from slam.frontend.window.odometry import Segment, WindowState
+from slam.frontend.window.odometry import Segment
 from slam.se3 import FloatArray, apply, invert
 
 WINDOW_SOURCE = "window"
@@ -23,37 +23,49 @@ _LEAST_LENGTH = 1e-6
 
 @dataclass(frozen=True)
 class WindowPoses:
-    """Relative ``poses``, unscaled, and the segment of every frame that has one, by frame."""
+    """Relative ``poses`` and ``loops``, unscaled, and the segment of every frame that has a pose, by frame."""
 
     poses: Sequence[RelativePose] = ()
     segments: Mapping[int, int] = field(default_factory=dict)
+    loops: Sequence[RelativePose] = ()
 
     def within(self, pose: RelativePose) -> bool:
         """Whether both frames of a measurement have poses in one map."""
         first, last = (self.segments.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
+    def relates(self, first: int) -> bool:
+        """Whether the frames before ``first`` and those from it on have poses in one map."""
+        before = max((frame for frame in self.segments if frame < first), default=None)
+        after = min((frame for frame in self.segments if frame >= first), default=None)
+        return before is not None and after is not None and self.segments[before] == self.segments[after]
+
     def frames_of(self, segment: int) -> list[int]:
         """The frames of a segment."""
         return [frame for frame, number in self.segments.items() if number == segment]
 
 
-def window_poses(state: WindowState, intrinsics: Intrinsics, config: WindowConfig, seed: int = 0) -> WindowPoses:
-    """All relative poses of the maps so far, in the unit of learned depth.
+def window_poses(
+    maps: Sequence[Segment], intrinsics: Intrinsics, config: WindowConfig, seed: int = 0, loops: Sequence[Ends] = ()
+) -> WindowPoses:
+    """All relative poses of some maps, in the unit of learned depth.
 
     Args:
-        state: after some frame.
+        maps: of one drive.
         intrinsics: of all images.
         config: least sigmas, inliers.
         seed: of RANSAC.
+        loops: keyframes of one map that see the same place, by their frames.
     """
     poses: list[RelativePose] = []
+    closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
-    for number, segment in enumerate(part for part in state.segments if part.started):
+    for number, segment in enumerate(part for part in maps if part.started):
         found = _segment_poses(segment, intrinsics, config, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
-    return WindowPoses(poses, segments)
+        closing |= _loop_poses(segment.map, loops, intrinsics, config, seed)
+    return WindowPoses(poses, segments, [closing[ends] for ends in loops])
 
 
 def _segment_poses(segment: Segment, intrinsics: Intrinsics, config: WindowConfig, seed: int) -> list[RelativePose]:
@@ -77,6 +89,24 @@ def _segment_poses(segment: Segment, intrinsics: Intrinsics, config: WindowConfi
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
             found.append(_relative(nearest, frame.index, T_guess, sigmas, unit, config))
+    return found
+
+
+def _loop_poses(
+    local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, config: WindowConfig, seed: int
+) -> dict[Ends, RelativePose]:
+    """Between keyframes of this map, their sigmas by the points that both see."""
+    unit, keyframes = learned_unit(local), {keyframe.index: keyframe for keyframe in local.keyframes}
+    found = {}
+    for first, last in loops:
+        if first not in keyframes or last not in keyframes:
+            continue
+        before, after = keyframes[first], keyframes[last]
+        both = np.isin(after.track_ids, before.track_ids)
+        T = after.T_camera_world
+        seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, config, seed)
+        pose = _relative(before, last, T, None if seen is None else seen[1], unit, config)
+        found[first, last] = replace(pose, source=LOOP_SOURCE)
     return found
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from slam.config import WindowConfig
+from slam.frames import TrackingEvent
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses, window_poses
 from slam.se3 import FloatArray, rotation_angle, umeyama
-from slam.sequences.catalogue import open_sequence
 from slam.storage.serialisation import Serialiser
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
@@ -29,7 +29,7 @@ def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> Windo
 
 
 def poses(state: WindowState) -> WindowPoses:
-    return window_poses(state, room.INTRINSICS, CONFIG)
+    return window_poses(state.segments, room.INTRINSICS, CONFIG)
 
 
 def chained(found: WindowPoses) -> dict[int, FloatArray]:
@@ -91,7 +91,7 @@ def test_another_scene_begins_another_map() -> None:
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     truth = room.walk(40)
     whole = poses(tracked(truth))
-    serialiser = Serialiser(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe)
+    serialiser = Serialiser(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent)
     serialiser.write(tmp_path / "state", tracked(truth[:25]))
     odometry = WindowOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):
@@ -100,21 +100,3 @@ def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     for one, other in zip(whole.poses, resumed.poses, strict=True):
         np.testing.assert_array_equal(one.T_from_to, other.T_from_to)
         np.testing.assert_array_equal(one.sigmas, other.sigmas)
-
-
-@pytest.mark.data
-def test_a_real_hand_held_recording(data_root: Path) -> None:
-    recording = data_root / "handheld_kitchen"
-    sequence = open_sequence(recording / "images")
-    indices = range(0, 240, 3)
-    truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)[indices, :, 3]
-    odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
-    unknown = np.full((sequence.intrinsics.height, sequence.intrinsics.width), np.nan, np.float32)
-    for k in indices:
-        odometry.add(sequence.frame(k), unknown)
-    T = chained(window_poses(odometry.state(), sequence.intrinsics, WindowConfig()))
-    assert sorted(T) == list(indices)
-    estimate = np.stack([T[k] for k in indices])
-    similarity = umeyama(truth, estimate[:, :3, 3], with_scale=True)
-    error = np.linalg.norm(similarity.apply_to_poses(estimate)[:, :3, 3] - truth, axis=1)
-    assert np.sqrt((error**2).mean()) < 0.04

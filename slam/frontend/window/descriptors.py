@@ -1,0 +1,51 @@
+"""Descriptors of corners, by which they are known again in keyframes far apart: SIFT (Lowe 2004) as 256 bits.
+
+Bits in place of numbers: words, matching and files are those of the binary descriptors of loops. A value is coded by
+two thresholds, so that Hamming's distance is that of the sums of coded differences.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.frames import Grey
+from slam.se3 import FloatArray
+
+Descriptors = NDArray[np.uint8]
+
+BYTES = 32
+_SIZE_PX = 8.0
+# terciles of square roots of SIFT's normed values (Arandjelovic and Zisserman 2012) over the corners of a kitchen
+_LOW, _HIGH = 0.034, 0.082
+_RADIUS_PX = 15
+_BLUR_PX = 2.0
+
+
+def describe(grey: Grey, pixels: NDArray[np.floating[Any]]) -> Descriptors:
+    """Descriptors ``(M, 32)`` of corners ``(M, 2)``, each turned into its own direction."""
+    if not len(pixels):
+        return np.zeros((0, BYTES), np.uint8)
+    corners = [
+        cv2.KeyPoint(float(u), float(v), _SIZE_PX, float(angle), 1.0, 0, 0)
+        for (u, v), angle in zip(pixels, _directions_deg(grey, pixels), strict=True)
+    ]
+    _, values = cv2.SIFT.create().compute(grey, corners)
+    roots = np.sqrt(values / np.maximum(values.sum(axis=1, keepdims=True), 1e-9))
+    return np.packbits(np.concatenate([roots > _LOW, roots > _HIGH], axis=1), axis=1)
+
+
+def _directions_deg(grey: Grey, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+    """From each corner to the centroid of the grey levels around it (Rosin 1999), degrees in [0, 360)."""
+    y, x = np.mgrid[-_RADIUS_PX : _RADIUS_PX + 1, -_RADIUS_PX : _RADIUS_PX + 1]
+    inside = x**2 + y**2 <= _RADIUS_PX**2
+    x, y = x[inside], y[inside]
+    border = _RADIUS_PX + 1
+    blurred = cv2.GaussianBlur(grey, (0, 0), _BLUR_PX)
+    padded = cv2.copyMakeBorder(blurred, border, border, border, border, cv2.BORDER_REFLECT)
+    u, v = np.rint(pixels).astype(np.int64).T + border
+    around = padded[v[:, None] + y, u[:, None] + x].astype(np.float64)
+    return np.asarray(np.rad2deg(np.arctan2(around @ y, around @ x)) % 360.0)

@@ -1,0 +1,174 @@
+"""Maps of one drive joined: brought into one world, tracks of the same corner made one, all keyframes adjusted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.config import WindowConfig
+from slam.frames import Intrinsics
+from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise
+from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
+from slam.frontend.window.odometry import Segment, TrackedFrame
+from slam.se3 import FloatArray, apply, invert
+
+logger = logging.getLogger(__name__)
+
+# outliers are taken out at these multiples of their limit, from a start that is still off by the drift
+_OUTLIER_LIMITS = (4.0, 2.0, 1.0)
+_ITERATIONS = 20
+
+
+@dataclass(frozen=True)
+class SharedCorners:
+    """Corners seen by two keyframes, given by their rows: ``corners`` ``(M, 2)`` of the earlier and the later one."""
+
+    earlier: int
+    later: int
+    corners: NDArray[np.intp]
+
+
+def join(
+    segments: Sequence[Segment],
+    T_world_camera: FloatArray,
+    scales: FloatArray,
+    shared: Sequence[SharedCorners],
+    intrinsics: Intrinsics,
+    config: WindowConfig,
+) -> tuple[Segment, list[float]]:
+    """One map of several, or of one with loops; the segments stay as they are.
+
+    Args:
+        segments: in time order, started.
+        T_world_camera: of all their keyframes in one world ``(K, 4, 4)``.
+        scales: units of that world per unit of each keyframe's own map ``(K,)``.
+        shared: between keyframes, by rows of these.
+        intrinsics: of all images.
+        config: noise and outliers.
+
+    Returns:
+        The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
+    """
+    united = _united([_moved(*part) for part in _parts(segments, T_world_camera, scales)])
+    keyframes = united.map.keyframes
+    tracks = _merged_tracks(keyframes, len(united.map.points), shared)
+    joined = _renumbered(united, tracks)
+    _adjust_all(joined.map, intrinsics, config)
+    return joined, [_kept_ratio(each, keyframes, joined.map.keyframes, tracks) for each in shared]
+
+
+def _parts(
+    segments: Sequence[Segment], T_world_camera: FloatArray, scales: FloatArray
+) -> list[tuple[Segment, FloatArray, FloatArray]]:
+    ends = np.cumsum([0, *(len(segment.map.keyframes) for segment in segments)])
+    return [
+        (segment, T_world_camera[first:last], scales[first:last])
+        for segment, (first, last) in zip(segments, pairwise(ends), strict=True)
+    ]
+
+
+def _moved(segment: Segment, T_world_camera: FloatArray, scales: FloatArray) -> Segment:
+    """Points follow the first keyframe that sees them, frames the last keyframe before them."""
+    before = segment.map
+    points = np.full_like(before.points, np.nan)
+    for keyframe, T, scale in reversed(list(zip(before.keyframes, T_world_camera, scales, strict=True))):
+        own = apply(keyframe.T_camera_world, before.points[keyframe.track_ids])
+        points[keyframe.track_ids] = apply(T, scale * own)
+    T_camera_world = invert(T_world_camera)
+    keyframes = [replace(k, T_camera_world=T) for k, T in zip(before.keyframes, T_camera_world, strict=True)]
+    indices = np.array([keyframe.index for keyframe in keyframes])
+    frames = []
+    for frame in segment.frames:
+        row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
+        frames.append(_followed(frame, before.keyframes[row].T_camera_world, T_camera_world[row], scales[row]))
+    return Segment(LocalMap(keyframes, points), frames, segment.started)
+
+
+def _followed(
+    frame: TrackedFrame, T_keyframe_before: FloatArray, T_keyframe_world: FloatArray, scale: float
+) -> TrackedFrame:
+    if frame.T_camera_world is None:
+        return frame
+    T_frame_keyframe = frame.T_camera_world @ invert(T_keyframe_before)
+    T_frame_keyframe[:3, 3] *= scale
+    return replace(frame, T_camera_world=T_frame_keyframe @ T_keyframe_world)
+
+
+def _united(segments: Sequence[Segment]) -> Segment:
+    """The maps in one, with tracks numbered one map after the other."""
+    keyframes: list[WindowKeyframe] = []
+    frames: list[TrackedFrame] = []
+    first = 0
+    for segment in segments:
+        keyframes += [replace(keyframe, track_ids=keyframe.track_ids + first) for keyframe in segment.map.keyframes]
+        frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
+        first += len(segment.map.points)
+    points = np.concatenate([segment.map.points for segment in segments])
+    return Segment(LocalMap(keyframes, points), frames, started=True)
+
+
+def _merged_tracks(keyframes: Sequence[WindowKeyframe], count: int, shared: Sequence[SharedCorners]) -> TrackIds:
+    """For each track the first one of the same point ``(count,)``; a keyframe never sees a point twice."""
+    first = np.arange(count)
+    members: dict[int, list[int]] = {}
+    seen_by: dict[int, set[int]] = {}
+    for row, keyframe in enumerate(keyframes):
+        for track in keyframe.track_ids.tolist():
+            seen_by.setdefault(track, set()).add(row)
+    for each in sorted(shared, key=lambda one: -len(one.corners)):
+        tracks_earlier = keyframes[each.earlier].track_ids[each.corners[:, 0]]
+        tracks_later = keyframes[each.later].track_ids[each.corners[:, 1]]
+        for a, b in zip(first[tracks_earlier].tolist(), tracks_later.tolist(), strict=True):
+            one, other = sorted((int(first[a]), int(first[b])))
+            if one == other or seen_by[one] & seen_by[other]:
+                continue
+            seen_by[one] |= seen_by[other]
+            members.setdefault(one, [one]).extend(members.pop(other, [other]))
+            first[members[one]] = one
+    return first
+
+
+def _renumbered(segment: Segment, tracks: TrackIds) -> Segment:
+    keyframes = []
+    for keyframe in segment.map.keyframes:
+        merged = tracks[keyframe.track_ids]
+        keyframes.append(keyframe.with_corners(np.argsort(merged), merged))
+    points = segment.map.points.copy()
+    lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
+    points[tracks[lonely]] = points[lonely]
+    frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
+    return Segment(LocalMap(keyframes, points), frames, started=True)
+
+
+def _adjust_all(local: LocalMap, intrinsics: Intrinsics, config: WindowConfig) -> None:
+    """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
+    noise = Noise(config.pixel_sigma, huber=config.huber_sigmas)
+    for limit in _OUTLIER_LIMITS:
+        sightings, track_ids = local.sightings(range(len(local.keyframes)), np.isfinite(local.points[:, 0]))
+        free = np.arange(len(local.keyframes)) > 0
+        poses = np.array([keyframe.T_camera_world for keyframe in local.keyframes])
+        problem = BundleAdjustment(sightings, intrinsics, free, noise)
+        solved = problem.solve(poses, local.points[track_ids], _ITERATIONS, config.tolerance)
+        local.points[track_ids] = solved.points
+        bad = solved.residual_px > limit * config.outlier_px
+        for row, keyframe in enumerate(local.keyframes):
+            gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
+            local.keyframes[row] = replace(keyframe.without(gone), T_camera_world=solved.T_camera_world[row])
+        dead = track_ids[np.bincount(sightings.point[~bad], minlength=len(track_ids)) < 2]
+        local.points[dead] = np.nan
+        logger.info("all %d keyframes adjusted: %d sightings, %d outliers", len(poses), len(sightings), bad.sum())
+
+
+def _kept_ratio(
+    shared: SharedCorners, before: Sequence[WindowKeyframe], after: Sequence[WindowKeyframe], tracks: TrackIds
+) -> float:
+    seen = [
+        np.isin(tracks[before[row].track_ids[corners]], after[row].track_ids)
+        for row, corners in zip((shared.earlier, shared.later), shared.corners.T, strict=True)
+    ]
+    return float(np.mean(seen[0] & seen[1]))

@@ -1,0 +1,206 @@
+"""Maps of keyframes closed after the last frame: loops among all keyframes, maps joined, everything adjusted once."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from slam.config import SlamConfig
+from slam.frames import Intrinsics, RelativePose, RelativeSimilarity, TrackingEvent
+from slam.frontend.window.joining import SharedCorners, join
+from slam.frontend.window.local_map import LocalMap, WindowKeyframe
+from slam.frontend.window.odometry import Segment
+from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.loops.closure import LoopClosures
+from slam.loops.descriptors import View
+from slam.loops.maps import MapLoop, find_map_loops
+from slam.loops.verification import Loop, RejectedLoop
+from slam.se3 import FloatArray, apply, invert, make
+from slam.similarity_graph import optimise_similarities
+
+logger = logging.getLogger(__name__)
+
+# keyframes that share so many tracks are in one place already
+_CONNECTED = 10
+_NEIGHBOURS = 3
+# a loop is wrong if fewer of its corners are one point after the adjustment
+_LEAST_KEPT = 0.5
+# of neighbouring keyframes: rotation, translation over the step, logarithm of the scale
+_ROTATION_SIGMA, _RELATIVE_SIGMA, _SCALE_SIGMA = 0.005, 0.03, 0.02
+_LEAST_SIGMA = 1e-4
+
+
+@dataclass(frozen=True)
+class MapClosure:
+    """Poses by the closed maps, their accepted ``loops``, the rejected ones, and the maps that were joined."""
+
+    poses: WindowPoses
+    loops: tuple[MapLoop, ...] = ()
+    rejected: tuple[RejectedLoop, ...] = ()
+    candidates: int = 0
+    measured: int = 0
+    joins: tuple[TrackingEvent, ...] = ()
+
+    def closures(self, scaled: Sequence[RelativePose]) -> LoopClosures:
+        """The loops, by their relative poses in the unit of the trajectory."""
+        accepted = (Loop(pose, loop.inliers, loop.score) for pose, loop in zip(scaled, self.loops, strict=True))
+        rejected = sorted(self.rejected, key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
+        return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
+
+
+def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConfig, seed: int = 0) -> MapClosure:
+    """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
+
+    Args:
+        maps: of one drive, in time order; they stay as they are.
+        intrinsics: of all images.
+        config: of loops and keyframes.
+        seed: of RANSAC.
+    """
+    maps = [segment for segment in maps if segment.started]
+    rows = _Rows(maps)
+    if not maps:
+        return MapClosure(WindowPoses())
+    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, config.loops, seed)
+    loops, rejected = list(found.found), list(found.rejected)
+    while True:
+        closed, wrong = _closed(rows, loops, intrinsics, config)
+        if not wrong:
+            break
+        loops = [loop for loop in loops if loop not in wrong]
+        rejected += [rows.refused(loop, "its corners are not the same points after the adjustment") for loop in wrong]
+    ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
+    poses = window_poses(closed, intrinsics, config.window, seed, ends)
+    joins = rows.joins(loops)
+    for joined in joins:
+        logger.info("%s", joined)
+    return MapClosure(poses, tuple(loops), tuple(rejected), found.candidates, found.measured, joins)
+
+
+def views_of(local: LocalMap) -> list[View]:
+    """The keyframes of a map: corners with their points in the camera."""
+    found = []
+    for keyframe in local.keyframes:
+        points = apply(keyframe.T_camera_world, local.points[keyframe.track_ids]).astype(np.float32)
+        found.append(View(keyframe.index, keyframe.pixels.astype(np.float32), keyframe.descriptors, points))
+    return found
+
+
+class _Rows:
+    """The keyframes of all maps, row by row."""
+
+    def __init__(self, maps: Sequence[Segment]) -> None:
+        self.segments = maps
+        self.keyframes: list[WindowKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
+        counts = [len(segment.map.keyframes) for segment in maps]
+        self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
+        self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
+
+    def views(self) -> list[View]:
+        """Corners with their points in the camera."""
+        return [view for segment in self.segments for view in views_of(segment.map)]
+
+    def apart(self) -> NDArray[np.bool_]:
+        """Which keyframes share few tracks ``(K, K)``."""
+        first = np.cumsum([0, *(len(segment.map.points) for segment in self.segments)])
+        tracks = [k.track_ids + first[number] for k, number in zip(self.keyframes, self.maps, strict=True)]
+        of_row = np.repeat(np.arange(len(tracks)), [len(each) for each in tracks])
+        shape = len(tracks), int(first[-1])
+        seen = csr_array((np.ones(len(of_row)), (of_row, np.concatenate(tracks))), shape=shape)
+        return np.asarray((seen @ seen.T).toarray() < _CONNECTED)
+
+    def refused(self, loop: MapLoop, reason: str) -> RejectedLoop:
+        """A loop rejected after all."""
+        first, last = (self.keyframes[row].index for row in loop.rows)
+        return RejectedLoop(first, last, reason, loop.score, loop.inliers, loop.similarity.T_from_to)
+
+    def joins(self, loops: Sequence[MapLoop]) -> tuple[TrackingEvent, ...]:
+        """Each map after the first that loops join with an earlier one."""
+        found = []
+        for number, segment in enumerate(self.segments):
+            rows = [loop.rows for loop in loops if self.maps[loop.rows[1]] == number != self.maps[loop.rows[0]]]
+            joining = [self.keyframes[row].index for row, _ in rows]
+            if joining:
+                first = segment.map.keyframes[0].index
+                found.append(TrackingEvent(first, "map joined", joining[0], len(joining)))
+        return tuple(found)
+
+    def start(self, loops: Sequence[MapLoop], members: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+        """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
+        T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
+        done = {int(members[0])}
+        across = sorted(loops, key=lambda loop: -loop.inliers)
+        while len(done) < len(members):
+            loop = next(loop for loop in across if len(done & set(self.maps[list(loop.rows)].tolist())) == 1)
+            known, new = loop.rows
+            similarity = loop.similarity
+            T_known_new, scale = similarity.T_from_to, similarity.scale
+            if int(self.maps[known]) not in done:
+                known, new = new, known
+                T_known_new, scale = invert(T_known_new), 1.0 / scale
+                T_known_new[:3, 3] *= scale
+            number = int(self.maps[new])
+            scales[self.maps == number] = scale * scales[known]
+            T_step = make(T_known_new[:3, :3], scales[known] * T_known_new[:3, 3])
+            T_new_each = invert(self.T_map_camera[new]) @ self.T_map_camera[self.maps == number]
+            T_new_each[:, :3, 3] *= scales[new]
+            T[self.maps == number] = T[known] @ T_step @ T_new_each
+            done.add(number)
+        return T, scales
+
+
+def _closed(
+    rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics, config: SlamConfig
+) -> tuple[list[Segment], list[MapLoop]]:
+    """The maps after these loops, and the loops that the adjustment contradicts."""
+    count = len(rows.segments)
+    ends = rows.maps[np.array([loop.rows for loop in loops], np.intp).reshape(-1, 2)]
+    links = csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, group = connected_components(links, directed=False)
+    closed, wrong = [], []
+    for number in np.unique(group):
+        members = np.flatnonzero(group == number)
+        inside = [loop for loop in loops if group[rows.maps[loop.rows[0]]] == number]
+        if not inside:
+            closed += [rows.segments[member] for member in members]
+            continue
+        joined, kept = _joined(rows, inside, members, intrinsics, config)
+        closed.append(joined)
+        wrong += [loop for loop, ratio in zip(inside, kept, strict=True) if ratio < _LEAST_KEPT]
+    return closed, wrong
+
+
+def _joined(
+    rows: _Rows, loops: Sequence[MapLoop], members: NDArray[np.intp], intrinsics: Intrinsics, config: SlamConfig
+) -> tuple[Segment, list[float]]:
+    T, scales = rows.start(loops, members)
+    chosen = np.flatnonzero(np.isin(rows.maps, members))
+    place = np.full(len(rows.keyframes), -1)
+    place[chosen] = np.arange(len(chosen))
+    edges = _steps(rows, chosen)
+    edges += [
+        replace(loop.similarity, from_index=int(place[loop.rows[0]]), to_index=int(place[loop.rows[1]]))
+        for loop in loops
+    ]
+    T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
+    shared = [SharedCorners(int(place[loop.rows[0]]), int(place[loop.rows[1]]), loop.corners) for loop in loops]
+    return join([rows.segments[member] for member in members], T, scales, shared, intrinsics, config.window)
+
+
+def _steps(rows: _Rows, chosen: NDArray[np.intp]) -> list[RelativeSimilarity]:
+    """Between neighbouring keyframes of one map, whose unit hardly changes."""
+    edges = []
+    for first, row in enumerate(chosen):
+        for last in range(first + 1, min(first + 1 + _NEIGHBOURS, len(chosen))):
+            if rows.maps[row] == rows.maps[chosen[last]]:
+                T = invert(rows.T_map_camera[row]) @ rows.T_map_camera[chosen[last]]
+                length = _RELATIVE_SIGMA * float(np.linalg.norm(T[:3, 3])) + _LEAST_SIGMA
+                sigmas = np.concatenate([np.full(3, _ROTATION_SIGMA), np.full(3, length), [_SCALE_SIGMA]])
+                edges.append(RelativeSimilarity(first, last, T, 1.0, sigmas))
+    return edges

@@ -1,0 +1,136 @@
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.config import SlamConfig, WindowConfig
+from slam.frontend.window.odometry import WindowOdometry, WindowState
+from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.pipeline.keyframe_tracking import KeyframeTracking
+from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
+from slam.sequences.catalogue import open_sequence
+
+_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
+assert _SPEC is not None
+assert _SPEC.loader is not None
+room = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(room)
+
+CONFIG = SlamConfig(window=WindowConfig(max_corners=400))
+
+
+def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> FloatArray:
+    """Down along both walls, turning away from the start, and back to it, rolled and closer."""
+    phase = np.linspace(0.0, 1.0, frames)
+    away = np.sin(np.pi * phase)
+    centres = np.column_stack([0.2 * np.sin(4 * np.pi * phase), 1.3 * away, closer * phase])
+    turns = np.column_stack([-0.35 * away, 0.02 * np.sin(9.0 * phase), roll * phase])
+    return from_rotation_vector(turns, centres)
+
+
+def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
+    odometry = WindowOdometry(CONFIG.window, room.INTRINSICS)
+    for k, T in enumerate(T_world_camera):
+        odometry.add(room.frame(k, T, 0 if seeds is None else seeds[k]), room.depth_map(T))
+    return odometry.state()
+
+
+def closed(state: WindowState) -> MapClosure:
+    return close_maps(state.segments, room.INTRINSICS, CONFIG)
+
+
+def errors(found: WindowPoses, truth: FloatArray) -> tuple[float, float]:
+    """Of the last map: root mean square of aligned positions, largest of rotations since its first frame in degrees."""
+    last = max(found.segments.values())
+    poses = [pose for pose in found.poses if found.segments[pose.to_index] == last]
+    T = {poses[0].from_index: np.eye(4)}
+    for pose in sorted(poses, key=lambda pose: pose.to_index):
+        T[pose.to_index] = T[pose.from_index] @ pose.T_from_to
+    frames = sorted(T)
+    estimate, true = np.stack([T[k] for k in frames]), truth[frames]
+    similarity = umeyama(true[:, :3, 3], estimate[:, :3, 3], with_scale=True)
+    aligned = similarity.apply_to_poses(estimate)
+    distance = np.linalg.norm(aligned[:, :3, 3] - true[:, :3, 3], axis=1)
+    since_first = true[0, :3, :3].T @ true[:, :3, :3]
+    turned = rotation_angle(np.swapaxes(estimate[:, :3, :3], 1, 2) @ since_first)
+    return float(np.sqrt((distance**2).mean())), float(np.rad2deg(turned).max())
+
+
+def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_closer() -> None:
+    walked = there_and_back(110, roll=0.4, closer=0.3)
+    truth = np.concatenate([walked[:30], walked[48:]])
+    state = tracked(truth, [0] * 30 + [9] * 11 + [0] * 51)
+    assert sum(segment.started for segment in state.segments) == 2
+    assert [event.event for event in state.events] == ["map begun", "lost", "map begun"]
+    after = closed(state)
+    assert len(set(after.poses.segments.values())) == 1
+    (join,) = after.joins
+    assert join.event == "map joined"
+    assert join.other is not None
+    assert join.other < 30 < 41 <= join.frame
+    position, rotation = errors(after.poses, truth)
+    assert position < 0.01
+    assert rotation < 0.3
+    for pose, loop in zip(after.poses.loops, after.loops, strict=True):
+        T = invert(truth[pose.from_index]) @ truth[pose.to_index]
+        assert np.rad2deg(rotation_angle(T[:3, :3].T @ loop.similarity.T_from_to[:3, :3])) < 3.0
+
+
+def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
+    walked = there_and_back(110, roll=0.4, closer=0.3)
+    truth = np.concatenate([walked[:60], walked[82:]])
+    seeds = [0] * 60 + [9] * 6 + [0] * 22
+    tracking = KeyframeTracking(
+        WindowConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
+    )
+    for k, T in enumerate(truth):
+        tracking.add(room.frame(k, T, seeds[k]), room.depth_map(T))
+    state = tracking.state()
+    assert state is not None
+    _, lost, found = state.events
+    assert (lost.event, lost.frame) == ("lost", 60)
+    assert (found.event, found.frame) == ("relocalised", 66)
+    assert found.other is not None
+    assert found.other < 40
+    poses = tracking.poses(state.segments)
+    assert set(poses.segments) == {*range(60), *range(66, 88)}
+    position, rotation = errors(poses, truth)
+    assert position < 0.01
+    assert rotation < 0.3
+
+
+def test_another_scene_is_no_loop() -> None:
+    walked = there_and_back(110)
+    after = closed(tracked(np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
+    assert after.loops == ()
+    assert after.joins == ()
+    assert len(set(after.poses.segments.values())) == 2
+
+
+@pytest.mark.data
+def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
+    recording = data_root / "handheld_kitchen"
+    sequence = open_sequence(recording / "images")
+    indices = range(0, 320, 4)
+    truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
+    odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
+    unknown = np.full((sequence.intrinsics.height, sequence.intrinsics.width), np.nan, np.float32)
+    for k in indices:
+        odometry.add(replace(sequence.frame(k), index=k // 4), unknown)
+    maps = odometry.state().segments
+    before = window_poses(maps, sequence.intrinsics, WindowConfig())
+    after = close_maps(maps, sequence.intrinsics, SlamConfig())
+    T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))
+    T_world_camera[:, :3] = truth
+    assert sorted(before.segments) == list(range(80))
+    T_world_camera = T_world_camera[indices]
+    assert len(after.loops) >= 8
+    for pose in after.poses.loops:
+        T = invert(T_world_camera[pose.from_index]) @ T_world_camera[pose.to_index]
+        assert np.rad2deg(rotation_angle(T[:3, :3].T @ pose.T_from_to[:3, :3])) < 5.0
+    error = errors(before, T_world_camera)[0]
+    assert error < 0.04
+    assert errors(after.poses, T_world_camera)[0] < 0.95 * error

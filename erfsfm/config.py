@@ -170,8 +170,11 @@ class TrainingConfig(Section):
     )
     batch: int = Field(default=4, ge=1, le=1024, description="snippets per step and device")
     devices: int = Field(
-        default=1, ge=1, description="GPUs, or processes on a CPU; batch normalisation is synchronised on GPUs alone"
+        default=1,
+        ge=1,
+        description="GPUs of a machine, or processes on its CPU; batch normalisation is synchronised on GPUs alone",
     )
+    nodes: int = Field(default=1, ge=1, description="machines, on each of which the same command is started")
     networks: Literal["both", "depth", "pose"] = Field(
         default="both", description="trained networks; the other one keeps its weights"
     )
@@ -206,6 +209,11 @@ class TrainingConfig(Section):
     )
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation")
 
+    @property
+    def processes(self) -> int:
+        """Number of processes on all machines."""
+        return self.nodes * self.devices
+
 
 class ExperimentConfig(Section):
     """One complete experiment."""
@@ -233,8 +241,10 @@ class ExperimentConfig(Section):
             raise ValueError("loss.mask_weight needs network.masks: true")
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
-        if self.training.minutes > 0 and self.training.devices > 1:
-            raise ValueError("training.minutes needs training.devices: 1: the clocks of several would differ")
+        if self.training.minutes > 0 and self.training.processes > 1:
+            raise ValueError(
+                "training.minutes needs training.devices: 1 and training.nodes: 1: the clocks of several would differ"
+            )
         return self
 
 

@@ -50,7 +50,7 @@ class Snippet:
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
-    """Random snippets number ``first_draw`` to ``draws``; whole batches are distributed to devices and workers."""
+    """Random snippets number ``first_draw`` to ``draws``; whole batches are distributed to processes and workers."""
 
     def __init__(
         self,
@@ -76,9 +76,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
         index, count = (worker.id, worker.num_workers) if worker else (0, 1)
-        batch, devices = self._config.training.batch, self._config.training.devices
+        batch, processes = self._config.training.batch, self._config.training.processes
         mine = self._first_draw + self._rank * batch
-        for number, first in enumerate(range(mine, self._draws, batch * devices)):
+        for number, first in enumerate(range(mine, self._draws, batch * processes)):
             if number % count == index:
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 

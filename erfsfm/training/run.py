@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 import signal
 import sys
 import warnings
@@ -36,6 +35,7 @@ from erfsfm.threads import single_threaded_opencv
 from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.output_folder import OutputFolder
+from erfsfm.training.processes import rank_of
 from erfsfm.training.progress import ProgressLine
 from erfsfm.training.supervision import measured_views
 
@@ -52,7 +52,7 @@ def train(
 ) -> Path:
     """Train, validate, keep the best.
 
-    With several devices, Lightning starts this program again for each further one; these processes exit here.
+    Of several processes (see `rank_of`) all but the first exit here; those of other nodes share the output folder.
 
     Args:
         config: the experiment.
@@ -71,7 +71,7 @@ def train(
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
     folder = OutputFolder(output)
-    rank = int(os.environ.get("LOCAL_RANK", 0)) if config.training.devices > 1 else 0
+    rank = rank_of(config.training)
     done_steps = 0
     if resume:
         done_steps = folder.resumable_steps(config)
@@ -83,7 +83,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    together = config.training.batch * config.training.devices
+    together = config.training.batch * config.training.processes
     many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
     draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
@@ -200,11 +200,12 @@ def _trainer(
     # Lightning's CSV log starts by deleting an older one of its name
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
-    progress = [] if quiet else [ProgressLine(training.batch * training.devices)]
-    several = training.devices > 1
+    progress = [] if quiet else [ProgressLine(training.batch * training.processes)]
+    several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
         devices=training.devices,
+        num_nodes=training.nodes,
         # loss terms and scales that are off leave weights without gradient
         strategy=DDPStrategy(find_unused_parameters=True) if several else "auto",
         sync_batchnorm=several and not on_cpu,

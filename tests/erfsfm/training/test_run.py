@@ -10,6 +10,7 @@ import os
 import pickle
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -732,11 +733,17 @@ def test_half_precision_of_tiny_images_on_a_cpu_is_refused(
 
 
 @pytest.mark.slow  # each process imports torch and Lightning
-@pytest.mark.parametrize("workers", [0, 1])
+def free_port() -> int:
+    with socket.socket() as each:
+        each.bind(("127.0.0.1", 0))
+        return int(each.getsockname()[1])
+
+
+@pytest.mark.parametrize(("spread", "workers"), [("devices", 1), ("nodes", 0)])
 def test_two_processes_are_one_with_twice_the_batch(
-    small: Small, world: Path, held_out: Path, tmp_path: Path, workers: int
+    small: Small, world: Path, held_out: Path, tmp_path: Path, spread: str, workers: int
 ) -> None:
-    """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for the second."""
+    """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for a second device."""
     script = tmp_path / "train.py"
     script.write_text(
         "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
@@ -751,17 +758,29 @@ def test_two_processes_are_one_with_twice_the_batch(
         file = tmp_path / f"{name}.yaml"
         file.write_text(dump_yaml(config))
         command = [sys.executable, str(script), str(file), str(tmp_path / name), *(["--resume"] if resume else [])]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout == "trained\n", "by the first process alone"
+        nodes = config.training.nodes
+        at = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())} if nodes > 1 else {}
+        started = [
+            subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, **at, "NODE_RANK": str(node)},
+            )
+            for node in range(nodes)
+        ]
+        said = [process.communicate(timeout=300) for process in started]
+        assert [process.returncode for process in started] == [0] * nodes, said
+        assert "".join(out for out, _ in said) == "trained\n", "by the first process alone"
 
     run("one", batch=4)
-    run("two", batch=2, devices=2)
+    run("two", batch=2, **{spread: 2})
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
     records = [load_model(tmp_path / name / "last").record for name in ("one", "two")]
     assert records[0].metrics == pytest.approx(records[1].metrics, rel=1e-4)
-    run("two", resume=True, batch=2, devices=2, steps=6)
+    run("two", resume=True, batch=2, steps=6, **{spread: 2})
     run("one", resume=True, batch=4, steps=6)
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments

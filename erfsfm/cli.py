@@ -8,11 +8,13 @@ import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from erfsfm import __version__, command_line
+from erfsfm.cli_evaluate import evaluate_app
+from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
 from erfsfm.cli_pack import pack
 
 app = typer.Typer(
@@ -21,15 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Self-supervised depth and ego-motion networks with wide receptive fields.",
 )
-evaluate_app = typer.Typer(no_args_is_help=True, help="Depth and pose errors of trained networks.")
 app.add_typer(evaluate_app, name="evaluate")
-
-Device = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="where to compute")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of the random numbers")]
-UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, help="accepted for old scripts; nothing is random")]
-Weights = Annotated[str, typer.Option(help="a shipped name (default, sim) or a training output folder")]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exactly as the reference code")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -268,72 +262,8 @@ def calibrate_noise(
     predictor = DepthPosePredictor.from_weights(weights, device)
     noise, rows = calibrate(predictor, dataset, sequence or (), allow_leak, predictor.pose_sha256)
     write_pose_noise(folder, noise)
-    _print_result(rows, as_json)
+    print_rows(rows, as_json)
     typer.echo(f"noise in {folder / NOISE_FILE}", err=True)
-
-
-@evaluate_app.command("depth")
-def evaluate_depth(
-    dataset: Annotated[
-        Path, typer.Option(help="a root with true depth (erfsfm-slam simulate --depth), or KITTI raw with --split")
-    ],
-    weights: Weights = "default",
-    split: Annotated[
-        str | None,
-        typer.Option(help="frames of KITTI raw: eigen, a YAML split, or a file of lines 'drive frame' or image paths"),
-    ] = None,
-    fidelity: Fidelity = "default",
-    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
-    device: Device = "auto",
-    seed: UnusedSeed = 0,
-    as_json: Json = False,
-) -> None:
-    """Depth errors under 80 m: Eigen's protocol with --split, else every fifth frame beside a median depth map.
-
-    Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
-    """
-    from erfsfm.errors import ConfigError
-    from erfsfm.evaluation.eigen import eigen_protocol
-    from erfsfm.evaluation.protocols import depth_protocol
-    from erfsfm.inference import DepthPosePredictor
-
-    if fidelity == "paper" and split is None:
-        raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
-    predictor = DepthPosePredictor.from_weights(weights, device)
-    if split is None:
-        _print_result(depth_protocol(predictor, dataset, allow_leak), as_json)
-    else:
-        _print_result(eigen_protocol(predictor, dataset, split, fidelity, allow_leak), as_json)
-
-
-@evaluate_app.command("pose")
-def evaluate_pose(
-    dataset: Annotated[Path, typer.Option(help="a KITTI odometry root with poses")],
-    sequence: Annotated[list[str], typer.Option(help="sequence names, or frames of one: 00[250:300]; repeat")],
-    weights: Weights = "default",
-    fidelity: Fidelity = "default",
-    allow_leak: Annotated[bool, typer.Option("--allow-leak", help="evaluate frames seen in training")] = False,
-    device: Device = "auto",
-    seed: UnusedSeed = 0,
-    as_json: Json = False,
-) -> None:
-    """Five-frame snippet ATE and RE, beside constant velocity straight ahead as a baseline.
-
-    Example: erfsfm evaluate pose --weights default --dataset KITTI --sequence 09 --sequence 10
-    """
-    from erfsfm.evaluation.protocols import pose_protocol
-    from erfsfm.inference import DepthPosePredictor
-
-    predictor = DepthPosePredictor.from_weights(weights, device)
-    _print_result(pose_protocol(predictor, dataset, sequence, fidelity, allow_leak), as_json)
-
-
-def _print_result(rows: list[dict[str, Any]], as_json: bool) -> None:
-    if as_json:
-        typer.echo(json.dumps(rows, indent=2))
-        return
-    for row in rows:
-        typer.echo("  ".join(f"{k} {v:.4f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
 
 
 def main() -> None:

@@ -85,29 +85,38 @@ def pose_protocol(
         DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
             not allowed.
     """
-    found: dict[str, list[Recording]] = {}
-    for each in discover(root):
-        for name in {each.name, each.sequence} if each.sequence else ():
-            found.setdefault(name, []).append(each)
     rows = []
     for name in sequences:
-        span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
-        if span.recording not in found:
-            raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
-        camera = found[span.recording][0].images[0].parent
-        wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
-        parts = [whole.within(span.start, span.stop) for whole in wholes]
-        chosen = [part for part in parts if part is not None]
-        if not chosen:
-            raise DataError(f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}")
-        for recording in chosen:
+        for recording in named_recordings(root, name):
             T_world_camera = recording.true_poses(fidelity)
             if T_world_camera is None:
                 raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
             leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-            shown = recording.name if [recording] == wholes else recording.frames_name
+            shown = recording.frames_name if "[" in name else recording.name
             rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
     return rows
+
+
+def named_recordings(root: Path, name: str) -> list[Recording]:
+    """Recordings of a sequence, or their part that a name with frames means (``00[250:300]``); of its first camera.
+
+    Raises:
+        DataError: the sequence is missing, or has none of the frames.
+    """
+    found: dict[str, list[Recording]] = {}
+    for each in discover(root):
+        for known in {each.name, each.sequence or each.name}:
+            found.setdefault(known, []).append(each)
+    span = FrameRange(name, 0, EVERYTHING) if name in found else FrameRange.parse(name)
+    if span.recording not in found:
+        raise DataError(f"no sequence {span.recording} in {root}: found {', '.join(sorted(found)) or 'none'}")
+    camera = found[span.recording][0].images[0].parent
+    wholes = [whole for whole in found[span.recording] if whole.images[0].parent == camera]
+    parts = [whole.within(span.start, span.stop) for whole in wholes]
+    chosen = [part for part in parts if part is not None]
+    if not chosen:
+        raise DataError(f"{name} names no frame of a recording: found {', '.join(w.frames_name for w in wholes)}")
+    return chosen
 
 
 def _pose_rows(

@@ -59,6 +59,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
     (r"--worlds( \d+)+", "--worlds 620"),
     (r"^(python tools/benchmark.py .*)--frames \d+", r"\1--frames 32"),
     (r"--growth( \d+)+", "--growth 12 16"),
+    (r"^(python tools/benchmark.py maps .*)--parts( '[^']+')+", r"\1--parts"),
     (r"^(python tools/kiss_icp.*)--frames 0:120", r"\1--frames 0:12"),
 )
 
@@ -77,6 +78,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),
     (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/calibration renders them"),
+    (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
     (r"^erfsfm-slam live ", "it wants a camera; tests/slam/live has folders and videos that go on"),
     (r"slam_node.py", "rclpy is on no package index; tests/slam/live runs its callbacks"),

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import torch
 from pydantic import ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
 
 from erfsfm.config import NetworkConfig
@@ -118,8 +118,9 @@ def save_model(folder: Path, model: Model, half: bool = False) -> None:
     for name, net in zip(FILES, (model.depth_net, model.pose_net)):
         if isinstance(net, Absent):
             continue
-        tensors = {key: _stored(key, value, half) for key, value in net.state_dict().items()}
-        write_atomically(folder / name, lambda path, t=tensors: save_file(t, path))  # type: ignore[misc]
+        # through memory: errors of a full disk come from the library as an exception of its own
+        content = save({key: _stored(key, value, half) for key, value in net.state_dict().items()})
+        write_atomically(folder / name, lambda path, content=content: path.write_bytes(content))  # type: ignore[misc]
     text = dump_yaml(model.record)
     write_atomically(folder / "model.yaml", lambda path: path.write_text(text))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,6 +65,7 @@ def load_config(
     overrides: Sequence[str],
     shipped: Sequence[Path],
     old_names: OldNames | None = None,
+    sections: Collection[str] | None = None,
 ) -> M:
     """Read a configuration and change some of its keys.
 
@@ -74,6 +75,7 @@ def load_config(
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
         shipped: folders of named configurations, the first one that has a name wins.
         old_names: of earlier releases.
+        sections: of the file that are read, the others keep their defaults; None for all of them.
 
     Raises:
         ConfigError: one line that names the key and the file or override, what came and what is allowed.
@@ -84,6 +86,8 @@ def load_config(
     if file_or_name is not None:
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), _read_tree(path)
+        if sections is not None:
+            tree = {name: tree[name] for name in sections if name in tree}
         old_names.refuse(tree, origin)
     for text in overrides:
         change: dict[str, Any] = {}

@@ -194,7 +194,7 @@ class MappingConfig(Section):
         default=245,
         ge=1,
         le=256,
-        description="level of all colours from which on a pixel above the horizon is sky",
+        description="level of all colours from which on a pixel above the horizon is sky, if the upper border is too",
     )
     sky_blueness: int = Field(
         default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"
@@ -277,3 +277,14 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
     return load_sections(SlamConfig, file_or_name, overrides)
+
+
+def load_stored(path: Path, *sections: str) -> SlamConfig:
+    """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
+
+    A run of an earlier release may have keys elsewhere that are gone.
+
+    Raises:
+        ConfigError: one line that names the key or file, what came and what is allowed.
+    """
+    return load_sections(SlamConfig, path, (), sections)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -60,13 +60,20 @@ OLD_NAMES = OldNames(
 )
 
 
-def load_sections(model: type[M], file_or_name: str | Path | None, overrides: Sequence[str]) -> M:
+def load_sections(
+    model: type[M],
+    file_or_name: str | Path | None,
+    overrides: Sequence[str],
+    sections: Collection[str] | None = None,
+) -> M:
     """Read a YAML file, or one of those under ``configs/slam`` by its name, and apply ``section.key=value`` overrides.
+
+    ``sections`` are those of the file that are read; None for all of them.
 
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.
     """
     try:
-        return load_tree(model, file_or_name, overrides, SHIPPED, OLD_NAMES)
+        return load_tree(model, file_or_name, overrides, SHIPPED, OLD_NAMES, sections)
     except erfsfm.errors.ConfigError as error:
         raise ConfigError(str(error)) from error

@@ -27,11 +27,6 @@ from slam.se3 import FloatArray, invert, is_se3
 _ANCHOR_SIGMA = 1e-6
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
 _OUTLYING = 3.0
-# iSAM2: threshold of relinearisation, and of convergence
-_RELINEARISE = 1e-3
-_CONVERGED = 1e-4
-_MOST_UPDATES = 20
-_SAME_RATIO = 0.01
 
 logger = logging.getLogger(__name__)
 
@@ -184,91 +179,6 @@ class PoseGraph:
         logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
 
 
-class IncrementalPoseGraph:
-    """The same factors solved incrementally by iSAM2 (Kaess et al. 2012).
-
-    iSAM2 updates the weight of a robust factor only where it relinearises, so it does that often. Factors whose
-    measurement was changed by later frames are replaced.
-    """
-
-    def __init__(self, config: PoseGraphConfig) -> None:
-        self._config = config
-        self._kernel = "none" if config.kernel == "none" else "huber"
-        self._restart()
-
-    def update(self, relative_poses: Sequence[RelativePose], T_world_camera_initial: FloatArray) -> FloatArray:
-        """Replace the graph's factors by these and solve.
-
-        Args:
-            relative_poses: all factors, at most one by each source between two frames in one direction.
-            T_world_camera_initial: dead reckoning ``(N, 4, 4)``; only its steps to new frames are used.
-
-        Returns:
-            ``T_world_camera`` ``(N, 4, 4)``.
-
-        Raises:
-            SlamError: frames are not connected or the system cannot be solved.
-        """
-        _check_connected(relative_poses, len(T_world_camera_initial))
-        wanted = {(edge.from_index, edge.to_index, edge.source): edge for edge in relative_poses}
-        try:
-            self._replace(wanted, T_world_camera_initial)
-        except RuntimeError as error:  # iSAM2 is not usable after an indeterminate system
-            logger.warning("iSAM2 is restarted: %s", _first_line(error))
-            self._restart()
-            initial = PoseGraph(self._config)
-            initial.add_relative(*relative_poses)
-            T_solved = initial.optimise(T_world_camera_initial)
-            try:
-                self._replace(wanted, T_solved)
-            except RuntimeError as again:
-                self._restart()
-                raise SlamError(f"the pose graph cannot be solved: {_first_line(again)}") from again
-        return self._T_world_camera.copy()
-
-    def _restart(self) -> None:
-        parameters = gtsam.ISAM2Params()
-        parameters.relinearizeSkip = 1
-        parameters.setRelinearizeThreshold(_RELINEARISE)
-        parameters.findUnusedFactorSlots = True
-        self._isam = gtsam.ISAM2(parameters)
-        self._held: dict[tuple[int, int, str], tuple[RelativePose, int]] = {}
-        self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
-
-    def _replace(self, wanted: dict[tuple[int, int, str], RelativePose], T_world_camera_initial: FloatArray) -> None:
-        gone = [key for key, (edge, _) in self._held.items() if key not in wanted or _differ(edge, wanted[key])]
-        slots = [self._held.pop(key)[1] for key in gone]
-        fresh = [key for key in wanted if key not in self._held]
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for key in fresh:
-            factors.add(_between(wanted[key], self._kernel, self._config))
-        count = len(self._T_world_camera)
-        T_world_last = self._T_world_camera[-1] if count else T_world_camera_initial[0]
-        T_last_start = T_world_last @ invert(T_world_camera_initial[max(count - 1, 0)])
-        for k in range(count, len(T_world_camera_initial)):
-            values.insert(k, _pose3(T_last_start @ T_world_camera_initial[k]))
-        if not count:
-            factors.add(_anchor(values.atPose3(0)))
-        result = self._isam.update(factors, values, slots)
-        self._held |= {
-            key: (wanted[key], slot) for key, slot in zip(fresh, result.getNewFactorsIndices(), strict=False)
-        }
-        T_before = None
-        for _ in range(_MOST_UPDATES):
-            T = np.stack(
-                [p.matrix() for p in map(self._isam.calculateEstimatePose3, range(len(T_world_camera_initial)))]
-            )
-            if T_before is not None and np.abs(T - T_before).max() < _CONVERGED:
-                break
-            T_before = T
-            self._isam.update()
-        if not np.isfinite(T).all():
-            raise RuntimeError("the solution is not finite")
-        T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()
-        T[0] = T_world_camera_initial[0]
-        self._T_world_camera = T
-
-
 def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
     """Whitened squared 6-dof residual ``(F,)`` of each measurement at a trajectory ``(N, 4, 4)``."""
     squared = []
@@ -288,13 +198,6 @@ def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None
     loose = np.flatnonzero(component != component[0])
     if len(loose):
         raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
-
-
-def _differ(old: RelativePose, new: RelativePose) -> bool:
-    """Whether a measurement or its sigmas changed by more than ``_SAME_RATIO``."""
-    moved = np.abs(old.T_from_to - new.T_from_to).max()
-    widened = np.abs(old.graph_sigmas / new.graph_sigmas - 1.0).max()
-    return bool(moved > _SAME_RATIO * new.sigmas.min() or widened > _SAME_RATIO)
 
 
 def _first_line(error: RuntimeError) -> str:

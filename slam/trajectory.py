@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 _COLUMNS = {"kitti": 12, "tum": 8}
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
+_FARTHEST = 1e12  # metres: to Saturn
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +197,7 @@ def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
         columns = columns or len(words)
         _check_columns(f"{path}, line {line}", len(words), columns)
         try:
-            rows.append([float(word) for word in words])
+            rows.append([_number(word) for word in words])
         except ValueError as error:
             raise TrajectoryError(f"{path}, line {line}: {_reason(error)}") from error
         lines.append(line)
@@ -206,7 +207,22 @@ def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
     bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
     if bad.size:
         raise TrajectoryError(f"{path}, line {lines[bad[0]]}: a number is not finite")
+    positions = numbers[:, 3::4] if columns == _COLUMNS["kitti"] else numbers[:, 1:4]
+    far = np.flatnonzero((np.abs(positions) > _FARTHEST).any(axis=1))
+    if far.size:
+        raise TrajectoryError(f"{path}, line {lines[far[0]]}: a position is farther than {_FARTHEST:g}")
     return lines, numbers
+
+
+def _number(word: str) -> float:
+    """Python's reading of a number, without its underscores.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if "_" in word:
+        raise ValueError(f"not a number: {word!r}")
+    return float(word)
 
 
 def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:

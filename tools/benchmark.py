@@ -24,6 +24,7 @@ from benchmarking.picture import draw, drawable
 from benchmarking.plan import (
     ABLATION,
     ACCURACY,
+    EVERYTHING,
     GROWTH,
     MAPS,
     SPEED,
@@ -86,6 +87,9 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     if options.kitti is not None:
         drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
     configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED, "maps": MAPS}[options.mode]
+    parts = getattr(options, "parts", None)
+    if parts is not None:
+        configurations = tuple(c for c in configurations if c is EVERYTHING or c.name in parts)
     rest = options.weights, options.seeds, options.set, options.device
     jobs = plan(folder, drives, configurations, *rest)
     if options.mode == "speed" and options.growth:
@@ -98,12 +102,16 @@ def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
     words += ["--kitti", "KITTI"] if options.kitti else []
+    drives = getattr(options, "drives", ())
+    names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
+    words += ["--drives", *names] if names else []
     for name in (
         "weights",
         "routes",
         "worlds",
         "frames",
         "conditions",
+        "parts",
         "sequences",
         "excerpt",
         "seeds",
@@ -159,6 +167,8 @@ def _parser() -> argparse.ArgumentParser:
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
         if mode == "maps":
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives with LiDAR")
+            names = [each.name for each in MAPS if each is not EVERYTHING]
+            add("--parts", nargs="*", choices=names, metavar="PART", help=f"to turn off: {', '.join(names)}; else all")
         if fast:
             add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
         else:

@@ -1,6 +1,7 @@
 """The pictures of README and docs, from run folders.
 
 Example: python tools/make_figures.py results/latest docs/images/demo.png
+Example: python tools/make_figures.py results/latest docs/images/map-0013.jpg --dataset DRIVE_0013 --seat 80
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor
+from slam.frames import Sequence
 from slam.results.folder import RunFolder
 from slam.results.map_mesh import MapMeshFile
 from slam.results.map_picture import MapScene
@@ -22,21 +24,45 @@ from slam.results.plots import depth_figure, map_figure, trajectories_of, trajec
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600
+NEAR_M = 100.0
 
 
 def main() -> None:
-    """One picture: depth of some frames above the trajectories and the map."""
+    """One picture: depth of some frames above the trajectories and the map, or a frame above the map from its seat."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")
     parser.add_argument("--sequence")
     parser.add_argument("--weights", default="default")
+    parser.add_argument("--seat", type=int, metavar="FRAME", help="the map from the driver's seat, below this frame")
     arguments = parser.parse_args()
 
     folder = RunFolder.open(arguments.run)
     sequence = open_sequence(arguments.dataset, arguments.sequence, None, None)
-    predictor = DepthPosePredictor.from_weights(arguments.weights)
+    if arguments.seat is None:
+        picture = overview(folder, sequence, DepthPosePredictor.from_weights(arguments.weights))
+    else:
+        picture = seat(folder, sequence, arguments.seat)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    small = [cv2.IMWRITE_PNG_COMPRESSION, 9] if arguments.output.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 85]
+    cv2.imwrite(str(arguments.output), picture[..., ::-1], small)
+    print(f"{arguments.output}: {picture.shape[1]}x{picture.shape[0]}, {arguments.output.stat().st_size / 1e3:.0f} kB")
+
+
+def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]:
+    """A frame above what its camera sees of the map within 100 m."""
+    T_world_camera = trajectories_of(folder)["optimised"].T_world_camera[frame]
+    mesh = MapMeshFile(folder.require("map_mesh.ply")).near(T_world_camera[:3, 3], NEAR_M)
+    below = MapScene(mesh).from_seat(T_world_camera)
+    image = sequence.frame(frame).image
+    height = round(image.shape[0] * below.shape[1] / image.shape[1])
+    above = cv2.resize(image, (below.shape[1], height), interpolation=cv2.INTER_AREA)
+    return np.concatenate([above, below])
+
+
+def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredictor) -> NDArray[np.uint8]:
+    """Depth of some frames above the trajectories and the map."""
     chosen = np.linspace(0, len(sequence) - 1, 5).round().astype(int)[1:-1]
     images = [sequence.frame(int(k)).image for k in chosen]
     depths = [predictor.depth(image) for image in images]
@@ -48,10 +74,7 @@ def main() -> None:
     right = _raster(map_picture, WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])
     bottom = np.concatenate([_padded(left, height), _padded(right, height)], axis=1)
-    picture = np.concatenate([top, bottom], axis=0)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(arguments.output), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    print(f"{arguments.output}: {picture.shape[1]}x{picture.shape[0]}, {arguments.output.stat().st_size / 1e3:.0f} kB")
+    return np.concatenate([top, bottom], axis=0)
 
 
 def _raster(figure: Figure, width: int) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import signal
 import sys
@@ -230,7 +231,9 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
         """Write ``checkpoint`` to ``path``."""
-        write_atomically(Path(path), lambda part: torch.save(checkpoint, part))
+        content = io.BytesIO()  # as in `save_model`
+        torch.save(checkpoint, content)
+        write_atomically(Path(path), lambda part: part.write_bytes(content.getbuffer()))
 
 
 def _single_threaded_worker(_: int) -> None:

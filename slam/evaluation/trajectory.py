@@ -30,13 +30,16 @@ Metric = float | int | str
 """A number, or in words why there is none."""
 
 SNIPPET_LENGTH = 5
+_SAME_ROTATION = 1e-9  # of the entries of a matrix
 
 _SNIPPET_KEYS = ("ate_mean", "ate_std", "re_mean", "re_std", "count")
 _ALIGN_KEYS = ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale")
 _EVO_KEYS = ("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference")
 # With fewer frames an alignment fits exactly, and its zero error is meaningless.
-_FEWEST_FRAMES: dict[Alignment, int] = {"none": 1, "first": 2, "scale": 2, "6dof": 2, "7dof": 3}
+_FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
+_NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no error to measure"
+_BACKWARDS = "the best scale is negative: the estimate goes the other way"
 _REFERENCE_STANDS_STILL = "the reference does not move, so scaling would hide every error"
 
 
@@ -175,6 +178,8 @@ def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
     for name, trajectory in (("estimate", estimate), ("reference", reference)):
         if not np.isfinite(trajectory.T_world_camera).all():
             return f"the {name} has poses that are not finite"
+    if len(estimate) > 1 and _is_constant(estimate.T_world_camera) and _is_constant(reference.T_world_camera):
+        return _NOTHING_MOVES
     return ""
 
 
@@ -188,6 +193,8 @@ def _alignment_metrics(
     if alignment in ("scale", "7dof") and _stands_still(T_world_reference):
         return dict.fromkeys(_ALIGN_KEYS, _REFERENCE_STANDS_STILL)
     aligned = align(T_world_estimate, T_world_reference, alignment)
+    if not isinstance(aligned.scale, str) and aligned.scale <= 0:
+        return dict.fromkeys(_ALIGN_KEYS, _BACKWARDS)
     offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
     return {
         "ate_rmse_m": float(np.sqrt((offsets**2).sum(axis=1).mean())),
@@ -270,6 +277,12 @@ def _stands_still(T_world_camera: FloatArray) -> bool:
     """Whether all positions are equal, up to rounding."""
     positions = T_world_camera[:, :3, 3]
     return bool(np.ptp(positions, axis=0).max() <= 1e-12 * max(1.0, np.abs(positions).max()))
+
+
+def _is_constant(T_world_camera: FloatArray) -> bool:
+    """Whether all poses are equal, up to rounding."""
+    turned = np.ptp(T_world_camera[:, :3, :3], axis=0).max() > _SAME_ROTATION
+    return _stands_still(T_world_camera) and not turned
 
 
 def _null(keys: Sequence[str], reason: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from slam.config import load_config
+from slam.config import load_stored
 from slam.mapping.submap import FOLDER, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
@@ -35,7 +35,7 @@ def map_file(folder: RunFolder, what: str, progress: Progress | None = None) -> 
         yield folder.require(f"map_{what}.ply")
         return
     logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
-    surface = MapSurface(paths, load_config(folder.require("config.yaml")).mapping, progress)
+    surface = MapSurface(paths, load_stored(folder.require("config.yaml"), "mapping").mapping, progress)
     with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
         path = Path(temporary) / f"map_{what}.ply"
         (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)

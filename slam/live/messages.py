@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from slam.errors import SlamError
-from slam.live.tracker import Tracked
+from slam.pipeline.tracker import Tracked
 from slam.runtime.imports import import_zmq
 from slam.trajectory import Trajectory
 

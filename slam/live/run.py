@@ -21,10 +21,10 @@ from slam.live.messages import Emit, corrected_message, pose_message
 from slam.live.reader import EXPECTED
 from slam.live.sequence import StreamedSequence, calibration_of
 from slam.live.source import open_source
-from slam.live.tracker import Tracker
 from slam.live.view import Viewer
 from slam.pipeline.batch import SlamPipeline, SlamResult
 from slam.pipeline.observer import Observer
+from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.results.folder import RunFolder

@@ -12,12 +12,12 @@ from slam.errors import SequenceError
 from slam.frames import Frame, Image, Intrinsics
 from slam.live.reader import Arrival, Reader
 from slam.live.source import Source
-from slam.pipeline.live import LiveSequence
+from slam.pipeline.growing import GrowingSequence
 from slam.sequences.camera_file import explicit_camera, find_camera_file
 from slam.sequences.undistortion import Undistortion
 
 
-class StreamedSequence(LiveSequence):
+class StreamedSequence(GrowingSequence):
     """The frames that a reader gave so far; ``arrivals`` are those of the last ones, by frame."""
 
     def __init__(self, name: str, source: Source, camera: CameraFile, most_wait_s: float) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 
 from slam import se3
 from slam.frames import Intrinsics
-from slam.live.tracker import Tracked
 from slam.pipeline.observations import Observations
+from slam.pipeline.tracker import Tracked
 from slam.runtime.imports import import_rerun
 from slam.se3 import FloatArray
 from slam.trajectory import Trajectory

@@ -15,7 +15,7 @@ from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images, read_image
 from erfsfm.readers.numbering import by_name
-from slam.config import LoopsConfig, load_config
+from slam.config import LoopsConfig, load_stored
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
 from slam.loops.descriptors import FeatureExtractor, View
@@ -76,7 +76,9 @@ def localise(
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
     own_camera = _camera_file(camera, paths)
     localiser = Localiser(
-        places, load_config(run.path / "config.yaml").loops, None if own_camera is None else _pinhole(own_camera)
+        places,
+        load_stored(run.path / "config.yaml", "loops").loops,
+        None if own_camera is None else _pinhole(own_camera),
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None
     chosen = paths if numbers is None else [paths[number] for number in numbers]

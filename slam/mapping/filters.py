@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +39,7 @@ class DepthFilters:
         )  # (3, H*W) with z = 1
         height, width = intrinsics.height, intrinsics.width
         border, self._above_bonnet = round(config.border * width), np.ones((height, width), dtype=bool)
+        self._top_rows = border + 1
         self._inside = np.zeros((height, width), dtype=bool)
         self._inside[border:, border : width - border] = True
         self._above_bonnet[height - round(config.bonnet * height) :] = False
@@ -91,13 +93,17 @@ class DepthFilters:
         return np.where(inside, v * camera.width + u, -1).astype(np.int64), z
 
     def _is_sky(self, image: Image) -> Mask:
-        """Bright or blue pixels ``(H, W)`` above the horizon of a level camera."""
+        """Bright or blue pixels ``(H, W)`` above the horizon of a level camera, in one piece with the upper border.
+
+        A facade and its windows may be as bright or blue, but have a roof above them.
+        """
         config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
         sky = np.zeros(image.shape[:2], dtype=bool)
         red, _, blue = (each.astype(np.int16) for each in np.moveaxis(image[:horizon], 2, 0))
         is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
         sky[:horizon] = (image[:horizon].min(axis=2) >= config.sky_brightness) | is_blue
-        return sky
+        _, piece = cv2.connectedComponents(sky.view(np.uint8), connectivity=4)
+        return sky & np.isin(piece, piece[: self._top_rows][sky[: self._top_rows]])
 
     def _agrees(self, view: DepthView, other: DepthView) -> Mask:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""

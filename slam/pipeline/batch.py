@@ -12,7 +12,7 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
-from slam.frames import Frame, Predictor, RelativePose, runs
+from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors, scaled_poses
 from slam.frontend.failure import MeasurementFailure
@@ -39,6 +39,7 @@ from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import Observer, ObserverState, read_frame
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.requirements import require_possible
+from slam.pipeline.solution import Solution
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -150,36 +151,40 @@ class SlamPipeline:
         observations, state = self._observe(journal, frames, watch)
         observations = self.close_maps(observations)
         mode = self.require_possible()
-        for first, last in runs(observations.interpolated):
-            reason = observations.interpolated[first]
-            logger.warning("frames %d to %d are interpolated: %s", first, last, reason)
         warn_of_doubts(len(self._sequence), observations, state)
-        measured = self.measure(mode, observations)
-        loops = self.close_loops(observations, measured)
-        graph, T_optimised, location = self._optimise(measured, loops)
+        solved = self.solve(mode, observations)
+        measured = solved.measured
         return SlamResult(
             network=self._trajectory(measured.T_network),
             odometry=self._trajectory(measured.T_odometry),
-            optimised=self._trajectory(T_optimised),
+            optimised=self._trajectory(solved.T_world_camera),
             lidar=measured.lidar,
             reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
             state=state,
             observations=observations,
             scale=measured.scale,
             factors=measured.factors,
-            loops=loops.without(graph.dropped),
-            graph=graph,
+            loops=solved.loops,
+            graph=solved.graph,
             map=None,
             stopwatch=self._watch,
             first=self.first,
-            location=location,
+            location=solved.location,
         )
+
+    def solve(self, mode: ScaleMode, observations: ClosedObservations) -> Solution:
+        """Relative poses, loops and the trajectory that fits both; ``SlamError`` where there is none."""
+        measured = self.measure(mode, observations)
+        loops = self.close_loops(observations, measured)
+        graph, T_optimised, location = self._optimise(measured, loops)
+        return Solution(measured, loops.without(graph.dropped), graph, T_optimised, location)
 
     def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
         """The front end: rotations, scale and lengths, then all factors and the odometry chained from them."""
         T_network = chain_raw(seen.snippets, len(self._sequence))
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
-        lidar = self._register_lidar()
+        with self._watch.stage("lidar"):
+            lidar = lidar_path(self._sequence)
         by_lidar = [] if lidar is None else lidar_steps(lidar, self._config.lidar)
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
         scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
@@ -340,11 +345,6 @@ class SlamPipeline:
         if positioning is not None and isinstance(location, Location):
             location = positioning.relocated(location, graph, T_optimised)
         return graph, T_optimised, location
-
-    def _register_lidar(self) -> LidarPath | None:
-        """LiDAR odometry, where the sequence has scans."""
-        with self._watch.stage("lidar"):
-            return lidar_path(self._sequence)
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:
         return Trajectory(self._sequence.stamps, T_world_camera)

@@ -12,7 +12,9 @@ logger = logging.getLogger(__name__)
 
 
 def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
-    """Warn of segments, whose places are guesses, and of a frozen end: no new image shows whether the camera stood."""
+    """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
+    for first, last in runs(seen.interpolated):
+        logger.warning("frames %d to %d are interpolated: %s", first, last, seen.interpolated[first])
     _warn_of_segments(seen)
     end = frames - 1
     for first, last in runs(state.seen.repeated):

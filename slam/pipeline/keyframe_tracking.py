@@ -12,15 +12,17 @@ from slam.frames import DepthMap, Frame, Intrinsics
 from slam.frontend.window.descriptors import describe
 from slam.frontend.window.local_map import LocalMap, corners_of
 from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
-from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.loops.descriptors import View
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
 from slam.pipeline.observations import Observations
-from slam.se3 import invert
+from slam.se3 import FloatArray, invert
 
 # a lost camera is looked for at every third frame
 _RELOCALISED_FRAMES = 3
+# looked back for the frame before, and keyframes that give the unit
+_FRAMES, _KEYFRAMES = 40, 20
 
 
 def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
@@ -34,7 +36,7 @@ def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
 
 
 class KeyframeTracking:
-    """Tracks keyframes beside the steps, until those are of a vehicle."""
+    """Tracks keyframes: beside the steps until those say whether they are a vehicle's, then in place of one of both."""
 
     def __init__(
         self,
@@ -47,6 +49,7 @@ class KeyframeTracking:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
         self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
         self._places: Relocaliser | None = None
+        self._is_carried = False
         self._odometry: WindowOdometry | None = None
         if config.use != "never" and state is not None:
             self._odometry = WindowOdometry(config, intrinsics, seed, state)
@@ -55,11 +58,16 @@ class KeyframeTracking:
         """The state to resume from."""
         return None if self._odometry is None else self._odometry.state()
 
-    def add(self, frame: Frame, depth: DepthMap) -> None:
-        """The next usable frame with its learned depth ``(H, W)``."""
+    def follow(self, frame: Frame) -> None:
+        """Track the next usable frame."""
+        if self._odometry is not None:
+            self._odometry.follow(frame)
+
+    def learn(self, frame: Frame, depth: DepthMap) -> None:
+        """Learned depth ``(H, W)`` of that frame; a lost camera is looked for."""
         if self._odometry is None:
             return
-        self._odometry.add(frame, depth)
+        self._odometry.learn(frame, depth)
         lost = self._odometry.lost_map()
         if lost is None:
             self._places = None
@@ -84,13 +92,40 @@ class KeyframeTracking:
 
     def decide(self, seen: Observations) -> None:
         """End the tracking where the first steps are those of a vehicle."""
-        if self._odometry is not None and self._config.use == "auto" and is_vehicle(seen, self._config):
+        if self._odometry is None or self._is_carried:
+            return
+        vehicle = False if self._config.use == "always" else is_vehicle(seen, self._config)
+        self._is_carried = vehicle is False
+        if vehicle:
             self._odometry = None
+
+    def measures(self, seen: Observations, index: int) -> bool:
+        """Whether keyframes alone measure the motion to the last frame: not before the decision, nor beside a gap or a
+        repeated image."""
+        doubtful = {*seen.repeated[-1:], *list(seen.unusable)[-1:]}
+        if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
+            return False
+        return self._odometry.locates(index - 1, index)
+
+    def step(self, index: int) -> tuple[int, FloatArray] | None:
+        """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
+        state = self.state()
+        if state is None or not self._is_carried or not state.segments:
+            return None
+        segment = state.segments[-1]
+        placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
+        located = [(place, T_map) for place, T_map in placed if T_map is not None]
+        if len(located) < 2 or located[-1][0] != index:
+            return None
+        (before, T_before_map), (_, T_frame_map) = located[-2:]
+        T_before_frame = T_before_map @ invert(T_frame_map)
+        T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
+        return before, T_before_frame
 
     def maps(self, seen: Observations) -> tuple[Segment, ...]:
         """All maps so far; none of a vehicle, nor before that is decided."""
-        undecided = self._config.use == "auto" and is_vehicle(seen, self._config) is None
-        if self._odometry is None or undecided:
+        self.decide(seen)
+        if self._odometry is None or not self._is_carried:
             return ()
         return tuple(segment for segment in self._odometry.state().segments if segment.started)
 

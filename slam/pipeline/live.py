@@ -1,8 +1,7 @@
-"""Live sessions: the steps of the batch pipeline frame by frame, and iSAM2 in place of the batch solver."""
+"""Live sessions: the measurements of the pipeline frame by frame, and the whole drive solved on request."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
@@ -17,14 +16,13 @@ from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.keyframe_tracking import decided
-from slam.pipeline.measurements import Measurements
 from slam.pipeline.observer import Observer, ObserverState
-from slam.pose_graph import IncrementalPoseGraph
+from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.timing import Stopwatch
-from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory
 
@@ -32,8 +30,8 @@ from slam.trajectory import Trajectory
 class Slam:
     """Monocular SLAM frame by frame; it keeps no images and makes no map.
 
-    Measurements are those of the pipeline, causally. Lengths and noise are estimated again as the drive goes on, so
-    earlier poses move a little with every update.
+    Poses come from the measurements of the last 100 frames; those before stay, so a frame costs the same however long
+    the drive is. `close_loops` solves the whole drive as `run` does.
     """
 
     def __init__(
@@ -43,7 +41,7 @@ class Slam:
         config: SlamConfig | None = None,
         camera_height_m: float | None = None,
         update_frames: int = 10,
-        sweep_frames: int = 100,
+        sweep_frames: int = 0,
         noise: PoseNoise | None = None,
         weights_sha256: str = "",
         seed: int = 0,
@@ -55,8 +53,9 @@ class Slam:
             intrinsics: of all images.
             config: None for the defaults.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
-            update_frames: the graph is solved after so many frames, and in `trajectory`.
-            sweep_frames: loops are searched after so many frames; 0: only in ``close_loops``.
+            update_frames: lengths of the last steps are solved after so many frames.
+            sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
+                in ``close_loops``.
             noise: of the snippet poses; None measures it against image geometry alone.
             weights_sha256: of the networks and the depth source, to refuse resuming a session of others.
             seed: of all RANSAC draws.
@@ -75,17 +74,13 @@ class Slam:
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = decided(config.model_copy(update={"mapping": without_map}), camera_height_m)
         self._weights_sha256 = weights_sha256
-        self._sequence = LiveSequence(intrinsics, camera_height_m)
+        self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
         self._observer = self._observe(None)
         self._is_closed = False
-        self._graph = IncrementalPoseGraph(config.pose_graph)
-        self._shortest = predictor.sources + 1
-        self._update_frames, self._sweep_frames = update_frames, sweep_frames
-        self._loops = LoopClosures(not_sought="no search for loops yet")
-        self._per_frame = np.ones(0)  # scale at which the loops were measured
-        self._T_world_camera: FloatArray = np.zeros((0, 4, 4))
+        self._tracker = Tracker(predictor, intrinsics, camera_height_m, config, noise, update=update_frames)
+        self._sweep_frames = sweep_frames
 
     @classmethod
     def from_weights(
@@ -159,10 +154,9 @@ class Slam:
         finally:  # the error may be of the frame before
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
+        self._tracker.add(self._observer)
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
             self.close_loops()
-        elif len(self) % self._update_frames == 0:
-            self._update()
 
     def save(self, path: str | Path) -> None:
         """Write all measurements to a file for `resume`; more frames may follow.
@@ -174,7 +168,7 @@ class Slam:
         write_atomically(Path(path), checkpoint.write)
 
     def resume(self, path: str | Path) -> None:
-        """Continue after the last frame of a file by `save`, as without an interruption; loops are searched again.
+        """Continue after the last frame of a file by `save`, with the whole drive solved.
 
         Raises:
             SlamError: there are frames already, or the file is missing, damaged or of another camera or other weights.
@@ -188,81 +182,34 @@ class Slam:
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
         self._sequence.stamps = checkpoint.stamps
+        self.close_loops()
 
     def trajectory(self) -> Trajectory:
         """All frames so far; before the first snippet the camera is assumed to stand.
 
         Raises:
-            SlamError: no frame yet, or the graph cannot be solved.
+            SlamError: no frame yet.
         """
         if not len(self):
             raise SlamError("no trajectory before the first frame")
-        if len(self._T_world_camera) < len(self):
-            self._update()
-        return Trajectory(self._sequence.stamps, self._T_world_camera.copy())
+        self._observer.flush()
+        self._tracker.add(self._observer)
+        return Trajectory(self._sequence.stamps, self._tracker.T_world_camera)
 
     def close_loops(self) -> LoopClosures:
-        """Search loops among all frames so far and add the consistent ones to the graph."""
+        """Solve the whole drive so far with its loops, as ``run`` does; later frames go on from its poses.
+
+        Raises:
+            SlamError: the graph has no solution.
+        """
         self._observer.flush()
-        if self._observer.has_snippets:
-            seen = self._pipeline.close_maps(self._observer.closed())
-            measured = self._pipeline.measure(self._mode, seen)
-            self._loops = self._pipeline.close_loops(seen, measured)
-            self._per_frame = measured.scale.per_frame
-            self._solve(measured)
-        return self._loops
+        if not self._observer.seen.snippets:
+            return LoopClosures(not_sought="there are too few usable frames")
+        solved = self._pipeline.solve(self._mode, self._pipeline.close_maps(self._observer.closed()))
+        self._tracker.correct(solved.T_world_camera, float(solved.measured.scale.per_frame[-1]))
+        return solved.loops
 
     def _observe(self, state: ObserverState | None) -> Observer:
         return Observer(
             self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
         )
-
-    def _update(self) -> None:
-        measured = self._measure()
-        if measured is None:
-            self._T_world_camera = np.tile(np.eye(4), (len(self), 1, 1))
-        else:
-            self._solve(measured)
-
-    def _measure(self) -> Measurements | None:
-        self._observer.flush()
-        if not self._observer.has_snippets:
-            return None
-        return self._pipeline.measure(self._mode, self._observer.closed())
-
-    def _solve(self, measured: Measurements) -> None:
-        now = measured.scale.per_frame
-        loops = [loop.measured for loop in self._loops.accepted]
-        current = [edge.scaled(float(now[edge.from_index] / self._per_frame[edge.from_index])) for edge in loops]
-        self._T_world_camera = self._graph.update([*measured.factors, *current], measured.T_odometry)
-
-
-@dataclass
-class LiveSequence:
-    """A sequence that grows by a frame at a time; its images are not kept."""
-
-    intrinsics: Intrinsics
-    camera_height_m: float | None
-    stamps: FloatArray = field(default_factory=lambda: np.zeros(0))
-    name: str = "live"
-    reference: FloatArray | None = None
-    T_camera_lidar: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    def frame(self, index: int) -> Frame:
-        """Always ``SlamError``: images are not kept."""
-        raise SlamError(f"frame {index} of a live drive is not kept")
-
-    def has_scan(self, index: int) -> bool:
-        """False: there are no scans."""
-        return False
-
-    def scan(self, index: int) -> FloatArray:
-        """Always ``SlamError``: there are no scans."""
-        raise SlamError(f"frame {index} of a live drive has no scan")
-
-    def provenance(self) -> tuple[str, ...]:
-        """Unknown."""
-        return ()

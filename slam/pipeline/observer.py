@@ -201,10 +201,9 @@ class Observer:
         """What was measured so far."""
         return self._seen
 
-    @property
-    def has_snippets(self) -> bool:
-        """Whether the pose network has measured anything yet."""
-        return bool(self._seen.snippets)
+    def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
+        """As `KeyframeTracking.step`, of a finished frame."""
+        return self._keyframes.step(index)
 
     def closed(self) -> ClosedObservations:
         """Everything measured so far with its gaps interpolated; more frames may follow.
@@ -214,11 +213,11 @@ class Observer:
         """
         self.flush()
         seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
-        steps, count = StepTable.of(seen.motions), len(seen.roads)
-        cuts = find_cuts(seen.failures, list(steps.motions), {*seen.unusable, *seen.repeated})
+        steps, count, maps = StepTable.of(seen.motions), len(seen.roads), self._keyframes.maps(seen)
+        window = self._keyframes.poses(maps)
+        cuts = find_cuts(seen.failures, {*steps.motions, *window.steps}, {*seen.unusable, *seen.repeated})
         gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
-        maps = self._keyframes.maps(seen)
-        return ClosedObservations.of(seen, gaps, cuts, self._keyframes.poses(maps), maps)
+        return ClosedObservations.of(seen, gaps, cuts, window, maps)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -261,8 +260,10 @@ class Observer:
 
     def _process(self, pending: PendingFrame) -> None:
         frame = pending.frame
+        with self._stopwatch.stage("keyframes"):
+            self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            steps = self._measure_steps(frame)
+            steps = [] if self._keyframes.measures(self._seen, frame.index) else self._measure_steps(frame)
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
         self._keyframes.decide(self._seen)
@@ -277,8 +278,7 @@ class Observer:
         with self._stopwatch.stage("road"):
             road = self._plane.fit(depth)
         self._seen.roads.append(road)
-        with self._stopwatch.stage("keyframes"):
-            self._keyframes.add(frame, depth)
+        self._keyframes.learn(frame, depth)
         height = road.height_unscaled if isinstance(road, GroundPlane) else None
         self._recent = (*self._recent, RecentFrame(frame, depth, height))[-self._frames_kept :]
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:

@@ -8,7 +8,7 @@ from slam import se3
 from slam.config import PoseGraphConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose
-from slam.pose_graph import LOOP_SOURCE, IncrementalPoseGraph, PoseGraph, whitened_squared
+from slam.pose_graph import LOOP_SOURCE, PoseGraph, whitened_squared
 
 ROTATION, TRANSLATION = 0.003, 0.03
 
@@ -213,83 +213,3 @@ def apart(T_world_camera, T_other) -> float:
     """Largest distance of two trajectories over the length of the path."""
     path = np.linalg.norm(np.diff(T_other[:, :3, 3], axis=0), axis=1).sum()
     return float(np.linalg.norm(T_world_camera[:, :3, 3] - T_other[:, :3, 3], axis=1).max() / path)
-
-
-@pytest.mark.parametrize("kernel", ["none", "huber"])
-def test_incremental_and_batch_agree(kernel):
-    """Factors in the order they arrive, loops when both ends are there, some of them false."""
-    _, odometry, skips, loops, initial = noisy_problem()
-    wrong = se3.from_rotation_vector(np.array([0.1, 0.5, 0.0]), np.array([4.0, 0.0, 3.0]))
-    everything = [*odometry, *skips, *loops, RelativePose(20, 170, wrong, loops[0].sigmas, LOOP_SOURCE)]
-    incremental = IncrementalPoseGraph(PoseGraphConfig(kernel=kernel))
-    for count in range(10, 201, 10):
-        so_far = [e for e in everything if max(e.from_index, e.to_index) < count]
-        T_world_camera = incremental.update(so_far, initial[:count])
-        assert T_world_camera.shape == (count, 4, 4)
-    np.testing.assert_array_equal(T_world_camera[0], initial[0])
-    _, batch = solve(everything, initial, kernel=kernel, relative_tolerance=1e-9)
-    assert apart(T_world_camera, batch) < 1e-3
-    assert apart(T_world_camera, initial) > 5e-3
-
-
-def test_incremental_replaces_changed_measurements():
-    _, odometry, skips, loops, initial = noisy_problem(count=60)
-    incremental = IncrementalPoseGraph(PoseGraphConfig())
-    incremental.update([*odometry, *skips, *loops], initial)
-    grown = [
-        RelativePose(e.from_index, e.to_index, se3.make(e.T_from_to[:3, :3], 1.2 * e.T_from_to[:3, 3]), e.sigmas, "x")
-        for e in odometry
-    ]
-    T_world_camera = incremental.update(grown, initial)
-    expected = se3.chain(np.stack([e.T_from_to for e in grown]))
-    np.testing.assert_allclose(T_world_camera, expected, atol=1e-3)
-
-
-def test_incremental_refuses_unconnected_frames_and_goes_on():
-    _, odometry, skips, loops, initial = noisy_problem(count=60)
-    incremental = IncrementalPoseGraph(PoseGraphConfig())
-    incremental.update(odometry[:29], initial[:30])
-    with pytest.raises(SlamError, match="not connected"):
-        incremental.update(odometry[:29], initial[:40])
-    solved = incremental.update([*odometry, *skips, *loops], initial)
-    _, batch = solve([*odometry, *skips, *loops], initial)
-    assert apart(solved, batch) < 1e-3
-
-
-def test_incremental_restarts_after_an_indeterminate_system(monkeypatch, caplog):
-    _, odometry, skips, loops, initial = noisy_problem(count=60)
-    incremental = IncrementalPoseGraph(PoseGraphConfig())
-    incremental.update(odometry[:29], initial[:30])
-
-    class Broken:
-        def update(self, *_):
-            raise RuntimeError("Indeterminant linear system detected\nwhile working near variable 7")
-
-    monkeypatch.setattr(incremental, "_isam", Broken())
-    solved = incremental.update([*odometry, *skips, *loops], initial)
-    _, batch = solve([*odometry, *skips, *loops], initial)
-    assert apart(solved, batch) < 1e-3
-    assert "is restarted: Indeterminant linear system" in caplog.text
-
-
-def test_incremental_that_fails_twice_is_one_error_and_goes_on_afterwards(monkeypatch):
-    """The restart fails as well: one line, and the next update is not left with an unusable iSAM2."""
-    _, odometry, skips, loops, initial = noisy_problem(count=60)
-    incremental = IncrementalPoseGraph(PoseGraphConfig())
-    incremental.update(odometry[:29], initial[:30])
-
-    class Broken:
-        def __init__(self, *_):
-            pass
-
-        def update(self, *_):
-            raise RuntimeError("Indeterminant linear system detected\nwhile working near variable 7")
-
-    incremental._isam = Broken()
-    with monkeypatch.context() as patched:
-        patched.setattr(gtsam, "ISAM2", Broken)
-        with pytest.raises(SlamError, match=r"^the pose graph cannot be solved: Indeterminant linear system detected$"):
-            incremental.update([*odometry, *skips, *loops], initial)
-    solved = incremental.update([*odometry, *skips, *loops], initial)
-    _, batch = solve([*odometry, *skips, *loops], initial)
-    assert apart(solved, batch) < 1e-3

@@ -1,7 +1,7 @@
 """Sparse optical flow: Shi-Tomasi corners, pyramidal Lucas-Kanade, forward-backward check.
 
-With a flow predicted from learned depth and the last motion, corners are tracked twice: in the image as it is, and in
-the image warped back by the predicted flow. The result with the smaller difference of windows is taken.
+With a flow predicted from learned depth and the last motion, corners are tracked in the image warped back by it. Those
+that are not found there and back, as on other cars, are tracked in the image as it is.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class CornerTracker:
 
         def flow() -> Answer:
             target = _warped(current.grey, self._config.window_px, predicted_flow)
-            found = self._best_flow(previous.grey, current.grey, points, [target])
+            found = self._first_flow(previous.grey, current.grey, points, [target])
             return found.pixels, found.kept
 
         def find() -> Tracks:
@@ -162,27 +162,25 @@ class CornerTracker:
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
     ) -> _Tracked:
         """Points ``(M, 2)`` tracked directly or through the predicted flow, and which are reliable."""
-        targets = [_Target(second, side, self._config.pyramid_levels)]
-        if predicted_flow is not None:
-            targets.append(_warped(second, side, predicted_flow))
-        return self._best_flow(first, second, points, targets)
+        plain = _Target(second, side, self._config.pyramid_levels)
+        targets = [plain] if predicted_flow is None else [_warped(second, side, predicted_flow), plain]
+        return self._first_flow(first, second, points, targets)
 
-    def _best_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _Tracked:
-        """Points ``(M, 2)`` by the target with the least window difference that passes the forward-backward check."""
+    def _first_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _Tracked:
+        """Points ``(M, 2)`` by the first target in which they pass the forward-backward check."""
         pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
-        if len(points) == 0:
-            return _Tracked(pixels, kept)
-        arrived = [_lucas_kanade(first, target.image, points, target) for target in targets]
-        difference = np.stack([np.where(found, difference, np.inf) for _, found, difference in arrived])
-        for choice in np.argsort(difference, axis=0, kind="stable"):
-            for n, (target, (forward, found, _)) in enumerate(zip(targets, arrived, strict=True)):
-                tried = np.flatnonzero(~kept & (choice == n) & found)
-                if len(tried) == 0:
-                    continue
-                backward, found_back, _ = _lucas_kanade(target.image, first, forward[tried], target)
-                error = np.abs(backward - points[tried]).max(axis=1)
-                returned = tried[found_back & (error < self._config.forward_backward_px)]
-                pixels[returned], kept[returned] = target.in_current(forward[returned]), True
+        for target in targets:
+            tried = np.flatnonzero(~kept)
+            if len(tried) == 0:
+                break
+            forward, found = _lucas_kanade(first, target.image, points[tried], target)
+            tried, forward = tried[found], forward[found]
+            if len(tried) == 0:
+                continue
+            backward, found_back = _lucas_kanade(target.image, first, forward, target)
+            error = np.abs(backward - points[tried]).max(axis=1)
+            returned = found_back & (error < self._config.forward_backward_px)
+            pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
         height, width = second.shape
         inside = (pixels >= 0).all(axis=1) & (pixels <= [width - 1, height - 1]).all(axis=1)
         return _Tracked(pixels, kept & inside)
@@ -206,11 +204,9 @@ def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
     return _Target(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
-def _lucas_kanade(
-    start: Grey, end: Grey, pixels: Pixels, target: _Target
-) -> tuple[Pixels, NDArray[np.bool_], NDArray[np.float32]]:
-    """Tracked pixels ``(M, 2)``, which of them were found, and the difference of their windows ``(M,)``."""
-    moved, status, difference = cv2.calcOpticalFlowPyrLK(
+def _lucas_kanade(start: Grey, end: Grey, pixels: Pixels, target: _Target) -> tuple[Pixels, NDArray[np.bool_]]:
+    """Tracked pixels ``(M, 2)``, and which of them were found."""
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
         start,
         end,
         pixels.reshape(-1, 1, 2),
@@ -219,7 +215,7 @@ def _lucas_kanade(
         maxLevel=target.levels,
         criteria=_CRITERIA,
     )
-    return moved.reshape(-1, 2), status.ravel().astype(bool), difference.ravel()
+    return moved.reshape(-1, 2), status.ravel().astype(bool)
 
 
 @dataclass(frozen=True)

@@ -89,18 +89,6 @@ class WindowOdometry:
         """The state to resume from."""
         return self._state
 
-    def add(self, frame: Frame, depth: DepthMap) -> None:
-        """Track and resect the next usable frame; make it a keyframe where that is wanted.
-
-        Args:
-            frame: at the size of the intrinsics.
-            depth: its learned z-depth ``(H, W)``, for the unit of the map.
-        """
-        self._follow(frame)
-        newest = self._state.segments[-1].map
-        if newest.keyframes[-1].index == frame.index:
-            newest.keyframes[-1] = newest.keyframes[-1].with_depth(depth)
-
     def lost_map(self) -> Segment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
         started = [segment for segment in self._state.segments if segment.started]
@@ -139,7 +127,8 @@ class WindowOdometry:
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
         segment.map.keyframes[-1] = segment.map.keyframes[-1].with_depth(depth)
 
-    def _follow(self, frame: Frame) -> None:
+    def follow(self, frame: Frame) -> None:
+        """Track and resect the next usable frame; make it a keyframe where that is wanted."""
         if not self._state.segments or self._state.lost > self._config.max_lost_frames:
             self._begin(frame)
             return
@@ -149,6 +138,18 @@ class WindowOdometry:
             self._locate(segment, frame, track_ids, pixels)
         else:
             self._start(segment, frame, track_ids, pixels)
+
+    def learn(self, frame: Frame, depth: DepthMap) -> None:
+        """Learned z-depth ``(H, W)`` of the last frame, for the unit of the map where it is a keyframe."""
+        newest = self._state.segments[-1].map
+        if newest.keyframes[-1].index == frame.index:
+            newest.keyframes[-1] = newest.keyframes[-1].with_depth(depth)
+
+    def locates(self, first: int, last: int) -> bool:
+        """Whether the last two frames are these, both with a pose in the newest map."""
+        frames = self._state.segments[-1].frames[-2:]
+        located = [frame.index for frame in frames if frame.T_camera_world is not None]
+        return located == [first, last]
 
     def _begin(self, frame: Frame) -> None:
         """A new map whose first keyframe is this frame; a map that never had points is forgotten."""

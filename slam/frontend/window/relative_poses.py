@@ -34,6 +34,11 @@ class WindowPoses:
         first, last = (self.segments.get(frame) for frame in pose.ends)
         return first is not None and first == last
 
+    @property
+    def steps(self) -> set[Ends]:
+        """Neighbouring frames that both have poses in one map."""
+        return {(k, k + 1) for k, number in self.segments.items() if self.segments.get(k + 1) == number}
+
     def relates(self, first: int) -> bool:
         """Whether the frames before ``first`` and those from it on have poses in one map."""
         before = max((frame for frame in self.segments if frame < first), default=None)

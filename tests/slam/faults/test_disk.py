@@ -6,9 +6,12 @@ import builtins
 import errno
 import io
 import os
+import resource
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -99,9 +102,15 @@ class _File:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    """Files below a folder, but the logs of a training, whose names have a time."""
+    files = [path for path in folder.rglob("*") if path.is_file() and "tensorboard" not in path.parts]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
+_TRAINING = [
+    *("train", "--config", "tiny", "--device", "cpu", "--set", "data.workers=0", "--set", "training.steps=2"),
+    *("--set", "training.checkpoint_every=1", "--set", "network.height=32", "--set", "network.width=64"),
+]
 Verb = tuple[Callable[[], None], list[object]]
 Call = Callable[[Callable[[], None], list[Any]], int]
 
@@ -124,11 +133,18 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
         "export colmap": (slam_main, [*export, out / "model", "--what", "colmap"]),
         "plot": (slam_main, ["plot", whole, "--output", out / "plot.png"]),
         "predict": (erfsfm_main, ["predict", tmp_path / "two", "--weights", tiny_weights, "--output", out / "depth"]),
+        "train": (erfsfm_main, [*_TRAINING, "--dataset", kitti_root, "--output", out / "training"]),
     }  # fmt: skip
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
-@pytest.mark.parametrize("name", ["run", "simulate", "export mesh", "export colmap", "plot", "predict"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("run", "simulate", "export mesh", "export colmap", "plot", "predict"),
+        pytest.param("train", marks=pytest.mark.slow),
+    ],
+)
 def test_one_failing_operation(
     name: str, operation: str, verbs: dict[str, Verb], call: Call, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -216,6 +232,38 @@ def test_a_real_disk_that_is_full(
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_a_cache_on_a_full_disk_is_one_warning(
+    verbs: dict[str, Verb], call: Call, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    main, words = verbs["run"]
+    with FailingDisk("write", 2, tmp_path / "cache").mounted():
+        assert call(main, [*words, "--cache", tmp_path / "cache"]) == 0
+    assert caplog.text.count("the cache is not written any more") == 1
+    assert RunFolder.open(tmp_path / "out" / "run").metrics()["status"] == "ok"
+
+
+def test_a_full_folder_for_temporary_files_is_one_line(
+    verbs: dict[str, Verb],
+    call: Call,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limit[1]))
+    try:
+        code = call(verbs["run"][0], [*verbs["run"][1], "--set", "mapping.enabled=true"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, before)
+    assert code == 1
+    assert "keyframes cannot be kept in" in capfd.readouterr().err
+    assert not list((tmp_path / "temporary").iterdir())
 
 
 LIMITED = """

@@ -214,6 +214,14 @@ def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp
         MapTruth.of(run)
 
 
+def test_the_run_of_an_earlier_release_serves_still(run: RunFolder, album: Path) -> None:
+    stored = (run.path / "config.yaml").read_text().replace("  memory_mb: 1000", "  max_blocks: 12000")
+    assert "max_blocks" in stored
+    run.write_text("config.yaml", stored)
+    (found,) = localise(album, run, numbers=range(1, 2))
+    assert found.T_world_camera is not None
+
+
 def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
     found = list(localise(album / "50.png", run))
     with pytest.raises(RunError, match="none of 1 images was found"):

@@ -63,6 +63,7 @@ def test_each_filter_counts_what_it_took():
     image = np.full((50, 100, 3), 90, np.uint8)
     image[10:30, 30:40] = 250  # bright: sky above the horizon at row 24.5
     image[10:15, 40:50] = (100, 120, 140)
+    image[12:18, 60:70] = 250  # a window: in one piece with nothing at the upper border, whose last row is 10
     config = MappingConfig(border=0.1, bonnet=0.2, max_relative_sigma=0.2)
     filters = DepthFilters(config, camera)
     kept = filters.kept(DepthView(0, depth, sigma, image, np.eye(4)), None)

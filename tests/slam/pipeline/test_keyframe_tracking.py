@@ -1,14 +1,25 @@
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from slam.config import SlamConfig, WindowConfig
-from slam.frames import RelativePose
+from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
+from slam.frames import Frame, RelativePose
 from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
 from slam.pipeline.observations import Observations
+from slam.pipeline.observer import Observer
+from slam.prediction.oracle import OraclePredictor
+from slam.runtime.timing import Stopwatch
 from slam.se3 import from_rotation_vector
 
+_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
+assert _SPEC is not None
+assert _SPEC.loader is not None
+room = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(room)
 POINTS = TriangulatedPoints(np.arange(1), np.ones(1), np.ones(1), np.ones(1))
 
 
@@ -31,3 +42,24 @@ def test_a_known_camera_height_decides() -> None:
     assert decided(SlamConfig(), None).window.use == "auto"
     always = SlamConfig(window=WindowConfig(use="always"))
     assert decided(always, 1.65).window.use == "always"
+
+
+def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
+    """Before their map begins, and over a gap."""
+    truth, blank = room.walk(40), (24, 25)
+    config = SlamConfig(
+        window=WindowConfig(use="always", max_corners=200),
+        loops=LoopsConfig(enabled=False),
+        mapping=MappingConfig(enabled=False),
+    )
+    oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
+    with Observer(oracle, room.INTRINSICS, config, Stopwatch()) as observer:
+        for k, T in enumerate(truth):
+            frame = room.frame(k, T)
+            observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
+        closed = observer.closed()
+    started = min(closed.window.segments)
+    assert started < 10 and len(closed.window.segments) == 40 - len(blank) - started
+    late = [ends for ends in closed.steps.motions if ends[0] > 19]
+    assert late == [(23, 26)]
+    assert set(closed.interpolated) == set(blank)

@@ -34,7 +34,9 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
 def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
     odometry = WindowOdometry(CONFIG.window, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
-        odometry.add(room.frame(k, T, 0 if seeds is None else seeds[k]), room.depth_map(T))
+        frame = room.frame(k, T, 0 if seeds is None else seeds[k])
+        odometry.follow(frame)
+        odometry.learn(frame, room.depth_map(T))
     return odometry.state()
 
 
@@ -87,7 +89,9 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
         WindowConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
     )
     for k, T in enumerate(truth):
-        tracking.add(room.frame(k, T, seeds[k]), room.depth_map(T))
+        frame = room.frame(k, T, seeds[k])
+        tracking.follow(frame)
+        tracking.learn(frame, room.depth_map(T))
     state = tracking.state()
     assert state is not None
     _, lost, found = state.events
@@ -117,9 +121,8 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     indices = range(0, 320, 4)
     truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
     odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
-    unknown = np.full((sequence.intrinsics.height, sequence.intrinsics.width), np.nan, np.float32)
     for k in indices:
-        odometry.add(replace(sequence.frame(k), index=k // 4), unknown)
+        odometry.follow(replace(sequence.frame(k), index=k // 4))
     maps = odometry.state().segments
     before = window_poses(maps, sequence.intrinsics, WindowConfig())
     after = close_maps(maps, sequence.intrinsics, SlamConfig())

@@ -24,7 +24,9 @@ CONFIG = WindowConfig(max_corners=200)
 def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
     odometry = WindowOdometry(CONFIG, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
-        odometry.add(room.frame(k, T, 0 if seeds is None else seeds[k]), room.depth_map(T))
+        frame = room.frame(k, T, 0 if seeds is None else seeds[k])
+        odometry.follow(frame)
+        odometry.learn(frame, room.depth_map(T))
     return odometry.state()
 
 
@@ -95,7 +97,9 @@ def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     serialiser.write(tmp_path / "state", tracked(truth[:25]))
     odometry = WindowOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):
-        odometry.add(room.frame(k, truth[k]), room.depth_map(truth[k]))
+        frame = room.frame(k, truth[k])
+        odometry.follow(frame)
+        odometry.learn(frame, room.depth_map(truth[k]))
     resumed = poses(odometry.state())
     for one, other in zip(whole.poses, resumed.poses, strict=True):
         np.testing.assert_array_equal(one.T_from_to, other.T_from_to)

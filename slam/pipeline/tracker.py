@@ -1,4 +1,4 @@
-"""The pose of the newest frame at a cost that does not grow with the drive."""
+"""Poses of the newest frames at a cost that does not grow with the drive."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from slam.config import ScaleMode, SlamConfig
 from slam.frames import Intrinsics, Predictor
 from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.live import LiveSequence
+from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.observer import Observer
 from slam.pipeline.recent import closed, recent
-from slam.se3 import FloatArray
+from slam.se3 import FloatArray, invert
 
 State = Literal["starting", "tracking", "bridged", "relocalised"]
 
@@ -33,7 +33,7 @@ class Tracker:
     """Poses from the measurements of the last ``window`` frames; those before are left as they are.
 
     Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
-    the last one was.
+    the last one was. Where keyframes measure the camera, only their unit is solved again.
     """
 
     def __init__(
@@ -47,8 +47,9 @@ class Tracker:
         update: int = 10,
     ) -> None:
         """Prepare for the first frame."""
-        self._predictor, self._intrinsics, self._height_m = predictor, intrinsics, camera_height_m
-        self._config, self._noise = config, noise
+        self._sources, self._gaps = predictor.sources, config.gaps
+        self._recent = GrowingSequence(intrinsics, camera_height_m)
+        self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
         self._window, self._update = window, update
         self._mode: ScaleMode = resolve_mode(config.scale, camera_height_m)
         self._T_world_camera: list[FloatArray] = []
@@ -60,6 +61,11 @@ class Tracker:
     def unit_name(self) -> str:
         """Of all lengths."""
         return "camera heights" if self._mode == "none" else "m"
+
+    @property
+    def T_world_camera(self) -> FloatArray:
+        """Poses of all frames ``(N, 4, 4)``."""
+        return np.array(self._T_world_camera).reshape(-1, 4, 4)
 
     def add(self, observer: Observer) -> list[Tracked]:
         """The frames that the observer has finished since the last call."""
@@ -73,6 +79,12 @@ class Tracker:
             Tracked(self._T_world_camera[k], self._state(k in seen.unusable), self._unit) for k in range(first, count)
         ]
 
+    def correct(self, T_world_camera: FloatArray, unit: float) -> None:
+        """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
+        self._T_world_camera, self._unit = list(T_world_camera), unit
+        if len(T_world_camera) > 1:
+            self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]
+
     def _state(self, is_bridged: bool) -> State:
         before, self._was_bridged = self._was_bridged, is_bridged
         if self._unit is None:
@@ -84,10 +96,17 @@ class Tracker:
         if not index:
             self._T_world_camera.append(np.eye(4))
             return
-        motion = next((m for m in reversed(observer.seen.motions[-4:]) if m.ends == (index - 1, index)), None)
-        if motion is not None and self._unit is not None:
-            self._T_previous_newest = motion.relative_pose.scaled(self._unit).T_from_to
-        self._T_world_camera.append(self._T_world_camera[-1] @ self._T_previous_newest)
+        before, by_keyframes = index - 1, observer.keyframe_step(index)
+        motion = next((m for m in reversed(observer.seen.motions[-4:]) if m.ends == (before, index)), None)
+        T_before_frame = self._T_previous_newest
+        if by_keyframes is not None:
+            before, T_before_frame = by_keyframes
+        elif motion is not None:
+            T_before_frame = motion.relative_pose.T_from_to.copy()
+        if T_before_frame is not self._T_previous_newest:
+            T_before_frame[:3, 3] *= self._unit or 1.0
+        self._T_world_camera.append(self._T_world_camera[before] @ T_before_frame)
+        self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
 
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on."""
@@ -95,11 +114,12 @@ class Tracker:
         window = recent(observer.seen, first)
         if not window.snippets:
             return
-        observations = closed(window, self._predictor.sources, self._config.gaps)
-        frames = LiveSequence(self._intrinsics, self._height_m, np.arange(count - first, dtype=np.float64))
-        pipeline = SlamPipeline(frames, self._predictor, self._config, noise=self._noise)
-        measured = pipeline.measure(self._mode, observations)
+        self._recent.stamps = np.arange(count - first, dtype=np.float64)
+        measured = self._pipeline.measure(self._mode, closed(window, self._sources, self._gaps))
+        if observer.keyframe_step(count - 1) is not None:
+            self._unit = float(np.median(measured.scale.per_frame))
+            return
+        self._unit = float(measured.scale.per_frame[-1])
         T_world_camera = self._T_world_camera[first] @ measured.T_odometry
         self._T_world_camera[first:] = list(T_world_camera)
-        self._T_previous_newest = np.linalg.inv(T_world_camera[-2]) @ T_world_camera[-1]
-        self._unit = float(measured.scale.per_frame[-1])
+        self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]

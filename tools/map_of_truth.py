@@ -1,0 +1,59 @@
+"""Errors of the map of true depth at true poses: what fusion, filters and cleaning lose by themselves.
+
+Example: python tools/map_of_truth.py --dataset world --set mapping.voxel_size_m=0.1
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slam.config import load_config
+from slam.errors import SlamError
+from slam.evaluation.map import compare, statistics
+from slam.mapping.map import TsdfMap
+from slam.results.map_error import HasTrueDepth
+from slam.results.map_error import find_truth as surface_of
+from slam.sequences.catalogue import open_sequence
+
+
+def main() -> None:
+    """Fuse every true depth map of a data set, and compare the surface with the truth."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dataset", type=Path, help="with true poses and depth maps; default: the embedded sequence")
+    parser.add_argument("--sequence")
+    parser.add_argument("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to the configuration")
+    arguments = parser.parse_args()
+    try:
+        print(errors(arguments.dataset, arguments.sequence, arguments.set))
+    except SlamError as error:
+        raise SystemExit(str(error)) from error
+
+
+def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
+    """One line of errors of the map."""
+    config, sequence = load_config(None, overrides).mapping, open_sequence(dataset, name)
+    truth = surface_of(sequence)
+    if isinstance(truth, str) or sequence.reference is None or not isinstance(sequence, HasTrueDepth):
+        raise SlamError(f"true poses and depth maps are wanted: {truth if isinstance(truth, str) else truth.name}")
+    intrinsics = sequence.intrinsics
+    tsdf_map = TsdfMap(config, intrinsics)
+    for frame in map(int, truth.frames):
+        size = intrinsics.width, intrinsics.height
+        depth = cv2.resize(sequence.true_depth(frame).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)
+        tsdf_map.integrate(depth, image, sequence.reference[frame], frame=frame)
+    found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points_world})
+    numbers = statistics(found.distances["map"])
+    score = numbers["f_score"]
+    return (
+        f"accuracy {numbers['accuracy_median_m']:.3f} m, 90 % {numbers['accuracy_90_m']:.2f} m, "
+        f"completeness {numbers['completeness']:.3f}, F-score {score['0.2']:.2f} / {score['0.5']:.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

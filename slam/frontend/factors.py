@@ -20,6 +20,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
+from slam.frontend.window.gaps import led_through
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
@@ -67,8 +68,10 @@ def make_factors(
     others = [
         [pose for pose in poses if not window.within(pose)] for poses in (networks, measured.interpolated, geometric)
     ]
+    by_network, interpolated, by_image = (scaled(poses) for poses in others)
     by_window = scaled_poses(window.poses, window, scale)
-    return [*scaled(others[0]), *scaled(others[1]), *lidar_steps, *scaled(others[2]), *by_window]
+    interpolated = led_through(interpolated, [*by_network, *by_image], by_window, window.segments)
+    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_window]
 
 
 def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:

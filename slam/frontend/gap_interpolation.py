@@ -152,13 +152,13 @@ def _equal_steps(geometric: Sequence[RelativePose], loose: set[int]) -> dict[int
     for factor in geometric:
         steps = range(factor.from_index, factor.to_index)
         if len(steps) > 1 and loose.issuperset(steps):
-            T_step = _root(factor.T_from_to, len(steps))
+            T_step = equal_step(factor.T_from_to, len(steps))
             equal_steps |= dict.fromkeys(steps, T_step)
     return equal_steps
 
 
-def _root(T_a_b: FloatArray, n: int) -> FloatArray:
-    """The transform whose n-th power is ``T_a_b``."""
+def equal_step(T_a_b: FloatArray, n: int) -> FloatArray:
+    """One of n equal steps from a to b: the transform ``(4, 4)`` whose n-th power is ``T_a_b``."""
     rotation_vector = Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec() / n
     powers = Rotation.from_rotvec(np.arange(n)[:, None] * rotation_vector).as_matrix()
     return from_rotation_vector(rotation_vector, np.linalg.solve(powers.sum(axis=0), T_a_b[:3, 3]))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -24,7 +28,7 @@ from slam.frames import Image
 from slam.live.messages import emitters
 from slam.live.reader import Reader
 from slam.live.run import LiveRequest, run_live
-from slam.live.source import FolderSource, VideoSource
+from slam.live.source import FolderSource, VideoSource, open_source
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -113,13 +117,70 @@ def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
     assert len(list(dies)) == 2 and dies.ended == "the source died: the cable was pulled"
 
 
-def test_a_video_plays_at_its_own_speed(tmp_path: Path) -> None:
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Eight images, each brighter by 30 than the one before, at 20 Hz."""
     path = tmp_path / "a.avi"
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (32, 24))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (32, 24))
     for number in range(8):
-        video.write(np.full((24, 32, 3), 30 * number, np.uint8))
-    video.release()
-    source = VideoSource(str(path))
+        writer.write(np.full((24, 32, 3), 30 * number, np.uint8))
+    writer.release()
+    return path
+
+
+@contextmanager
+def piped(video: Path) -> Iterator[str]:
+    pipe = video.with_name("pipe")
+    os.mkfifo(pipe)
+    thread = Thread(target=lambda: pipe.write_bytes(video.read_bytes()), daemon=True)
+    thread.start()
+    yield str(pipe)
+    thread.join()
+
+
+@contextmanager
+def served(video: Path) -> Iterator[str]:
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(video.parent))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/{video.name}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("opened", [piped, served])
+def test_a_pipe_and_an_address_give_images_as_they_arrive(
+    video: Path, opened: Callable[[Path], AbstractContextManager[str]]
+) -> None:
+    with opened(video) as name:
+        stamps, images = zip(*open_source(name, 5.0).images(Event()), strict=True)
+    assert [round(float(image.mean()) / 30) for image in images] == list(range(8))
+    assert (np.diff(stamps) > 0).all() and stamps[-1] < 5.0, "seconds since the first"
+
+
+def test_the_viewer_is_shown_the_drive(
+    street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it would show goes to a file, as it does without a screen."""
+    rerun = pytest.importorskip("rerun", reason="the extra rerun is not installed")
+    shown, target, messages = tmp_path / "shown.rrd", tmp_path / "images", []
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda stream: stream.save(shown))
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    settings, output = SETTINGS[1:], tmp_path / "run"  # keyframes are kept for the map
+    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, output, wait_s=1.5, view=True)
+    run_live(request, messages.append)
+    content = shown.read_bytes()
+    assert content[:3] == b"RRF"
+    for place in (b"/world/path", b"/world/camera", b"/world/camera/image", b"/depth", b"/world/map/"):
+        assert place in content, place
+
+
+def test_a_video_plays_at_its_own_speed(video: Path) -> None:
+    source = VideoSource(str(video))
     source.fps = 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
@@ -129,6 +190,8 @@ def test_a_video_plays_at_its_own_speed(tmp_path: Path) -> None:
 def test_sources_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="no image comes from"):
         VideoSource(str(tmp_path / "none.mp4"))
+    with pytest.raises(SequenceError, match="no image comes from 99: check the camera"):
+        open_source("99", 0.1)
     with pytest.raises(SequenceError, match=r"no image came to .* within 0\.1 s"):
         FolderSource(tmp_path, 0.1)
     with pytest.raises(SlamError, match="choose camera-height"):

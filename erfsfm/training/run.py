@@ -24,6 +24,7 @@ from torch.utils.data import DataLoader
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
+from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError
@@ -84,8 +85,13 @@ def train(
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
     together = config.training.batch * config.training.processes
-    many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
-    draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
+    span = (config.training.steps * together, done_steps * together)
+    draws: SnippetDraws | ShardDraws
+    if in_shards(training):
+        draws = ShardDraws(training, config, *span, rank)
+    else:
+        many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
+        draws = SnippetDraws(training, config, *span, rank, many_views)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
     if not resume:
@@ -108,7 +114,7 @@ def _timer(minutes: float) -> Timer:
     return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
 
 
-def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
+def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
     workers = config.data.workers
     return DataLoader(
         draws,

@@ -15,7 +15,7 @@ class Measurements:
     """All relative poses with their noise, and the trajectories chained from them ``(N, 4, 4)``."""
 
     T_network: FloatArray
-    lidar: LidarPath | None
+    lidar: LidarPath | MeasurementFailure | None
     scale: Scale
     factors: list[RelativePose]
     T_odometry: FloatArray

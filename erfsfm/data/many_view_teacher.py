@@ -135,7 +135,8 @@ class DriveLabels:
         for target in targets:
             near = [n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording)]
             grey = {n: image for n in (target, *near) if (image := self._grey(n, camera)) is not None}
-            bounds = np.stack([np.zeros((camera.height, camera.width)), np.full((camera.height, camera.width), np.inf)])
+            nothing = np.zeros((camera.height, camera.width), np.float32)
+            bounds = nothing, np.full_like(nothing, np.inf)
             if target in grey and len(grey) > LEAST_NEIGHBOURS:
                 image = grey.pop(target)
                 T_neighbour_target = np.linalg.inv(self.T_world_camera[[*grey]]) @ self.T_world_camera[target]
@@ -150,9 +151,10 @@ class DriveLabels:
     def _grey(self, index: int, camera: Camera) -> Grey | None:
         """A frame at a camera's size; None where it cannot be read."""
         try:
-            return np.asarray(cv2.cvtColor(self.recording.image(index, camera.height, camera.width), cv2.COLOR_RGB2GRAY))
+            image = self.recording.image(index, camera.height, camera.width)
         except DataError:
             return None
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
 class ManyViewTeacher:

@@ -76,8 +76,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``, of the first snippet of its random numbers that can be read: tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3), and ``frames``
-        (N + 1): of each image in time order a number that is its own, mirrored another one.
+        """Sample ``number``, of the first snippet drawn that can be read: tensors ``target`` (3, H, W), ``sources``
+        (N, 3, H, W), ``K`` (3, 3), and ``frames`` (N + 1): of each image in time order a number that is its own,
+        mirrored another one.
 
         With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With
         weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.

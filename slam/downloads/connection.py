@@ -86,7 +86,7 @@ def connection_errors(url: str, what: str) -> Iterator[None]:
     try:
         yield
     except (exceptions.MissingSchema, exceptions.InvalidSchema, exceptions.InvalidURL) as error:
-        raise DownloadError(f"{url} is no address: give --mirror as http://HOST/FOLDER or https://HOST/FOLDER") from error
+        raise DownloadError(f"{url} is no address: give --mirror as https://HOST/FOLDER") from error
     except (OSError, EOFError, remotezip.RemoteZipError, urllib3.HTTPError) as error:
         raise BrokenError(f"{url}: {what} ({_cause(error)}); run the same command again to go on") from error
 

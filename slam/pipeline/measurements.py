@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.frames import RelativePose
+from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
 from slam.se3 import FloatArray

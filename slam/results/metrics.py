@@ -22,7 +22,16 @@ from slam.frontend.lidar_odometry import LidarPath
 from slam.pipeline.batch import SlamResult
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
-from slam.results.summary import SCHEMA, Provenance, describe_frames, describe_gaps, describe_sequence, describe_timing, finite, null
+from slam.results.summary import (
+    SCHEMA,
+    Provenance,
+    describe_frames,
+    describe_gaps,
+    describe_sequence,
+    describe_timing,
+    finite,
+    null,
+)
 from slam.se3 import umeyama
 from slam.trajectory import Trajectory, associate
 

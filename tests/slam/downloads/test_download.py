@@ -228,8 +228,8 @@ def test_one_that_keeps_breaking_is_named_and_goes_on_later(
     "mirror, message",
     [
         ("http://127.0.0.1:9", r"\(Connection refused\); run the same command again to go on"),
-        ("archives", "is no address: give --mirror as http://HOST/FOLDER"),
-        ("ftp://127.0.0.1", "is no address: give --mirror as http://HOST/FOLDER"),
+        ("archives", "is no address: give --mirror as https://HOST/FOLDER"),
+        ("ftp://127.0.0.1", "is no address: give --mirror as https://HOST/FOLDER"),
     ],
 )
 def test_no_server_at_all(download: Call, arguments: tuple[str, ...], mirror: str, message: str) -> None:

@@ -51,7 +51,7 @@ class DepthQuality:
             self._refined.add(keyframe.refined.depth, truth, keyframe.refined.relative_sigma)
 
     def summary(self, is_refined: bool) -> dict[str, Any]:
-        """``network`` and ``refined``, each null with a reason where it cannot be computed; warns of unreadable maps."""
+        """``network`` and ``refined``, each null with a reason where it cannot be computed; warns of unread maps."""
         network, refined = self._network.summary(), self._refined.summary()
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:

@@ -82,7 +82,7 @@ class Recording:
         """
         if self.packed is not None:
             raise DataError(
-                f"{self.name} lies in shards, which only training reads: name it in data.validation and pack again"
+                f"{self.name} lies in shards, which are to train on alone: use the recording that was packed"
             )
         stored = self.images[index]
         if self.video is not None:

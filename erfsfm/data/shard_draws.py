@@ -178,16 +178,21 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
         return weights, np.diff(np.rint(shares / shares[-1] * sizes.sum()), prepend=0).astype(np.int64)
 
 
-def in_shards(recordings: Sequence[Recording]) -> bool:
-    """Whether these recordings lie in shards.
+def in_shards(training: Sequence[Recording], validation: Sequence[Recording]) -> bool:
+    """Whether the recordings to train on lie in shards.
 
     Raises:
-        DataError: some do and some do not.
+        DataError: some do and some do not, or those to validate on do.
     """
-    packed = [recording.packed is not None for recording in recordings]
+    for recording in validation:
+        if recording.packed is not None:
+            raise DataError(
+                f"{recording.name} lies in shards, which are to train on: pack again with it in data.validation"
+            )
+    packed = [recording.packed is not None for recording in training]
     if any(packed) and not all(packed):
         raise DataError(
-            f"{recordings[packed.index(False)].name} is not in shards as {recordings[packed.index(True)].name} is: "
+            f"{training[packed.index(False)].name} is not in shards as {training[packed.index(True)].name} is: "
             "pack it into shards too, or train on one kind of data set"
         )
     return any(packed)

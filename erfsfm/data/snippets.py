@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,6 +24,7 @@ from erfsfm.data.samples import as_tensors, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import overlapping
 from erfsfm.data.standstill import moving_parts
+from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.errors import DataError
 from erfsfm.readers.frame_range import FrameRange
 from erfsfm.teacher.structure import StructureCache, TeacherStructure
@@ -32,14 +32,6 @@ from erfsfm.teacher.structure import StructureCache, TeacherStructure
 logger = logging.getLogger(__name__)
 
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
-
-
-@dataclass(frozen=True)
-class Snippet:
-    """A window: frames ``first`` to ``first + length - 1`` of a recording."""
-
-    recording: Recording
-    first: int
 
 
 class SnippetDraws(IterableDataset[dict[str, Tensor]]):
@@ -60,6 +52,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._rank = rank
         images_mb = config.data.cache_mb - (0 if many_views is None else labels_mb(config.data))
         self._cache = ImageCache(images_mb, config.network.height, config.network.width)
+        self._reader = SnippetReader()
         self._structures = StructureCache(config.teacher.cache)
         self._many_views = many_views
         length = config.network.sources + 1
@@ -76,17 +69,23 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``, a `training_sample`."""
+        """Sample ``number``, a `training_sample` of the first snippet drawn that can be read."""
         rng = np.random.default_rng([self._config.training.seed, number])
-        which = int(rng.choice(len(self.recordings), p=self._probabilities))
-        recording = self.recordings[which]
         network = self._config.network
-        starts = self._starts(recording)
-        snippet = Snippet(recording, starts[int(rng.integers(len(starts)))])
-        images = load_window(self._cache, snippet, network.sources + 1)
+        snippet, images = self._reader.first_readable(
+            self._chosen(rng), lambda snippet: load_window(self._cache, snippet, network.sources + 1)
+        )
+        recording, which = snippet.recording, self.recordings.index(snippet.recording)
         camera = recording.camera.resized(network.width, network.height)
         seen = self._structure(snippet, images, camera.K)
         return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
+
+    def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
+        """Random snippets without end."""
+        while True:
+            recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
+            starts = self._starts(recording)
+            yield Snippet(recording, starts[int(rng.integers(len(starts)))])
 
     def _starts(self, recording: Recording) -> range:
         """First frames of the snippets that may be drawn."""
@@ -121,7 +120,7 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
         kept = usable(recordings, length)
         windows = [Snippet(r, first) for r in kept for first in range(len(r) - length + 1)]
         chosen = np.linspace(0, len(windows) - 1, min(config.data.validation_snippets, len(windows)))
-        self.snippets = [windows[int(i)] for i in chosen.round()]
+        self.snippets = readable([windows[int(i)] for i in chosen.round()], self._read)
 
     def __len__(self) -> int:
         return len(self.snippets)
@@ -129,28 +128,26 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
     def __getitem__(self, item: int) -> dict[str, Tensor]:
         snippet, network = self.snippets[item], self._network
         recording, length = snippet.recording, network.sources + 1
-        images = load_window(self._cache, snippet, length)
+        images, depth = self._read(snippet)
         sample = as_tensors(images, recording.camera.resized(network.width, network.height).K)
-        middle = snippet.first + network.sources // 2
-        depth = recording.true_depth(middle)
         if depth is not None:
             sample["depth"] = torch.from_numpy(depth)
         T_world_camera = recording.true_poses()
         if T_world_camera is not None:
             window = T_world_camera[snippet.first : snippet.first + length]
             sources = np.delete(window, network.sources // 2, axis=0)
-            sample["T_source_target"] = torch.from_numpy(np.linalg.inv(sources) @ T_world_camera[middle])
+            sample["T_source_target"] = torch.from_numpy(np.linalg.inv(sources) @ window[network.sources // 2])
         return sample
+
+    def _read(self, snippet: Snippet) -> tuple[list[NDArray[np.uint8]], NDArray[np.float32] | None]:
+        """Images in time order, and true depth of the target where it is known."""
+        images = load_window(self._cache, snippet, self._network.sources + 1)
+        return images, snippet.recording.true_depth(snippet.first + self._network.sources // 2)
 
 
 def labels_mb(config: DataConfig) -> int:
     """The part of ``data.cache_mb`` for labels of many views: larger than images, but fewer."""
     return config.cache_mb * 2 // 5
-
-
-def load_window(cache: ImageCache, snippet: Snippet, length: int) -> list[NDArray[np.uint8]]:
-    """The images of a snippet at the networks' size, in time order."""
-    return [cache.image(snippet.recording, snippet.first + k) for k in range(length)]
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:

@@ -87,7 +87,7 @@ def train(
     together = config.training.batch * config.training.processes
     span = (config.training.steps * together, done_steps * together)
     draws: SnippetDraws | ShardDraws
-    if in_shards(training):
+    if in_shards(training, validation):
         draws = ShardDraws(training, config, *span, rank)
     else:
         many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)

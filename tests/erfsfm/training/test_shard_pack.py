@@ -150,7 +150,7 @@ def test_processes_and_workers_share_a_pass_without_overlap(
 
 def test_samples_are_those_of_the_originals(config: ExperimentConfig, pack: Path) -> None:
     on_shards = on_pack(config, pack)
-    assert in_shards(split_recordings(on_shards.data)[0])
+    assert in_shards(*split_recordings(on_shards.data))
     assert config.teacher.cache is not None
     teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
     originals = SnippetDraws(split_recordings(config.data)[0], config, 400, many_views=teacher)
@@ -329,8 +329,8 @@ def test_what_does_not_fit_is_refused(config: ExperimentConfig, pack: Path, shar
     with pytest.raises(DataError, match="too few for 99 data loader processes"):
         draws(changed(on_shards, data={"workers": 99}), 2)
     with pytest.raises(DataError, match="not in shards as simulated/0 is"):
-        in_shards(split_recordings(on_pack(config, pack, shared / "simulated/1").data)[0])
-    with pytest.raises(DataError, match="lies in shards, which only training reads"):
+        in_shards(*split_recordings(on_pack(config, pack, shared / "simulated/1").data))
+    with pytest.raises(DataError, match="lies in shards, which are to train on: pack again"):
         train(on_pack(config, pack, validation=["simulated/1", "simulated/500"]), tmp_path / "run", device="cpu")
     plain: ShardSummary = pack_shards(photometric(config), tmp_path / "plain", megabytes=0.3)
     assert plain.labels == 0 and plain.frames == sum(FRAMES.values())
@@ -338,6 +338,8 @@ def test_what_does_not_fit_is_refused(config: ExperimentConfig, pack: Path, shar
         draws(on_pack(config, tmp_path / "plain"), 2)
     with pytest.raises(DataError, match="raise --shard-megabytes"):
         pack_shards(config, tmp_path / "tiny", megabytes=0.01)
+    with pytest.raises(DataError, match="lies in shards, which are to train on alone"):
+        pack_shards(photometric(on_shards), tmp_path / "again")
     with pytest.raises(ConfigError, match="is not empty"):
         pack_shards(config, pack)
     assert not (tmp_path / "tiny").exists()

@@ -84,14 +84,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    together = config.training.batch * config.training.processes
-    span = (config.training.steps * together, done_steps * together)
-    draws: SnippetDraws | ShardDraws
-    if in_shards(training, validation):
-        draws = ShardDraws(training, config, *span, rank)
-    else:
-        many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
-        draws = SnippetDraws(training, config, *span, rank, many_views)
+    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output / "teacher", quiet)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
     if not resume:
@@ -112,6 +105,24 @@ def train(
 def _timer(minutes: float) -> Timer:
     """Time of the loop, kept in checkpoints; it ends the run after some minutes, if any are given."""
     return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
+
+
+def _draws(
+    training: list[Recording],
+    sharded: bool,
+    config: ExperimentConfig,
+    position: tuple[int, int],
+    measured: Path,
+    quiet: bool,
+) -> SnippetDraws | ShardDraws:
+    """What this process trains on; ``position`` is the steps done and its rank, ``measured`` keeps a teacher's labels."""
+    done_steps, rank = position
+    together = config.training.batch * config.training.processes
+    draws, done = config.training.steps * together, done_steps * together
+    if sharded:
+        return ShardDraws(training, config, draws, done, rank)
+    many_views = measured_views(training, config, measured, quiet or rank > 0)
+    return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
 def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:

@@ -115,7 +115,7 @@ def _draws(
     measured: Path,
     quiet: bool,
 ) -> SnippetDraws | ShardDraws:
-    """What this process trains on; ``position`` is the steps done and its rank, ``measured`` keeps a teacher's labels."""
+    """What this process trains on; ``position``: steps done and rank; ``measured``: of the teacher."""
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together

@@ -13,6 +13,7 @@ from erfsfm.config_tree import Section
 from erfsfm.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
+_LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
 
 class NetworkConfig(Section):
@@ -244,6 +245,13 @@ class ExperimentConfig(Section):
         if self.training.minutes > 0 and self.training.processes > 1:
             raise ValueError(
                 "training.minutes needs training.devices: 1 and training.nodes: 1: the clocks of several would differ"
+            )
+        network, plain = self.network, any("lite0" not in name for name in (self.network.depth, self.network.pose))
+        one_pixel = max(network.height, network.width) <= _LAST_MAP_ONE_PIXEL
+        if plain and network.normalisation == "batch" and self.training.batch == 1 and one_pixel:
+            raise ValueError(
+                f"network.normalisation: batch has one value to normalise in a batch of one {network.height}x"
+                f"{network.width} image: training.batch must be 2 or more, or the images larger than 128 pixels"
             )
         return self
 

@@ -24,14 +24,17 @@ from numpy.typing import NDArray
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import TrainingError
+from erfsfm.errors import DataError, TrainingError
 from erfsfm.files import write_atomically
+from erfsfm.geometry.camera import Camera
+from erfsfm.multiview import Grey
 from erfsfm.teacher.drive_poses import drive_poses
 from erfsfm.teacher.many_views import NEIGHBOURS, label
 from erfsfm.teacher.structure import TeacherStructure
 
 VERSION = 1
 LARGEST_WIDTH = 832  # pixels of the images that are measured: finer flow is slower and no surer
+LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
 
 Progress = Callable[[str, int, int], None]
@@ -76,10 +79,7 @@ class DriveLabels:
 
     def motion(self, first: int, sources: int) -> NDArray[np.float32]:
         """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
-        target = first + sources // 2
-        others = np.delete(np.arange(first, first + sources + 1), sources // 2)
-        T_source_target = np.linalg.inv(self.T_world_camera[others]) @ self.T_world_camera[target]
-        return np.asarray(T_source_target, dtype=np.float32)
+        return snippet_motion(self.T_world_camera, first, sources)
 
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
         """Least and most inverse depth ``(H, W)`` of a frame.
@@ -120,23 +120,51 @@ class DriveLabels:
         write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
 
     def measure_labels(self, targets: Sequence[int]) -> int:
-        """Measure and keep the labels of some frames; returns their number."""
+        """Measure and keep the labels of some frames; returns their number.
+
+        Neighbours that cannot be read are left out. Of a frame that cannot be read, or has less than two, nothing is
+        known.
+        """
         cv2.setNumThreads(1)
         ratio = min(LARGEST_WIDTH / self.recording.camera.width, 1)
         camera = self.recording.camera
         camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
         for target in targets:
-            frames = [target, *(n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording))]
-            images = [self.recording.image(n, camera.height, camera.width) for n in frames]
-            grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-            T_neighbour_target = np.linalg.inv(self.T_world_camera[frames[1:]]) @ self.T_world_camera[target]
-            bounds = label(grey[0], grey[1:], camera.K.astype(np.float64), T_neighbour_target)
+            near = [n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording)]
+            grey = {n: image for n in (target, *near) if (image := self._grey(n, camera)) is not None}
+            nothing = np.zeros((camera.height, camera.width), np.float32)
+            bounds = nothing, np.full_like(nothing, np.inf)
+            if target in grey and len(grey) > LEAST_NEIGHBOURS:
+                image = grey.pop(target)
+                T_neighbour_target = np.linalg.inv(self.T_world_camera[[*grey]]) @ self.T_world_camera[target]
+                bounds = label(image, [*grey.values()], camera.K.astype(np.float64), T_neighbour_target)
             least, most = (
                 cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
                 for values in bounds
             )
             write_atomically(self.label_file(target), lambda p: _compress(p, least=least, most=most), sync=False)  # noqa: B023
         return len(targets)
+
+    def _grey(self, index: int, camera: Camera) -> Grey | None:
+        """A frame at a camera's size; None where it cannot be read."""
+        try:
+            image = self.recording.image(index, camera.height, camera.width)
+        except DataError:
+            return None
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+
+def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float32]:
+    """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
+    target = first + sources // 2
+    others = np.delete(np.arange(first, first + sources + 1), sources // 2)
+    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target], dtype=np.float32)
+
+
+def motion_alone(T_source_target: NDArray[np.float32], size: tuple[int, int]) -> TeacherStructure:
+    """A structure that bounds no depth; ``size`` is height and width of the images."""
+    nothing = np.zeros(size, dtype=np.float16)
+    return TeacherStructure(T_source_target, nothing, np.full_like(nothing, np.inf))
 
 
 class ManyViewTeacher:
@@ -177,8 +205,7 @@ class ManyViewTeacher:
         """Of the snippet that begins at a frame."""
         drive, target = self.drive(recording), first + sources // 2
         if self.measures == "poses":
-            nothing = np.zeros(self._size, dtype=np.float16)
-            return TeacherStructure(drive.motion(first, sources), nothing, np.full_like(nothing, np.inf))
+            return motion_alone(drive.motion(first, sources), self._size)
         least, most = self._labels.get((id(recording), target), lambda: np.stack(drive.label(target)))
         return TeacherStructure(drive.motion(first, sources), least, most)
 

@@ -79,10 +79,23 @@ def connection_errors(url: str, what: str) -> Iterator[None]:
 
     Raises:
         BrokenError: with what to do.
+        DownloadError: the address is none of a server.
     """
-    remotezip, _, urllib3 = import_remotezip()
+    remotezip, requests, urllib3 = import_remotezip()
+    exceptions = requests.exceptions
     try:
         yield
+    except (exceptions.MissingSchema, exceptions.InvalidSchema, exceptions.InvalidURL) as error:
+        raise DownloadError(f"{url} is no address: give --mirror as https://HOST/FOLDER") from error
     except (OSError, EOFError, remotezip.RemoteZipError, urllib3.HTTPError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise BrokenError(f"{url}: {what} ({reason}); run the same command again to go on") from error
+        raise BrokenError(f"{url}: {what} ({_cause(error)}); run the same command again to go on") from error
+
+
+def _cause(error: BaseException) -> str:
+    """What the system says, such as that the connection was refused, else the error itself."""
+    first: BaseException | None = error
+    while first is not None:
+        if isinstance(first, OSError) and first.strerror:
+            return first.strerror
+        first = first.__context__
+    return " ".join(f"{type(error).__name__}: {error}".split())

@@ -86,7 +86,7 @@ class ZipMembers:
 
     def _open(self) -> Any:
         remotezip, *_ = import_remotezip()
-        connection = self._connection
+        connection, url = self._connection, self.url
 
         class Fetcher:
             """What remotezip asks for ranges."""
@@ -95,7 +95,8 @@ class ZipMembers:
                 pass
 
             def fetch(self, data_range: tuple[int, int | None], stream: bool = False) -> Any:
-                response = connection.get(*data_range)
+                with connection_errors(url, "cannot be read"):  # zipfile takes an OSError for a damaged archive
+                    response = connection.get(*data_range)
                 first, _, last = (
                     response.headers["Content-Range"].removeprefix("bytes ").partition("/")[0].partition("-")
                 )

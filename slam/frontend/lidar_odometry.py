@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 import logging
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.errors import ErfsfmError
 from slam.config import LidarConfig
+from slam.errors import SlamError
 from slam.frames import RelativePose, Sequence
+from slam.frontend.failure import MeasurementFailure
 from slam.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
@@ -21,10 +25,14 @@ LIDAR_SOURCE = "lidar"
 
 @dataclass(frozen=True)
 class LidarPath:
-    """``frames`` ``(S,)`` that have a scan, and ``T_world_camera`` ``(S, 4, 4)`` there, metres, first the identity."""
+    """``frames`` ``(S,)`` that have a scan, and ``T_world_camera`` ``(S, 4, 4)`` there, metres, first the identity.
+
+    ``unreadable`` says of frames why their scan could not be read; they are left out.
+    """
 
     frames: NDArray[np.int64]
     T_world_camera: FloatArray
+    unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
 def has_scans(sequence: Sequence) -> bool:
@@ -33,15 +41,22 @@ def has_scans(sequence: Sequence) -> bool:
     return sequence.T_camera_lidar is not None and any(map(all, itertools.pairwise(scanned)))
 
 
-def lidar_path(sequence: Sequence) -> LidarPath | None:
-    """Register all scans of a sequence one after the other; None where it has fewer than two.
+def readable_scan(sequence: Sequence, frame: int) -> FloatArray | str:
+    """The points ``(P, 3)`` of a frame's scan, metres, in the LiDAR, or why they cannot be read."""
+    try:
+        return sequence.scan(frame)
+    except (SlamError, ErfsfmError) as error:
+        return str(error)
 
-    Raises:
-        SlamError: a scan cannot be read.
+
+def lidar_path(sequence: Sequence) -> LidarPath | MeasurementFailure | None:
+    """Register the scans of a sequence one after the other; None where it has fewer than two.
+
+    Scans that cannot be read are left out, with one warning; a failure where fewer than two can.
     """
-    frames = [k for k in range(len(sequence)) if sequence.has_scan(k)]
+    scanned = [k for k in range(len(sequence)) if sequence.has_scan(k)]
     T_camera_lidar = sequence.T_camera_lidar
-    if len(frames) < LEAST_SCANS or T_camera_lidar is None:
+    if len(scanned) < LEAST_SCANS or T_camera_lidar is None:
         return None
     # kiss-icp takes a while to import and most sequences have no scans
     from kiss_icp.config import load_config
@@ -51,13 +66,24 @@ def lidar_path(sequence: Sequence) -> LidarPath | None:
     settings.data.deskew = False  # the points have no time stamps
     settings.registration.max_num_threads = 1  # reproducible
     odometry = KissICP(settings)
-    T_first_lidar = []
-    for frame in frames:
-        odometry.register_frame(sequence.scan(frame), np.array([]))
+    frames, T_first_lidar, unreadable = [], [], {}
+    for frame in scanned:
+        points = readable_scan(sequence, frame)
+        if isinstance(points, str):
+            unreadable[frame] = points
+            continue
+        odometry.register_frame(points, np.array([]))
+        frames.append(frame)
         T_first_lidar.append(odometry.last_pose.copy())
+    if unreadable:
+        found = f"{len(unreadable)} of {len(scanned)} LiDAR scans cannot be read, first {min(unreadable.items())[1]}"
+        if len(frames) < LEAST_SCANS:
+            logger.warning("%s: the run goes on without LiDAR", found)
+            return MeasurementFailure(found)
+        logger.warning("%s: they are left out", found)
     T_world_camera = T_camera_lidar @ np.stack(T_first_lidar) @ invert(T_camera_lidar)
     logger.info("kiss-icp registered %d scans", len(frames))
-    return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera)
+    return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera, unreadable)
 
 
 def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:

@@ -66,7 +66,7 @@ class SlamResult:
     network: Trajectory
     odometry: Trajectory
     optimised: Trajectory
-    lidar: LidarPath | None
+    lidar: LidarPath | MeasurementFailure | None
     reference: Trajectory | None
     state: ObserverState
     observations: ClosedObservations
@@ -185,7 +185,7 @@ class SlamPipeline:
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
-        by_lidar = [] if lidar is None else lidar_steps(lidar, self._config.lidar)
+        by_lidar = lidar_steps(lidar, self._config.lidar) if isinstance(lidar, LidarPath) else []
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
         scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
         factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
 
+from slam.errors import SlamError
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
 from slam.pipeline.keyframe_depth import KeyframeDepth
@@ -13,6 +15,8 @@ from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply
 from slam.sequences.excerpt import Excerpt
+
+logger = logging.getLogger(__name__)
 
 _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refining it
 
@@ -26,13 +30,18 @@ class DepthQuality:
         self._is_metric = unit != "none"
         self._network, self._refined = DepthErrors(), DepthErrors()
         self._keyframes = self._not_refined = 0
+        self._unreadable: list[str] = []
 
     def add(self, keyframe: KeyframeDepth) -> None:
-        """Compare a keyframe with the truth, where it is known."""
+        """Compare a keyframe with the truth, where it is known and can be read."""
         self._keyframes += 1
         if not self._is_metric:
             return
-        truth = true_depth(self._sequence, keyframe.index, self._keyframes)
+        try:
+            truth = true_depth(self._sequence, keyframe.index, self._keyframes)
+        except SlamError as error:
+            self._unreadable.append(str(error))
+            return
         if truth is None:
             return
         self._network.add(keyframe.depth, truth)
@@ -42,9 +51,12 @@ class DepthQuality:
             self._refined.add(keyframe.refined.depth, truth, keyframe.refined.relative_sigma)
 
     def summary(self, is_refined: bool) -> dict[str, Any]:
-        """``network`` and ``refined``, each null with a reason where it cannot be computed."""
+        """``network`` and ``refined``, each null with a reason where it cannot be computed; warns of unread maps."""
         network, refined = self._network.summary(), self._refined.summary()
-        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
+        if self._unreadable:
+            logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
+        missing = unreadable if self._unreadable else "the sequence has no true depth (simulated, depth_2 or LiDAR)"
         if self._keyframes == 0:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:

@@ -14,6 +14,7 @@ from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
 from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import readable_scan
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
 from slam.se3 import FloatArray, Similarity, apply, invert
@@ -77,6 +78,8 @@ class DepthTruth:
 class LidarTruth:
     """LiDAR scans at true poses, points within 25 m of the scanner; moving objects are among them.
 
+    A scan that cannot be read, of which LiDAR odometry has warned, has no point.
+
     Completeness is about points in the images; the accuracy of the map is measured against all.
     """
 
@@ -94,7 +97,9 @@ class LidarTruth:
         """The points of one scan; those that project into its image are in the image."""
         sequence = self._sequence
         assert sequence.reference is not None and sequence.T_camera_lidar is not None
-        points = sequence.scan(frame)
+        points = readable_scan(sequence, frame)
+        if isinstance(points, str):
+            points = np.empty((0, 3))
         ranges = np.linalg.norm(points, axis=1)
         self._limits[frame] = _elevations(points, ranges)
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
@@ -177,6 +182,8 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: SlamResult, s
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
         return no_map_errors(str(error))
+    if truth.distance is None and len(found.distances["with_scale"].to_map) == 0:
+        return no_map_errors("no point of the true surface is known near the images")
     scaled = {"scale": fits["with_scale"].scale} | statistics(found.distances["with_scale"])
     rigid = _unknown_scale() if unmetric else statistics(found.distances["rigid"])
     return {**rigid, "truth": truth.name, "evaluated_m": found.length_m, "with_scale": scaled}

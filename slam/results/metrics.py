@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -17,27 +18,39 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import LidarPath
 from slam.pipeline.batch import SlamResult
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
-from slam.results.summary import SCHEMA, Provenance, describe_gaps, describe_sequence, describe_timing, finite, null
+from slam.results.summary import (
+    SCHEMA,
+    Provenance,
+    describe_frames,
+    describe_gaps,
+    describe_sequence,
+    describe_timing,
+    finite,
+    null,
+)
 from slam.se3 import umeyama
 from slam.trajectory import Trajectory, associate
 
 
 def lidar_trajectory(result: SlamResult) -> Trajectory | None:
     """LiDAR odometry with the stamps of its frames."""
-    if result.lidar is None:
+    if not isinstance(result.lidar, LidarPath):
         return None
     return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
 
 
 def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
     """Errors of LiDAR odometry at its frames."""
-    lidar = lidar_trajectory(result)
-    if lidar is None or result.lidar is None:
+    path, lidar = result.lidar, lidar_trajectory(result)
+    if isinstance(path, MeasurementFailure):
+        return null("lidar", path.reason)
+    if path is None or lidar is None:
         return null("lidar", "the sequence has no LiDAR scans")
-    reference = None if result.reference is None else result.reference.select(result.lidar.frames).rebased()
+    reference = None if result.reference is None else result.reference.select(path.frames).rebased()
     return {"lidar": trajectory_metrics(lidar, reference)}
 
 
@@ -60,6 +73,7 @@ def estimate_metrics(
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
+            | {"unreadable_scans": describe_frames(_unreadable_scans(result))}
             | {"continued_at": result.first}
             | {"segments": [asdict(segment) for segment in result.observations.segments]},
             "timing": describe_timing(result.stopwatch, len(sequence) - result.first),
@@ -74,6 +88,11 @@ def estimate_metrics(
         }
     )
     return metrics
+
+
+def _unreadable_scans(result: SlamResult) -> Mapping[int, str]:
+    """Frames whose LiDAR scan was left out of the odometry, with the reason."""
+    return result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
 
 
 def _tracking(result: SlamResult) -> dict[str, Any]:

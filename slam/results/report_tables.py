@@ -96,7 +96,8 @@ def what_ran(metrics: Metrics) -> Table:
     sha256 = text("provenance", "weights_sha256")
     rows = [
         ("Sequence", f"{text('sequence', 'name')}, {text('sequence', 'frames')} frames"),
-        ("Interpolated frames", _interpolated(metrics)),
+        ("Interpolated frames", _frames(metrics, "bridged") or "none"),
+        *([("LiDAR scans left out", left_out)] if (left_out := _frames(metrics, "unreadable_scans")) else []),
         ("True length", text("sequence", "length_m", unit=" m")),
         ("Frame rate", text("sequence", "fps", unit=" frames/s")),
         ("Scale", f"mode {text('scale', 'mode')}, value {text('scale', 'value', decimals=4)}"),
@@ -315,11 +316,10 @@ def _depth_source(metrics: Metrics) -> str:
     return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
 
 
-def _interpolated(metrics: Metrics) -> str:
-    """Interpolated frames, with the reason of each gap."""
-    found, _ = lookup(metrics, "sequence", "bridged")
-    gaps = [f"{gap['first']} to {gap['last']}: {gap['reason']}" for gap in found or ()]
-    return _shortened(gaps) if gaps else "none"
+def _frames(metrics: Metrics, name: str) -> str:
+    """Consecutive frames of a list of the sequence, with the reason of the first."""
+    found, _ = lookup(metrics, "sequence", name)
+    return _shortened([f"{gap['first']} to {gap['last']}: {gap['reason']}" for gap in found or ()])
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> str:

@@ -54,10 +54,12 @@ def describe_sequence(sequence: Sequence, length_m: float | None) -> dict[str, A
 
 def describe_gaps(frames: Mapping[int, str]) -> dict[str, Any]:
     """Number of interpolated frames, and the gaps with the reason of their first frame."""
-    return {
-        "bridged_frames": len(frames),
-        "bridged": [{"first": first, "last": last, "reason": frames[first]} for first, last in runs(frames)],
-    }
+    return {"bridged_frames": len(frames), "bridged": describe_frames(frames)}
+
+
+def describe_frames(reasons: Mapping[int, str]) -> list[dict[str, Any]]:
+    """Consecutive frames with the reason of the first."""
+    return [{"first": first, "last": last, "reason": reasons[first]} for first, last in runs(reasons)]
 
 
 def describe_timing(watch: Stopwatch, frames: int) -> dict[str, Any]:

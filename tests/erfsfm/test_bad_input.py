@@ -19,7 +19,7 @@ from erfsfm.config import NetworkConfig, dump_yaml, load_experiment
 Refusal = Callable[..., str]
 WriteRoot = Callable[..., Path]
 TRAIN = ["train", "--config", "tiny", "--set", "training.steps=1", "--set", "data.workers=0", "--device", "cpu"]
-SMALL = ["--set", "network.height=32", "--set", "network.width=64", "--set", "training.batch=1"]
+SMALL = ["--set", "network.height=32", "--set", "network.width=64", "--set", "training.batch=2"]
 
 
 @pytest.fixture
@@ -58,13 +58,19 @@ def test_a_snippet_shorter_than_asked(refusal: Refusal, tmp_path: Path, write_ro
 
 def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:
     root = write_root(tmp_path / "root", frames=5, size=(64, 96))
-    odd = root / "sequences/00/image_2/000003.png"
+    odd = root / "sequences/00/image_2/000002.png"
     cv2.imwrite(str(odd), np.zeros((48, 96, 3), np.uint8))
     wanted = (
-        "000003.png is 96 x 48; the camera of kitti_odometry/00 is 96 x 64; all images of a recording need one size"
+        "000002.png is 96 x 48; the camera of kitti_odometry/00 is 96 x 64; all images of a recording need one size"
     )
     assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
+
+
+def test_batch_normalisation_of_one_value(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
+    root = write_root(tmp_path / "root", frames=5)
+    error = refusal(*TRAIN, *SMALL[:4], "--set", "training.batch=1", "--dataset", root, "--output", tmp_path / "run")
+    assert "one value to normalise in a batch of one 32x64 image: training.batch must be 2 or more" in error
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

@@ -23,6 +23,7 @@ from slam.errors import RunError, SlamError
 from slam.pipeline.batch import SlamPipeline
 from slam.pose_graph import PoseGraph
 from slam.results.folder import RunFolder
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 CheckRun = Callable[[Path], dict[str, Any]]
 CopyRoot = Callable[[], Path]
@@ -165,6 +166,27 @@ def test_an_unreadable_image_is_bridged_and_reported(
     assert folder.metrics()["sequence"]["bridged_frames"] == 1
     for name in ("report.html", "run.log"):
         assert "000006.png is truncated" in (folder.path / name).read_text()
+
+
+def test_unreadable_scans_are_left_out_and_reported(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    scans = root / "sequences/sim/velodyne"
+    scans.mkdir()
+    street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001))
+    for k in range(4, 8):
+        street.scan(k).astype("<f4").tofile(scans / f"{k:06d}.bin")
+    (scans / "000006.bin").write_bytes(b"12345")
+    folder = run_slam(**reported | {"dataset": root, "frames": None})
+    (gap,) = check_run(folder.path)["sequence"]["unreadable_scans"]
+    assert (gap["first"], gap["last"]) == (6, 6) and "000006.bin is no Velodyne scan" in gap["reason"]
+    for name in ("report.html", "run.log"):
+        assert "000006.bin is no Velodyne scan" in (folder.path / name).read_text()
+    for scan in scans.iterdir():
+        scan.write_bytes(b"12345")
+    metrics = check_run(run_slam(**reported | {"dataset": root, "frames": None}).path)
+    assert metrics["trajectories"]["lidar_reason"].startswith("4 of 4 LiDAR scans cannot be read")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The many-view teacher on a simulated drive: poses by the SLAM system, labels, what is kept."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,18 @@ def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
     assert told == [("teacher: depth", 1, 1)]
     assert kept.stat().st_mtime_ns == written and len(lost.read_bytes()) == len(before)
+
+
+def test_an_image_that_cannot_be_read_has_no_label_and_is_no_neighbour(recording, teacher, tmp_path):
+    shutil.copytree(recording.images[0].parents[3], tmp_path / "world")
+    broken = discover(tmp_path / "world")[0]
+    broken.images[12].write_bytes(b"broken")
+    drive = ManyViewTeacher(tmp_path / "teacher", SIZE, stride=6).drive(broken)
+    drive.keep_poses(teacher.drive(recording).T_world_camera)
+    drive.measure_labels([10, 12])
+    least, most = drive.label(12)
+    assert (least == 0).all() and np.isinf(most).all()
+    assert (drive.label(10)[0] > 0).mean() > 0.3
 
 
 def test_only_labelled_frames_are_drawn(recording, teacher):

@@ -18,13 +18,8 @@ from torch.utils.data import DataLoader
 
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.snippets import (
-    SnippetDraws,
-    ValidationSnippets,
-    as_tensors,
-    split_recordings,
-    usable,
-)
+from erfsfm.data.samples import as_tensors
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.errors import DataError
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
@@ -75,6 +70,45 @@ def test_only_the_default_validation_may_match_no_recording(coded: Path) -> None
     assert split_recordings(DataConfig(roots=[coded / "a"], validation=[]))[1] == []
     with pytest.raises(DataError, match=r"nothing to validate on: .* name folder/c; found folder/a; name one"):
         split_recordings(DataConfig(roots=[coded / "a"], validation=["folder/c"]))
+
+
+def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
+    coded: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def drawn() -> list[dict[str, Tensor]]:
+        recordings = discover(coded / "a") + discover(coded / "b")
+        draws = SnippetDraws(recordings, experiment(flip=0), 40)
+        return [draws.draw(number) for number in range(40)]
+
+    before = drawn()
+    (coded / "a/4.png").write_bytes(b"broken")
+    after = drawn()
+    assert caplog.messages == [
+        f"image {coded / 'a/4.png'} cannot be decoded: it is damaged or not an image; copy it again: "
+        "snippets with it are passed over"
+    ]
+    with_it = [folder_of(one) == "a" and 4 in frames_of(one) for one in before]
+    assert 3 < sum(with_it) < 20
+    assert not any(folder_of(one) == "a" and 4 in frames_of(one) for one in after)
+    for one, other in (pair for pair, changed in zip(zip(before, after), with_it) if not changed):
+        assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_where_most_images_are_broken_the_reason_is_told(coded: Path) -> None:
+    for index in range(1, FRAMES, 2):
+        (coded / f"a/{index}.png").write_bytes(b"broken")
+    with pytest.raises(DataError, match=r"20 snippets in a row cannot be read, the last: .*a/\d\.png cannot be"):
+        SnippetDraws(discover(coded / "a"), experiment(), 1).draw(0)
+    with pytest.raises(DataError, match=r"no snippet to validate on can be read: .*a/1\.png cannot be decoded"):
+        ValidationSnippets(discover(coded / "a"), experiment())
+
+
+def test_broken_images_and_depth_are_left_out_of_validation(coded: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (coded / "a/1.png").write_bytes(b"broken")
+    snippets = ValidationSnippets(discover(coded / "a"), experiment())
+    assert [snippet.first for snippet in snippets.snippets] == [2, 3, 4, 5, 6]
+    (message,) = caplog.messages
+    assert message.startswith("2 of 7 snippets to validate on cannot be read and are left out: ")
 
 
 def frames_of(sample: dict[str, Tensor]) -> list[int]:

@@ -24,6 +24,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import erfsfm.training.run
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
 from erfsfm.errors import CheckpointError, ConfigError, DataError, TrainingError
@@ -219,22 +220,24 @@ def test_killed_and_resumed_ends_with_identical_weights(
 
 def die(config: ExperimentConfig, output: Path, moment: str) -> None:
     """Train in this process until it kills itself."""
-    step, save, saved = SelfSupervision.training_step, torch.save, []
+    step, write, written = SelfSupervision.training_step, erfsfm.training.run.write_atomically, []
 
     def dying_step(self: SelfSupervision, batch: dict[str, Tensor], index: int) -> Tensor:
         if moment == "in a step" and self.global_step == 5:
             os.kill(os.getpid(), signal.SIGKILL)
         return step(self, batch, index)
 
-    def dying_save(content: Any, path: Any, *args: Any, **options: Any) -> None:
-        save(content, path, *args, **options)
-        saved.append(path)
-        if moment == "in the second checkpoint" and len(saved) == 2:
-            os.truncate(path, Path(path).stat().st_size // 2)
+    def dying_write(path: Path, fill: Callable[[Path], object]) -> None:
+        def half(partial: Path) -> None:
+            fill(partial)
+            os.truncate(partial, partial.stat().st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
 
+        written.append(path)
+        write(path, half if moment == "in the second checkpoint" and len(written) == 2 else fill)
+
     SelfSupervision.training_step = dying_step  # type: ignore[method-assign]
-    torch.save = dying_save
+    erfsfm.training.run.write_atomically = dying_write
     train(config, output, device="cpu")
 
 

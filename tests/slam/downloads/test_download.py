@@ -136,7 +136,7 @@ def download(
     """Exit code, stdout and stderr, which is one line at most."""
 
     def call(*arguments: str) -> tuple[int, str, str]:
-        words = ["download", *arguments, "--to", str(tmp_path / "to"), "--mirror", server.address]
+        words = ["download", "--to", str(tmp_path / "to"), "--mirror", server.address, *arguments]
         monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
         try:
             main()
@@ -221,6 +221,20 @@ def test_one_that_keeps_breaking_is_named_and_goes_on_later(
     assert download(*arguments)[0] == 0
     left = found(tmp_path / "to")
     assert left == WHOLE if arguments == KITTI else not [name for name in left if "part" in name]
+
+
+@pytest.mark.parametrize("arguments", [KITTI, TUM])
+@pytest.mark.parametrize(
+    "mirror, message",
+    [
+        ("http://127.0.0.1:9", r"\(Connection refused\); run the same command again to go on"),
+        ("archives", "is no address: give --mirror as https://HOST/FOLDER"),
+        ("ftp://127.0.0.1", "is no address: give --mirror as https://HOST/FOLDER"),
+    ],
+)
+def test_no_server_at_all(download: Call, arguments: tuple[str, ...], mirror: str, message: str) -> None:
+    code, _, err = download(*arguments, "--mirror", mirror)
+    assert code == 1 and re.search(message, err) and len(err.splitlines()) == 1, err
 
 
 @pytest.mark.parametrize("arguments", [KITTI, TUM])

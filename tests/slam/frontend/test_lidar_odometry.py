@@ -1,12 +1,13 @@
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from erfsfm.errors import DataError
 from erfsfm.readers.scan import read_velodyne
 from slam.config import LidarConfig
+from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
@@ -72,12 +73,26 @@ def test_scans_are_used_where_neighbours_have_them_and_the_extrinsics_are_known(
     assert not has_scans(Scanned(np.eye(4)))
 
 
-def test_a_scan_cut_short_is_named(street, tmp_path):
+def test_scans_that_cannot_be_read_are_left_out_with_one_warning(street, tmp_path, caplog):
+    sequence = Scanned(street.T_camera_lidar, {k: tmp_path / f"{k}.bin" for k in range(4)})
+    for k, path in sequence.paths.items():
+        street.scan(k).tofile(path)
+    sequence.paths[1].write_bytes(b"12345")
+    path = lidar_path(sequence)
+    assert isinstance(path, LidarPath)
+    np.testing.assert_array_equal(path.frames, [0, 2, 3])
+    assert "1.bin is no Velodyne scan" in path.unreadable[1] and list(path.unreadable) == [1]
+    assert caplog.messages == [f"1 of 4 LiDAR scans cannot be read, first {path.unreadable[1]}: they are left out"]
+    assert path.T_world_camera[-1, 2, 3] == pytest.approx(street.T_world_camera[3, 2, 3], abs=0.5)
+
+
+def test_without_two_scans_that_can_be_read_the_reason_stands_for_the_path(street, tmp_path):
     sequence = Scanned(street.T_camera_lidar, {k: tmp_path / f"{k}.bin" for k in range(2)})
     for path in sequence.paths.values():
         path.write_bytes(b"12345")
-    with pytest.raises(DataError, match=r"0\.bin is no Velodyne scan.*; got [45] bytes"):
-        lidar_path(sequence)
+    failure = lidar_path(sequence)
+    assert isinstance(failure, MeasurementFailure)
+    assert re.search(r"2 of 2 LiDAR scans .*0\.bin is no Velodyne scan.*; got [45] bytes", failure.reason)
 
 
 @pytest.mark.data

@@ -50,6 +50,16 @@ def test_an_excerpt_reads_the_frame_of_its_base(tmp_path) -> None:
     assert true_depth(excerpt, 1) is None
 
 
+def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(tmp_path, caplog) -> None:
+    sequence = with_depth(tmp_path)
+    (tmp_path / "000002.png").write_bytes(b"x")
+    quality = DepthQuality(sequence, "camera-height")
+    for _ in range(2):
+        quality.add(keyframe())
+    assert quality.summary(True)["network_reason"] == "the true depth of 2 keyframes cannot be read"
+    assert len(caplog.messages) == 1 and "000002.png" in caplog.messages[0]
+
+
 def test_every_missing_number_has_its_reason(tmp_path) -> None:
     def reasons(unit: str, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True):
         quality = DepthQuality(sequence, unit)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam.errors import SequenceError
 from slam.frames import Intrinsics, Sequence
 from slam.results.map_error import find_truth, map_errors
 from slam.se3 import FloatArray, apply
@@ -88,6 +89,19 @@ def test_scans_are_a_truth(on_disk: Path, true_map: FloatArray) -> None:
     assert 0.3 < found["in_field"]["share"] < 1.0
     assert found["in_field"]["precision"]["0.5"] > found["precision"]["0.5"]
     assert found["completeness"] > 0.9
+
+
+def test_scans_that_cannot_be_read_measure_nothing(on_disk: Path, true_map: FloatArray) -> None:
+    def cut_off() -> FloatArray:
+        raise SequenceError("the scan is cut off")
+
+    sequence = open_sequence(on_disk)
+    assert isinstance(sequence, RecordedSequence)
+    sequence.depth_maps, sequence.scans[5] = None, cut_off
+    assert errors(true_map, sequence)["completeness"] > 0.9
+    sequence.scans = dict.fromkeys(sequence.scans, cut_off)
+    found = errors(true_map, sequence)
+    assert found["completeness"] is None and found["completeness_reason"]
 
 
 def test_an_excerpt_has_the_truth_of_its_own_frames(embedded: SimulatedSequence, on_disk: Path) -> None:

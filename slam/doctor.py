@@ -16,7 +16,7 @@ from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kin
 
 PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
-WEIGHTS = ("default", "sim", "erf-dfc")
+WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
 
 
 def examine(dataset: Path | None) -> list[str]:

@@ -14,7 +14,7 @@ from slam.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
 
-PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
+PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "onnxruntime", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
 WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
 

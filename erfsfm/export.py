@@ -6,13 +6,12 @@ The graphs are fixed to one image at the size of the weights: the maps of a defo
 from __future__ import annotations
 
 import json
-import tempfile
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -21,9 +20,10 @@ from erfsfm.checkpoint import Absent, Model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import ExportError
 from erfsfm.files import write_atomically
+from erfsfm.networks.onnx_graph import exported
 from erfsfm.networks.presets import NetworkKind
+from erfsfm.onnx_session import open_session
 
-OPSET = 17
 # of the largest output; a thousand roundings of float32
 TOLERANCE = 1e-4
 
@@ -85,12 +85,11 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
         seed: of the random images on which both are compared.
 
     Raises:
-        ExportError: onnx or onnxruntime is not installed, another ending, or outputs that differ.
+        ExportError: another ending, or outputs that differ.
         ConfigError: the paper's dilated depth network, which cannot run.
     """
     if path.suffix != ".onnx":
         raise ExportError(f"--output must end in .onnx; got {path}")
-    _require_onnx()
     config, generator = model.record.network, torch.Generator().manual_seed(seed)
     files = []
     if not isinstance(model.depth_net, Absent):
@@ -113,7 +112,7 @@ def _export(
     preset: str,
     model: Model,
 ) -> Exported:
-    content = _with_metadata(_traced(graph, examples[0]), kind, preset, model)
+    content = _with_metadata(exported(graph, examples[0], graph.inputs, [graph.output]), kind, preset, model)
     difference = max(_difference(graph, content, example) for example in examples)
     if not difference <= TOLERANCE:
         raise ExportError(
@@ -122,17 +121,6 @@ def _export(
         )
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
     return Exported(path, kind, preset, difference)
-
-
-def _require_onnx() -> None:
-    try:
-        import onnx
-        import onnxruntime
-    except ImportError as error:
-        raise ExportError(
-            f"ONNX export needs onnx and onnxruntime ({error}): pip install 'erfsfm-slam[onnx]'"
-        ) from error
-    del onnx, onnxruntime
 
 
 def _images(config: NetworkConfig, generator: torch.Generator, lead: tuple[int, ...]) -> list[tuple[Tensor, ...]]:
@@ -144,26 +132,8 @@ def _images(config: NetworkConfig, generator: torch.Generator, lead: tuple[int, 
     return [(2 * image.reshape(1, *lead, *image.shape[1:]) - 1,) for image in (smooth, noisy)]
 
 
-def _traced(graph: DepthGraph | PoseGraph, example: tuple[Tensor, ...]) -> bytes:
-    with tempfile.TemporaryDirectory() as folder, torch.no_grad(), warnings.catch_warnings():
-        path = Path(folder) / "graph.onnx"
-        warnings.simplefilter("ignore")  # shapes become constants, as intended
-        torch.onnx.export(
-            graph,
-            example,
-            path,
-            input_names=list(graph.inputs),
-            output_names=[graph.output],
-            opset_version=OPSET,
-            dynamo=False,  # the newer exporter needs onnxscript, and writes the same graph
-        )
-        return path.read_bytes()
-
-
 def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model) -> bytes:
     """The checked graph with metadata: preset, fidelity, input range, licence and training data."""
-    import onnx
-
     graph = onnx.load_model_from_string(content)
     onnx.checker.check_model(graph)
     record = model.record
@@ -183,9 +153,7 @@ def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model)
 
 def _difference(graph: nn.Module, content: bytes, example: tuple[Tensor, ...]) -> float:
     """Largest difference of the two outputs, relative to the largest output."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    session = open_session(content, torch.get_num_threads())
     names = [entry.name for entry in session.get_inputs()]
     (answer,) = session.run(None, {name: tensor.numpy() for name, tensor in zip(names, example)})
     with torch.no_grad():

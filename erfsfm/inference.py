@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Literal, NamedTuple, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -20,8 +20,8 @@ from erfsfm.data.splits import overlapping as overlapping  # likewise
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.networks.frozen import Frozen
 from erfsfm.networks.lite0_pose import Lite0PoseNet
+from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 from erfsfm.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.readers.images import resize_image
@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 
 F = TypeVar("F", np.float32, np.float64)
 DeviceChoice = Literal["auto", "cpu", "cuda"]
+Network = Callable[..., Tensor]
 NETWORK_THREADS = max(torch.get_num_threads() - 1, 1)  # one core stays free for other threads
 
 
@@ -62,6 +63,23 @@ class PreparedImage:
     features: Tensor | None = None
 
 
+class _Networks(NamedTuple):
+    depth: Network
+    pose: Network
+    features: Network | None  # of one image, for a pose network that encodes each by itself
+
+    def as_graphs(self) -> _Networks:
+        features = self.features and _graph(self.features)
+        return _Networks(_graph(self.depth), _graph(self.pose), features)
+
+
+def _graph(network: Network) -> Network:
+    return OnnxGraph(network, NETWORK_THREADS) if isinstance(network, nn.Module) else network
+
+
+_graphs: dict[tuple[object, str], _Networks] = {}  # of the last weights in this process
+
+
 class DepthPosePredictor:
     """Depth of single images and poses of snippets, in one unknown scale.
 
@@ -77,14 +95,14 @@ class DepthPosePredictor:
         self.record = model.record
         self.sha256 = sha256
         self.sources: int = model.record.network.sources
-        self._depth_net = model.depth_net.eval().to(self.device)
-        self._pose_net: nn.Module = _PoseMatrices(model.pose_net).eval().to(self.device)
-        self._pose_features: nn.Module | None = None
-        if isinstance(model.pose_net, Lite0PoseNet):
-            self._pose_features = _PoseFeatures(model.pose_net).eval()
-        if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
-            for network in (self._depth_net, self._pose_net):
+        depth_net, pose_net = model.depth_net, model.pose_net
+        for network in (depth_net, pose_net):
+            network.eval().to(self.device)
+            if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._networks = _Networks(depth_net, pose_net, None)
+        if isinstance(pose_net, Lite0PoseNet):
+            self._networks = _Networks(depth_net, _Motion(pose_net).eval(), _Features(pose_net).eval())
 
     @classmethod
     def from_weights(cls, name_or_dir: str | Path, device: str = "cpu") -> DepthPosePredictor:
@@ -109,10 +127,16 @@ class DepthPosePredictor:
         return predictor
 
     def freeze(self) -> Self:
-        """Trace the networks: the same outputs up to rounding, faster on a CPU."""
+        """On a CPU, run the networks by ONNX Runtime: the same outputs up to rounding, in less time.
+
+        The graphs are made at the first call, in some two seconds, and kept for the next predictor of these weights.
+        """
         if self.device.type == "cpu":
-            self._depth_net, self._pose_net = Frozen(self._depth_net), Frozen(self._pose_net)
-            self._pose_features = self._pose_features and Frozen(self._pose_features)
+            key = (self.sha256 or object(), repr(self.record.network))
+            if key not in _graphs:
+                _graphs.clear()
+                _graphs[key] = self._networks.as_graphs()
+            self._networks = _graphs[key]
         return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
@@ -142,7 +166,7 @@ class DepthPosePredictor:
         Raises:
             CheckpointError: the network's output is not finite.
         """
-        disparity: NDArray[np.float32] = self._depth_net(self._tensor(image))[0, 0].float().cpu().numpy()
+        disparity: NDArray[np.float32] = self._networks.depth(self._tensor(image))[0, 0].float().cpu().numpy()
         return self._finite(disparity, "depth")
 
     @torch.inference_mode()
@@ -165,7 +189,8 @@ class DepthPosePredictor:
         middle = self.sources // 2
         inputs = [self._pose_input(image) for image in images]
         target = inputs.pop(middle)
-        T_source_target: NDArray[np.float64] = self._pose_net(target, inputs).cpu().numpy()
+        vectors = self._networks.pose(target, inputs)[0].double()
+        T_source_target: NDArray[np.float64] = pose_vector_to_matrix(vectors).cpu().numpy()
         return self._finite(T_source_target, "pose")
 
     def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
@@ -187,34 +212,19 @@ class DepthPosePredictor:
 
     def _pose_input(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
         """The image, or its features where the pose network encodes each image by itself."""
-        if self._pose_features is None:
+        features = self._networks.features
+        if features is None:
             return self._tensor(image)
         prepared = image if isinstance(image, PreparedImage) else self.prepare(image)
         if prepared.features is None:
-            prepared.features = self._pose_features(prepared.tensor)
+            prepared.features = features(prepared.tensor)
         return prepared.features
 
     def _tensor(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
         return image.tensor if isinstance(image, PreparedImage) else self._input(image)
 
 
-class _PoseMatrices(nn.Module):
-    """A pose network whose output for one snippet are transforms in double precision."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
-        """``T_source_target`` ``(N, 4, 4)``, unscaled, of images or of their features."""
-        if isinstance(self.network, Lite0PoseNet):
-            vectors = self.network.motion(target, sources)
-        else:
-            vectors = self.network(target, sources)
-        return pose_vector_to_matrix(vectors[0].double())
-
-
-class _PoseFeatures(nn.Module):
+class _Features(nn.Module):
     """What a pose network sees of one image."""
 
     def __init__(self, network: Lite0PoseNet) -> None:
@@ -224,6 +234,20 @@ class _PoseFeatures(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """``(1, 3, h, w)`` to ``(1, C, h / 16, w / 16)``."""
         return self.network.features(image)
+
+
+class _Motion(nn.Module):
+    """Pose vectors ``(1, N, 6)`` from the features of a target and of its sources."""
+
+    def __init__(self, network: Lite0PoseNet) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
+        """Translation (unscaled) and XYZ Euler angles of each source."""
+        vectors = self.network.motion(target, sources)
+        assert isinstance(vectors, Tensor)  # a list in training alone
+        return vectors
 
 
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:

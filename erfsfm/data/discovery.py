@@ -42,7 +42,7 @@ def discover(root: Path) -> list[Recording]:
         entries = ", ".join(sorted(p.name for p in root.iterdir())[:8]) if root.is_dir() else root.name
         raise DataError(
             f"no recording in {root}: wanted a KITTI odometry root (sequences/NN/image_2), KITTI raw drives "
-            f"(2011_09_26/..._sync/image_02), or images or a video with camera.yaml; found "
+            f"(2011_09_26/..._sync/image_02), images or a video with camera.yaml, or a pack ({INDEX_FILE}); found "
             f"{entries or 'an empty folder'}"
         )
     return found

@@ -79,10 +79,7 @@ class DriveLabels:
 
     def motion(self, first: int, sources: int) -> NDArray[np.float32]:
         """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
-        target = first + sources // 2
-        others = np.delete(np.arange(first, first + sources + 1), sources // 2)
-        T_source_target = np.linalg.inv(self.T_world_camera[others]) @ self.T_world_camera[target]
-        return np.asarray(T_source_target, dtype=np.float32)
+        return snippet_motion(self.T_world_camera, first, sources)
 
     def label(self, target: int) -> tuple[NDArray[np.float16], NDArray[np.float16]]:
         """Least and most inverse depth ``(H, W)`` of a frame.
@@ -157,6 +154,19 @@ class DriveLabels:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
+def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float32]:
+    """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at pose ``first`` of ``(frames, 4, 4)``."""
+    target = first + sources // 2
+    others = np.delete(np.arange(first, first + sources + 1), sources // 2)
+    return np.asarray(np.linalg.inv(T_world_camera[others]) @ T_world_camera[target], dtype=np.float32)
+
+
+def motion_alone(T_source_target: NDArray[np.float32], size: tuple[int, int]) -> TeacherStructure:
+    """A structure that bounds no depth; ``size`` is height and width of the images."""
+    nothing = np.zeros(size, dtype=np.float16)
+    return TeacherStructure(T_source_target, nothing, np.full_like(nothing, np.inf))
+
+
 class ManyViewTeacher:
     """Labels of several drives, kept in one folder.
 
@@ -195,8 +205,7 @@ class ManyViewTeacher:
         """Of the snippet that begins at a frame."""
         drive, target = self.drive(recording), first + sources // 2
         if self.measures == "poses":
-            nothing = np.zeros(self._size, dtype=np.float16)
-            return TeacherStructure(drive.motion(first, sources), nothing, np.full_like(nothing, np.inf))
+            return motion_alone(drive.motion(first, sources), self._size)
         least, most = self._labels.get((id(recording), target), lambda: np.stack(drive.label(target)))
         return TeacherStructure(drive.motion(first, sources), least, most)
 

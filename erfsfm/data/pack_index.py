@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 
 from erfsfm.config_tree import Section, dump_yaml, first_problem
 from erfsfm.data.recordings import Recording
+from erfsfm.data.shards import InShards, ShardIndex, Shards
 from erfsfm.errors import DataError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.camera import Camera
@@ -30,14 +31,19 @@ class PackedCamera(Section):
     cy: float
 
 
-class PackedRecording(Section):
-    """Consecutive frames; files are named by their numbers."""
+class ShardedRecording(Section):
+    """Consecutive frames in tar files."""
 
     name: str = Field(min_length=1, description="as in the leak record, without frames")
     start: int = Field(ge=0, description="number of the first frame")
     frames: int = Field(gt=0)
-    folder: str = Field(pattern=r"^[\w-]+$", description="of its files, below images/ and depth/")
     camera: PackedCamera
+
+
+class PackedRecording(ShardedRecording):
+    """Consecutive frames in files that are named by their numbers."""
+
+    folder: str = Field(pattern=r"^[\w-]+$", description="of its files, below images/ and depth/")
     poses: bool = Field(default=False, description="whether true poses of this camera are known")
     depth: list[int] = Field(default_factory=list, description="frames with true depth")
 
@@ -46,6 +52,8 @@ class PackIndex(Section):
     """The content of ``pack.yaml``."""
 
     recordings: list[PackedRecording]
+    shards: ShardIndex | None = None
+    sharded: list[ShardedRecording] = Field(default_factory=list, description="recordings in shards, to train on")
 
 
 def image_file(root: Path, folder: str, frame: int) -> Path:
@@ -80,7 +88,23 @@ def read_pack(root: Path) -> list[Recording]:
         raise DataError(str(error)) from error
     except ValidationError as error:
         raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; pack again") from error
-    return [_recording(root, entry) for entry in index.recordings]
+    found = [_recording(root, entry) for entry in index.recordings]
+    if index.shards is not None:
+        shards = Shards(root, index.shards)
+        found += [_sharded(shards, number, entry) for number, entry in enumerate(index.sharded)]
+    return found
+
+
+def _sharded(shards: Shards, number: int, entry: ShardedRecording) -> Recording:
+    return Recording(
+        entry.name,
+        (shards.pack / INDEX_FILE,) * entry.frames,
+        Camera(**entry.camera.model_dump()),
+        start=entry.start,
+        stored=entry.frames,
+        without_stops=True,
+        packed=InShards(shards, number, entry.start),
+    )
 
 
 def _recording(root: Path, entry: PackedRecording) -> Recording:

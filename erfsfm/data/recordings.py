@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.config import Fidelity
+from erfsfm.data.shards import InShards
 from erfsfm.data.video import Video
 from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
@@ -32,6 +33,7 @@ class Recording:
     name of its folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a
     recording with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for
     these alone. ``without_stops`` says that frames in which the car stands still were taken out when it was packed.
+    The frames of one with ``packed`` are in tar files; `erfsfm.data.shard_draws` reads them.
     """
 
     name: str
@@ -47,6 +49,7 @@ class Recording:
     skipped: int = 0
     stored: int = 0
     without_stops: bool = False
+    packed: InShards | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -75,8 +78,12 @@ class Recording:
         """Frame as ``(height, width, 3)`` uint8 RGB, resized without crop.
 
         Raises:
-            DataError: the file is missing, incomplete, not an image, or of another size than the camera.
+            DataError: the file is missing, incomplete, not an image, of another size than the camera, or in a shard.
         """
+        if self.packed is not None:
+            raise DataError(
+                f"{self.name} lies in shards, which are to train on alone: use the recording that was packed"
+            )
         stored = self.images[index]
         if self.video is not None:
             self._require_size(stored, self.video.height, self.video.width)

@@ -16,27 +16,20 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.config import DataConfig, ExperimentConfig
-from erfsfm.data.augmentation import augment
 from erfsfm.data.discovery import discover
 from erfsfm.data.image_cache import ImageCache
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
+from erfsfm.data.samples import as_tensors, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import overlapping
 from erfsfm.data.standstill import moving_parts
-from erfsfm.data.weather import weathered
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.errors import DataError
 from erfsfm.readers.frame_range import FrameRange
 from erfsfm.teacher.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
-
-# An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
-# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
-FOCAL_LENGTH = 1.9
-
-_MOST_FRAMES = 10_000_000  # of a recording
 
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
@@ -64,7 +57,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._many_views = many_views
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
-        self._probabilities = _probabilities(self.recordings, length, config.data)
+        self._probabilities = chances(self.recordings, length, config.data)
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -76,13 +69,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``, of the first snippet drawn that can be read: tensors ``target`` (3, H, W), ``sources``
-        (N, 3, H, W), ``K`` (3, 3), and ``frames`` (N + 1): of each image in time order a number that is its own,
-        mirrored another one.
-
-        With a teacher, also ``T_source_target`` (N, 4, 4), ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With
-        weather, also ``shown`` (N + 1, 3, H, W): the images in time order as the networks see them.
-        """
+        """Sample ``number``, a `training_sample` of the first snippet drawn that can be read."""
         rng = np.random.default_rng([self._config.training.seed, number])
         network = self._config.network
         snippet, images = self._reader.first_readable(
@@ -91,24 +78,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         recording, which = snippet.recording, self.recordings.index(snippet.recording)
         camera = recording.camera.resized(network.width, network.height)
         seen = self._structure(snippet, images, camera.K)
-        bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
-        images, bounds, varied, mirrored = augment(images, bounds, camera, self._config.data, network.fidelity, rng)
-        sample = as_tensors(images, varied.K)
-        first = (2 * which + mirrored) * _MOST_FRAMES + snippet.first
-        sample["frames"] = torch.arange(first, first + network.sources + 1)
-        if seen is not None:
-            T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
-            if self._many_views is not None:
-                nearer = varied.fy / network.height / FOCAL_LENGTH
-                bounds = [values * np.float32(nearer) for values in bounds]
-                T_source_target = T_source_target.copy()
-                T_source_target[:, :3, 3] /= nearer
-            sample["T_source_target"] = torch.from_numpy(T_source_target)
-            sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
-        probability = self._config.data.weather
-        if probability > 0:
-            sample["shown"] = _stacked(weathered(images, rng) if rng.random() < probability else images)
-        return sample
+        return training_sample(images, camera, seen, (which, snippet.first), self._config, rng)
 
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
         """Random snippets without end."""
@@ -178,25 +148,6 @@ class ValidationSnippets(Dataset[dict[str, Tensor]]):
 def labels_mb(config: DataConfig) -> int:
     """The part of ``data.cache_mb`` for labels of many views: larger than images, but fewer."""
     return config.cache_mb * 2 // 5
-
-
-def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:
-    """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour in [0, 1]."""
-    middle = len(images) // 2
-    stacked = _stacked(images)
-    sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
-    return {"target": stacked[middle], "sources": sources, "K": torch.from_numpy(K)}
-
-
-def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
-    """Colour in [0, 1], ``(N + 1, 3, H, W)``."""
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
-
-
-def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
-    mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
-    return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)
 
 
 def usable(recordings: Sequence[Recording], length: int) -> list[Recording]:
@@ -313,7 +264,7 @@ def _may_stop(recording: Recording) -> bool:
     return recording.name.startswith("kitti_raw/") and not recording.without_stops
 
 
-def _probabilities(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
+def chances(recordings: list[Recording], length: int, config: DataConfig) -> NDArray[np.float64]:
     """Chance of each recording: by its windows, then by the configured weight of its kind."""
     windows: NDArray[np.float64] = np.array([len(r) - length + 1 for r in recordings], dtype=np.float64)
     if not config.weights:

@@ -107,9 +107,9 @@ class DeformableConv2d(nn.Module):
         )
 
 
-def meets_kernel(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
-    """Whether a pass of `inputs` through a network computes any of its deformable layers by the compiled path."""
-    met = []
+def has_large_sampling(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
+    """Whether any deformable layer of a network is large enough for the compiled path with these inputs."""
+    met: list[bool] = []
 
     def look(layer: nn.Module, given: tuple[Tensor, ...]) -> None:
         assert isinstance(layer, DeformableConv2d)
@@ -122,7 +122,7 @@ def meets_kernel(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
     finally:
         for hook in hooks:
             hook.remove()
-    return any(met) and _compiled_kernel() is not None
+    return any(met)
 
 
 def _pair(value: int | tuple[int, int]) -> tuple[int, int]:

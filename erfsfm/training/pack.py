@@ -55,8 +55,8 @@ class PackSummary:
 
 
 @dataclass(frozen=True)
-class _Drive:
-    """A recording as files; ``labels`` and ``depth`` by frame, counted from its first."""
+class PackedDrive:
+    """A recording as files in memory; ``labels`` and ``depth`` by frame, counted from its first."""
 
     recording: Recording
     images: list[bytes]
@@ -65,18 +65,20 @@ class _Drive:
     depth: dict[int, bytes] = field(default_factory=dict)
     true_poses: NDArray[np.float64] | None = None
 
-    def first(self, frames: int, sources: int) -> _Drive:
+    def first(self, frames: int, sources: int) -> PackedDrive:
         """Its first frames alone, and the labels that have half of ``sources`` on either side."""
         last = min(frames, len(self.images)) - sources // 2
         labels = {target: data for target, data in self.labels.items() if target < last}
-        return _Drive(self.recording.part(0, frames), self.images[:frames], labels, self.measured)
+        return PackedDrive(self.recording.part(0, frames), self.images[:frames], labels, self.measured)
 
     @property
     def is_simulated(self) -> bool:
+        """Whether it can be made again, and may be shortened."""
         return self.recording.name.startswith("simulated/")
 
     @property
     def size(self) -> int:
+        """Bytes of all its files."""
         files = [*self.images, *self.labels.values(), *self.depth.values()]
         poses = _HEADER_BYTES + _POSE_BYTES * len(self.images) if self.measured else 0
         true_poses = 0 if self.true_poses is None else _TRUE_POSE_BYTES * len(self.images)
@@ -100,10 +102,7 @@ def pack(
     Raises:
         ConfigError, DataError: no place for the measurements, ``output`` is taken, or too few megabytes.
     """
-    if config.teacher.views == "many" and config.teacher.cache is None:
-        raise ConfigError("name the folder that keeps the teacher's measurements: --set teacher.cache=FOLDER")
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
+    require_room(config, output)
     training, validation = split_recordings(config.data)
     training = usable(training, config.network.sources + 1)
     teacher = measured_views(training, config, output / TEACHER_FOLDER, quiet)
@@ -112,11 +111,11 @@ def pack(
         for done, recording in enumerate(training):
             show("packing", done, len(training))
             drives.append(_encoded(recording, config, teacher, quality))
-    held_out = _validation_drives(validation, config, quality)
+    held_out = validation_drives(validation, config, quality)
     kept = _fitting(drives, int(megabytes * 1e6) - sum(drive.size for drive in held_out), config)
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
     try:
-        entries = [_write(unfinished, f"{n:04d}", drive, config) for n, drive in enumerate([*kept, *held_out])]
+        entries = [write_drive(unfinished, f"{n:04d}", drive, config) for n, drive in enumerate([*kept, *held_out])]
         write_index(unfinished, PackIndex(recordings=entries))
         _write_teacher(unfinished, kept, config, trained_on(training))
         unfinished.replace(output)
@@ -125,35 +124,50 @@ def pack(
     return _summary(output, drives, kept)
 
 
-def _encoded(recording: Recording, config: ExperimentConfig, teacher: ManyViewTeacher | None, quality: int) -> _Drive:
-    images = [_jpeg(recording, index, config, quality) for index in range(len(recording))]
+def require_room(config: ExperimentConfig, output: Path) -> None:
+    """Refuse a folder that is taken, and a teacher without a folder for its measurements.
+
+    Raises:
+        ConfigError: one line with what to do.
+    """
+    if config.teacher.views == "many" and config.teacher.cache is None:
+        raise ConfigError("name the folder that keeps the teacher's measurements: --set teacher.cache=FOLDER")
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
+
+
+def _encoded(
+    recording: Recording, config: ExperimentConfig, teacher: ManyViewTeacher | None, quality: int
+) -> PackedDrive:
+    images = [jpeg(recording, index, config, quality) for index in range(len(recording))]
     if teacher is None:
-        return _Drive(recording, images)
+        return PackedDrive(recording, images)
     measured = teacher.drive(recording)
     targets = measured.targets(config.network.sources) if teacher.measures == "depth and poses" else ()
     labels = {target: encode(*measured.label(target)) for target in targets}
-    return _Drive(recording, images, labels, measured)
+    return PackedDrive(recording, images, labels, measured)
 
 
-def _validation_drives(recordings: list[Recording], config: ExperimentConfig, quality: int) -> list[_Drive]:
+def validation_drives(recordings: list[Recording], config: ExperimentConfig, quality: int) -> list[PackedDrive]:
     """One for each snippet to validate on, with true depth of its target and true poses where they are known."""
     drives = []
     middle, length = config.network.sources // 2, config.network.sources + 1
     for snippet in ValidationSnippets(recordings, config).snippets if recordings else ():
         part = snippet.recording.part(snippet.first, snippet.first + length)
-        images = [_jpeg(part, index, config, quality) for index in range(length)]
+        images = [jpeg(part, index, config, quality) for index in range(length)]
         truth = part.depth[middle] if part.depth else None
         depth = {} if truth is None else {middle: truth.read_bytes()}
-        drives.append(_Drive(part, images, depth=depth, true_poses=part.true_poses(config.network.fidelity)))
+        drives.append(PackedDrive(part, images, depth=depth, true_poses=part.true_poses(config.network.fidelity)))
     return drives
 
 
-def _jpeg(recording: Recording, index: int, config: ExperimentConfig, quality: int) -> bytes:
+def jpeg(recording: Recording, index: int, config: ExperimentConfig, quality: int) -> bytes:
+    """A frame at the networks' size as JPEG; ``quality`` is 1 to 100."""
     image = recording.image(index, config.network.height, config.network.width)
     return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
-def _fitting(drives: list[_Drive], room: int, config: ExperimentConfig) -> list[_Drive]:
+def _fitting(drives: list[PackedDrive], room: int, config: ExperimentConfig) -> list[PackedDrive]:
     """The drives with simulated ones shortened to the most frames that fit.
 
     Raises:
@@ -161,7 +175,7 @@ def _fitting(drives: list[_Drive], room: int, config: ExperimentConfig) -> list[
     """
     sources, stride = config.network.sources, config.teacher.stride
 
-    def shortened(frames: int) -> list[_Drive]:
+    def shortened(frames: int) -> list[PackedDrive]:
         return [drive.first(frames, sources) if drive.is_simulated else drive for drive in drives]
 
     def size(frames: int) -> int:
@@ -181,7 +195,8 @@ def _fitting(drives: list[_Drive], room: int, config: ExperimentConfig) -> list[
     return shortened(few)
 
 
-def _write(output: Path, folder: str, drive: _Drive, config: ExperimentConfig) -> PackedRecording:
+def write_drive(output: Path, folder: str, drive: PackedDrive, config: ExperimentConfig) -> PackedRecording:
+    """Write a drive's files under ``output``; returns its entry in the index."""
     recording = drive.recording
     for number, data in enumerate(drive.images, recording.start):
         _put(image_file(output, folder, number), data)
@@ -201,7 +216,7 @@ def _write(output: Path, folder: str, drive: _Drive, config: ExperimentConfig) -
     )
 
 
-def _write_teacher(output: Path, kept: list[_Drive], config: ExperimentConfig, wanted: list[str]) -> None:
+def _write_teacher(output: Path, kept: list[PackedDrive], config: ExperimentConfig, wanted: list[str]) -> None:
     """Measurements under the digests of the packed images; first the pack is read as a training will read it."""
     packed, _ = split_recordings(config.data.model_copy(update={"roots": [output]}))
     if trained_on(packed) != wanted:
@@ -220,7 +235,7 @@ def _put(path: Path, data: bytes) -> None:
     write_atomically(path, lambda part: part.write_bytes(data), sync=False)
 
 
-def _summary(output: Path, drives: list[_Drive], kept: list[_Drive]) -> PackSummary:
+def _summary(output: Path, drives: list[PackedDrive], kept: list[PackedDrive]) -> PackSummary:
     frames, labels = (sum(len(part) for part in parts) for parts in zip(*((d.images, d.labels) for d in kept)))
     simulated = sum(len(drive.images) for drive in kept if drive.is_simulated)
     return PackSummary(

@@ -24,6 +24,7 @@ from torch.utils.data import DataLoader
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
+from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError
@@ -83,9 +84,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    together = config.training.batch * config.training.processes
-    many_views = measured_views(training, config, output / "teacher", quiet or rank > 0)
-    draws = SnippetDraws(training, config, config.training.steps * together, done_steps * together, rank, many_views)
+    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output / "teacher", quiet)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     seen = trained_on(draws.recordings)
     if not resume:
@@ -108,7 +107,25 @@ def _timer(minutes: float) -> Timer:
     return Timer(timedelta(minutes=minutes) if minutes else None, verbose=False)
 
 
-def _loader(draws: SnippetDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
+def _draws(
+    training: list[Recording],
+    sharded: bool,
+    config: ExperimentConfig,
+    position: tuple[int, int],
+    measured: Path,
+    quiet: bool,
+) -> SnippetDraws | ShardDraws:
+    """What this process trains on; ``position``: steps done and rank; ``measured``: of the teacher."""
+    done_steps, rank = position
+    together = config.training.batch * config.training.processes
+    draws, done = config.training.steps * together, done_steps * together
+    if sharded:
+        return ShardDraws(training, config, draws, done, rank)
+    many_views = measured_views(training, config, measured, quiet or rank > 0)
+    return SnippetDraws(training, config, draws, done, rank, many_views)
+
+
+def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: str) -> DataLoader[dict[str, Tensor]]:
     workers = config.data.workers
     return DataLoader(
         draws,

@@ -12,20 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+import onnxruntime
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from erfsfm.inference import NETWORK_THREADS
+from erfsfm.onnx_session import open_session
 from erfsfm.readers.images import resize_image
 from slam.config import DepthConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image
 from slam.prediction.depth_source import Disparity, Kind, disparity_of
-from slam.runtime.imports import import_onnx
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
-_FATAL = 4  # level of ONNX Runtime's own log; its errors are raised as well
 
 
 class OnnxDepth:
@@ -38,22 +41,21 @@ class OnnxDepth:
             config: a source of kind ``onnx``.
 
         Raises:
-            SlamError: onnxruntime is not installed, a damaged file, one that is no such network, or settings missing.
+            SlamError: a damaged file, one that is no such network, or settings missing.
         """
         self.name = config.source
         self._path = Path(config.source.partition(":")[2]).expanduser()
-        onnx, runtime = import_onnx()
         content = self._content()
         self.sha256 = hashlib.sha256(content).hexdigest()
-        notes = self._require_whole(onnx, content)
-        self._session = self._loaded(runtime, content)
+        notes = self._require_whole(content)
+        self._session = self._loaded(content)
         self._input, self._shape, self._height, self._width = self._image_input(config)
         own = notes.get("input") == _OWN_INPUT and notes.get("kind") == "depth"
         self._kind, self._mean, self._std = self._settings(config, own)
         self._output = self._depth_output(config)
         numbers = (self._mean.tolist(), self._std.tolist(), self._height, self._width, self._output)
         self.identity = f"onnx {self.sha256} {self._kind} {config.align} {numbers}"
-        self.runtime = f"onnxruntime {runtime.__version__}"
+        self.runtime = f"onnxruntime {onnxruntime.__version__}"
         self._answers: GetOrCompute = without_cache
         self._run(np.zeros((self._height, self._width, 3), np.uint8))
 
@@ -103,10 +105,8 @@ class OnnxDepth:
         except OSError as error:
             raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
 
-    def _require_whole(self, onnx: Any, content: bytes) -> dict[str, str]:
+    def _require_whole(self, content: bytes) -> dict[str, str]:
         """The metadata of a graph whose weights are all in its file."""
-        from google.protobuf.message import DecodeError
-
         try:
             model = onnx.load_model_from_string(content)
         except DecodeError as error:
@@ -117,17 +117,12 @@ class OnnxDepth:
             raise SlamError(f"{self._path} keeps weights in other files, which are not read: save it as one file")
         return {entry.key: entry.value for entry in model.metadata_props}
 
-    def _loaded(self, runtime: Any, content: bytes) -> Any:
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = NETWORK_THREADS
-        options.inter_op_num_threads = 1
-        options.log_severity_level = _FATAL
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # costly on a shared machine
+    def _loaded(self, content: bytes) -> onnxruntime.InferenceSession:
         try:
-            return runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            return open_session(content, NETWORK_THREADS)
         except self._errors() as error:
             raise SlamError(
-                f"{self._path} cannot be run by onnxruntime {runtime.__version__}, with its own operators alone: "
+                f"{self._path} cannot be run by onnxruntime {onnxruntime.__version__}, with its own operators alone: "
                 f"{_short(error)}"
             ) from error
 
@@ -192,8 +187,6 @@ class OnnxDepth:
 
     def _errors(self) -> tuple[type[Exception], ...]:
         """What ONNX Runtime raises: classes without a common base of their own."""
-        from onnxruntime.capi import onnxruntime_pybind11_state as state
-
         own = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
         return (*own, RuntimeError, ValueError)
 

@@ -31,11 +31,6 @@ def import_rerun() -> ModuleType:
     return rerun
 
 
-def import_onnx() -> tuple[ModuleType, ...]:
-    """Import onnx and ONNX Runtime, an optional extra; `SlamError` if one cannot be loaded."""
-    return _import_extra("depth.source=onnx needs onnx and onnxruntime", "'erfsfm-slam[onnx]'", "onnx", "onnxruntime")
-
-
 def import_laspy() -> ModuleType:
     """Import laspy with its LAZ codec, an optional extra; `SlamError` if one cannot be loaded."""
     _, laspy = _import_extra("LAS and LAZ need laspy and lazrs", "'erfsfm-slam[las]'", "lazrs", "laspy")

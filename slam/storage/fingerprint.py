@@ -24,10 +24,11 @@ _ABOVE_THE_CACHE = (
 
 @functools.cache
 def code_fingerprint() -> str:
-    """Fingerprint of all code behind cached results, with the versions of torch, NumPy, OpenCV and SciPy."""
+    """Fingerprint of all code behind cached results, with the versions of the libraries that compute them."""
     own = Path(__file__).parents[1], Path(erfsfm.__file__).parent
     libraries = (f"{library.__name__} {library.__version__}" for library in (np, cv2, scipy))
-    return " ".join((fingerprint(own), *libraries, f"torch {version('torch')}"))
+    not_imported = (f"{name} {version(name)}" for name in ("torch", "onnxruntime"))
+    return " ".join((fingerprint(own), *libraries, *not_imported))
 
 
 def fingerprint(packages: Sequence[Path]) -> str:

@@ -227,7 +227,6 @@ def test_convert(run: Run, tmp_path: Path) -> None:
 
 
 def test_export(run: Run, tmp_path: Path, weights: Path) -> None:
-    pytest.importorskip("onnxruntime")
     code, out, err = run(
         "export", "--weights", weights, "--format", "onnx", "--output", tmp_path / "new/net.onnx", "--json"
     )

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
+import onnxruntime
 import pytest
 import torch
 from torch import nn
@@ -18,9 +19,6 @@ from erfsfm.errors import ConfigError, ExportError
 from erfsfm.export import export_onnx, pose_path
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.presets import PRESETS
-
-onnxruntime = pytest.importorskip("onnxruntime")
-onnx = pytest.importorskip("onnx")
 
 DEPTH = [name for name, preset in PRESETS.items() if preset.kind == "depth"]
 POSE = [name for name, preset in PRESETS.items() if preset.kind == "pose"]
@@ -93,31 +91,18 @@ def test_one_network_alone(tmp_path: Path) -> None:
 
 def test_a_graph_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = fresh()
-    traced = erfsfm.export._traced
+    exported = erfsfm.export.exported
 
-    def wrong(graph: Any, example: Any) -> bytes:
-        content = traced(graph, example)
+    def wrong(*given: Any) -> bytes:
+        content = exported(*given)
         with torch.no_grad():
             model.depth_net.heads[-1].bias.add_(0.01)
         return content
 
-    monkeypatch.setattr(erfsfm.export, "_traced", wrong)
+    monkeypatch.setattr(erfsfm.export, "exported", wrong)
     with pytest.raises(ExportError, match="was not written: onnxruntime differs"):
         export_onnx(model, tmp_path / "net.onnx")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_without_onnxruntime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest: Any) -> Any:
-        if name == "onnxruntime":
-            raise ImportError("No module named 'onnxruntime'")
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ExportError, match=r"pip install 'erfsfm-slam\[onnx\]'"):
-        export_onnx(fresh(), tmp_path / "net.onnx")
 
 
 def test_other_endings(tmp_path: Path) -> None:

@@ -24,9 +24,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 import torch
 import yaml
+from onnx import TensorProto, helper
 
 import erfsfm.cli
 import slam.cli
@@ -87,8 +89,6 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/localisation has short ones"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
-if importlib.util.find_spec("onnxruntime") is None:
-    NOT_RUN = (*NOT_RUN, (r"onnx", "the extra 'onnx' is not installed"))
 if importlib.util.find_spec("rerun") is None:
     NOT_RUN = (*NOT_RUN, (r"--rerun ", "the extra 'rerun' is not installed"))
 if importlib.util.find_spec("laspy") is None:
@@ -206,11 +206,6 @@ def old_checkpoint(path: Path, preset: str) -> None:
 
 def relative_network(path: Path) -> None:
     """A network of any input size whose disparity is an image's mean brightness, shifted to be positive."""
-    if importlib.util.find_spec("onnx") is None:
-        return
-    import onnx
-    from onnx import TensorProto, helper
-
     nodes = [
         helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1),
         helper.make_node("Add", ["mean", "shift"], ["depth"]),
@@ -264,9 +259,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         call(f"{train} runs/toy")
         call(f"{train} runs/table1-dfc --set network.sources=4")
         call("erfsfm predict world/sequences/sim/image_2 --weights runs/toy --output depth")
-        if importlib.util.find_spec("onnxruntime") is not None:
-            call("erfsfm export --weights runs/toy --format onnx --output net.onnx")
-            relative_network(Path("relative.onnx"))
+        call("erfsfm export --weights runs/toy --format onnx --output net.onnx")
+        relative_network(Path("relative.onnx"))
         for name in ("KITTI", "KITTI_ODOMETRY", "path/to/kitti"):
             for sequence in ("05", "06", "09"):
                 shutil.copytree("world/sequences/sim", f"{name}/sequences/{sequence}")

@@ -18,13 +18,8 @@ from torch.utils.data import DataLoader
 
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.snippets import (
-    SnippetDraws,
-    ValidationSnippets,
-    as_tensors,
-    split_recordings,
-    usable,
-)
+from erfsfm.data.samples import as_tensors
+from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.errors import DataError
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 

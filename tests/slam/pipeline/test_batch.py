@@ -239,8 +239,6 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     result = run(still, f"scale.mode={mode}")
     np.testing.assert_allclose(result.optimised.T_world_camera, still.reference, atol=1e-9)
-    metrics = trajectory_metrics(result.optimised, result.reference)
-    assert metrics["align"]["6dof"]["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
     if mode == "reference":
         assert isinstance(result.scale.estimate, MeasurementFailure) and "does not move" in result.scale.estimate.reason
 

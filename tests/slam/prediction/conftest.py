@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import onnx
 import pytest
+from onnx import TensorProto, helper
 
 MakeNetwork = Callable[..., Path]
 
@@ -14,9 +16,6 @@ MakeNetwork = Callable[..., Path]
 @pytest.fixture
 def make_network(tmp_path: Path) -> MakeNetwork:
     """Writes a network that gives the mean of an image's channels, scaled and shifted: ``gain * mean + shift``."""
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    from onnx import TensorProto, helper
 
     def make(
         name: str = "net.onnx",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
 from slam.config import DepthConfig
@@ -89,7 +89,6 @@ def test_what_does_not_fit_is_one_line(
 
 
 def test_a_network_that_fails_or_gives_no_map_is_found_at_once(make_network: MakeNetwork) -> None:
-    onnx = pytest.importorskip("onnx")
     path = make_network(shape=(1, 3, "height", "width"))
     model = onnx.load(path)
     shape = onnx.helper.make_tensor("shape", onnx.TensorProto.INT64, [3], [2, 14, 14])
@@ -120,7 +119,6 @@ def test_damaged_and_missing_files_are_one_line(make_network: MakeNetwork, tmp_p
 
 
 def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path: Path) -> None:
-    onnx = pytest.importorskip("onnx")
     model = onnx.load(make_network())
     for tensor in model.graph.initializer:
         tensor.raw_data = np.float32(1).tobytes()
@@ -128,15 +126,6 @@ def test_weights_in_other_files_are_refused(make_network: MakeNetwork, tmp_path:
     onnx.save(model, tmp_path / "split.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
     with pytest.raises(SlamError, match="weights in other files, which are not read: save it as one file"):
         opened(tmp_path / "split.onnx")
-
-
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
-def test_without_the_extra_the_install_command_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
-) -> None:
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(SlamError, match=r"pip install 'erfsfm-slam\[onnx\]'"):
-        opened(tmp_path / "net.onnx")
 
 
 def test_outputs_are_cached_by_file_and_settings(make_network: MakeNetwork, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Frozen graphs have the outputs of their networks."""
+"""ONNX graphs have the outputs of their networks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from erfsfm.networks import deformable
 from erfsfm.networks.deformable import DeformableConv2d
-from erfsfm.networks.frozen import Frozen
+from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.networks.presets import build
 
 SIZE = (1, 3, 64, 128)
@@ -33,40 +33,50 @@ def inputs(kind: str, seed: int) -> tuple[Any, ...]:
     return (images[0],) if kind == "depth" else (images[0], images[1:])
 
 
+def calls_of(network: nn.Module) -> list[object]:
+    """One entry for each forward pass of the network from now on."""
+    calls: list[object] = []
+    network.register_forward_pre_hook(lambda *_: calls.append(None))
+    return calls
+
+
 @pytest.mark.parametrize(
     "name",
     [f"{erf}{kind}{variant}" for kind in ("depth", "pose") for erf, variant in (("", "net"), ("erf-", "net-dfcv2"))]
-    + ["erf-depthnet-dilated", "erf-posenet-dilated", "erf-posenet-dfc"],
+    + ["erf-depthnet-dilated", "erf-posenet-dilated", "erf-posenet-dfc", "erf-depthnet-lite0"],
 )
 @torch.inference_mode()
 def test_a_graph_has_the_outputs_of_its_network_on_other_images_too(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 2**40)  # all in plain PyTorch
     kind = "depth" if "depth" in name else "pose"
     network = with_moving_taps(build(name, width=0.125, sources=4))
-    graph = Frozen(network)
-    for seed in range(3):
-        given = inputs(kind, seed)
-        wanted: Tensor = network(*given)
-        assert (graph(*given) - wanted).abs().max() <= 1e-5 * wanted.abs().max()
-    assert isinstance(graph.network, torch.jit.ScriptModule)
+    given = [inputs(kind, seed) for seed in range(3)]
+    wanted: list[Tensor] = [network(*images) for images in given]
+    graph, calls = OnnxGraph(network, 1), calls_of(network)
+    for images, output in zip(given, wanted):
+        assert (graph(*images) - output).abs().max() <= 1e-5 * output.abs().max()
+    before = len(calls)
+    graph(*given[0])
+    assert len(calls) == before, "PyTorch computes what ONNX Runtime should"
 
 
 @torch.inference_mode()
 def test_outputs_are_deterministic_from_the_first_call_on() -> None:
-    graph = Frozen(with_moving_taps(build("erf-depthnet-dfcv2", width=0.125)))
+    graph = OnnxGraph(with_moving_taps(build("erf-depthnet-dfcv2", width=0.125)), 1)
     given = inputs("depth", 0)
     answers = [graph(*given) for _ in range(4)]
     assert all(torch.equal(answer, answers[0]) for answer in answers)
 
 
 @torch.inference_mode()
-def test_networks_with_compiled_layers_are_not_traced(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("numba")
+def test_networks_with_large_deformable_layers_are_not_exported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deformable, "_KERNEL_SAMPLES", 1)
     network = with_moving_taps(build("erf-depthnet-dfc", width=0.25))
-    graph = Frozen(network)
+    graph, calls = OnnxGraph(network, 1), calls_of(network)
     graph(*inputs("depth", 0))
-    assert graph.network is network
+    before = len(calls)
+    graph(*inputs("depth", 0))
+    assert len(calls) == before + 1
 
 
 def test_a_network_that_raises_keeps_raising() -> None:
@@ -74,25 +84,24 @@ def test_a_network_that_raises_keeps_raising() -> None:
         def forward(self, image: Tensor) -> Tensor:
             raise ValueError("no network here")
 
-    graph = Frozen(Refusing())
+    graph = OnnxGraph(Refusing(), 1)
     for _ in range(2):
         with pytest.raises(ValueError, match="no network here"):
             graph(torch.zeros(SIZE))
 
 
-def test_tracing_in_a_thread_warns_of_nothing_and_keeps_the_warning_filters() -> None:
-    """`warnings.catch_warnings` would replace the filters of every thread while the graph is traced."""
+def test_an_export_in_a_thread_warns_of_nothing_and_keeps_the_warning_filters() -> None:
+    """`warnings.catch_warnings` would replace the filters of every thread while the graph is made."""
     seen: list[object] = []
 
     class Watching(nn.Module):
         def forward(self, image: Tensor) -> Tensor:
             seen.append(warnings.filters)
-            return image * bool(image.shape[0] > 0) if image.sum() < 1e9 else image
+            return image * 2.0 if image.sum() < 1e9 else image
 
     with warnings.catch_warnings(record=True) as warned:
-        graph = Frozen(Watching().eval())
+        graph = OnnxGraph(Watching().eval(), 1)
         with ThreadPoolExecutor(1) as thread:
             thread.submit(graph, torch.zeros(SIZE)).result()
         assert all(filters is warnings.filters for filters in seen)
-    assert isinstance(graph.network, torch.jit.ScriptModule)
     assert not warned

@@ -1,0 +1,85 @@
+"""A training sample: the images of a snippet, augmented, as tensors, with what a teacher measured of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.augmentation import augment
+from erfsfm.data.weather import weathered
+from erfsfm.geometry.camera import Camera
+from erfsfm.teacher.structure import TeacherStructure
+
+# An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
+# focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).
+FOCAL_LENGTH = 1.9
+
+_MOST_FRAMES = 10_000_000  # of a recording
+
+
+def training_sample(
+    images: list[NDArray[np.uint8]],
+    camera: Camera,
+    seen: TeacherStructure | None,
+    place: tuple[int, int],
+    config: ExperimentConfig,
+    rng: np.random.Generator,
+) -> dict[str, Tensor]:
+    """Augment a snippet and make it a sample.
+
+    Args:
+        images: N + 1 in time order at the networks' size, ``(H, W, 3)`` each.
+        camera: of these images.
+        seen: what the teacher measured, if there is one.
+        place: number of the recording, and the snippet's first frame in it.
+        config: of the experiment.
+        rng: of all random draws.
+
+    Returns:
+        Tensors ``target`` (3, H, W), ``sources`` (N, 3, H, W), ``K`` (3, 3), and ``frames`` (N + 1): of each image in
+        time order a number that is its own, mirrored another one. With a teacher, also ``T_source_target`` (N, 4, 4),
+        ``least`` and ``most`` (1, H, W) of `TeacherStructure`. With weather, also ``shown`` (N + 1, 3, H, W): the
+        images in time order as the networks see them.
+    """
+    network = config.network
+    bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
+    images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, network.fidelity, rng)
+    sample = as_tensors(images, varied.K)
+    which, first = place
+    number = (2 * which + mirrored) * _MOST_FRAMES + first
+    sample["frames"] = torch.arange(number, number + network.sources + 1)
+    if seen is not None:
+        T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
+        if config.teacher.views == "many":
+            nearer = varied.fy / network.height / FOCAL_LENGTH
+            bounds = [values * np.float32(nearer) for values in bounds]
+            T_source_target = T_source_target.copy()
+            T_source_target[:, :3, 3] /= nearer
+        sample["T_source_target"] = torch.from_numpy(T_source_target)
+        sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
+    probability = config.data.weather
+    if probability > 0:
+        sample["shown"] = _stacked(weathered(images, rng) if rng.random() < probability else images)
+    return sample
+
+
+def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:
+    """Images in time order to ``target`` (the middle one), ``sources`` and ``K``; colour in [0, 1]."""
+    middle = len(images) // 2
+    stacked = _stacked(images)
+    sources = torch.cat([stacked[:middle], stacked[middle + 1 :]])
+    return {"target": stacked[middle], "sources": sources, "K": torch.from_numpy(K)}
+
+
+def _stacked(images: list[NDArray[np.uint8]]) -> Tensor:
+    """Colour in [0, 1], ``(N + 1, 3, H, W)``."""
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+
+
+def mirror_motion(T_a_b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The motion ``(..., 4, 4)`` of horizontally flipped images."""
+    mirror = np.diag([-1, 1, 1, 1]).astype(np.float32)
+    return np.asarray(mirror @ T_a_b @ mirror, dtype=np.float32)

@@ -63,7 +63,7 @@ def run(
     camera: Annotated[
         Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
     ] = None,
-    weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
+    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,

@@ -14,8 +14,9 @@ from erfsfm.refinement.refine import RefinedDepth, Road, refine
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.se3 import FloatArray, invert, rotation_angle
 
-BASELINES = (0.07, 0.2)  # wanted distances of neighbours over the median depth, before and after the keyframe
+BASELINES = (0.07, 0.2)  # wanted distances of neighbours over the median depth, after the keyframe and before it
 BASELINE_RANGE = 2.5  # accepted factor on these
+MOST_NEIGHBOURS = 3
 MAX_FRAMES_APART = 40
 MAX_ROTATION_DEG = 20.0
 _REMEMBERED = 24
@@ -66,20 +67,20 @@ class DepthRefiner:
         return refined
 
     def _neighbours(self, n: int, median_depth: float) -> list[int]:
-        """For each baseline the best keyframe before and the best after."""
+        """The best keyframe at each wanted distance, at most three; those after are nearer to what is ahead."""
         near = np.flatnonzero(np.abs(self._indices - self._indices[n]) <= MAX_FRAMES_APART)
         T_target_other = invert(self._T_world_camera[n]) @ self._T_world_camera[near]
         distance = np.linalg.norm(T_target_other[:, :3, 3], axis=1)
         turned = rotation_angle(T_target_other[:, :3, :3])
         chosen: list[int] = []
-        for side in (near < n, near > n):
+        for side in (near > n, near < n):
             for baseline in BASELINES:
                 off = np.abs(np.log(np.maximum(distance, 1e-9) / (baseline * median_depth)))
                 usable = side & (off < np.log(BASELINE_RANGE)) & (turned < np.deg2rad(MAX_ROTATION_DEG))
                 usable &= ~np.isin(near, chosen)
                 if usable.any():
                     chosen.append(int(near[np.where(usable, off, np.inf).argmin()]))
-        return sorted(chosen)
+        return sorted(chosen[:MOST_NEIGHBOURS])
 
 
 def _appearance(image: Image) -> Appearance:

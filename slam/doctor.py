@@ -14,9 +14,9 @@ from slam.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
 
-PACKAGES = ("torch", "onnxruntime", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
+PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "onnxruntime", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
-WEIGHTS = ("default", "sim", "lite0", "erf-dfc")
+WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
 
 
 def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:

@@ -17,14 +17,14 @@ CONTRAST_FLOOR = 4.0  # grey levels: what is less is noise
 
 @dataclass(frozen=True)
 class Appearance:
-    """A grey image at full and at half size, and its normalised copies.
+    """A grey image ``(H, W)`` and at half size ``(h, w)``: grey levels, plain and normalised.
 
-    ``fine`` ``(H, W, 3)`` holds normalised grey levels and their derivatives along x and y, ``coarse``
-    ``(h, w)`` normalised grey levels at half size, ``coarse_grey`` ``(h, w)`` plain ones.
+    ``slopes`` are the derivatives of ``levels`` along x and y.
     """
 
     grey: Array
-    fine: Array
+    levels: Array
+    slopes: tuple[Array, Array]
     coarse: Array
     coarse_grey: Array
 
@@ -37,12 +37,7 @@ class Appearance:
         levels = normalised(full)
         along_x = cv2.Sobel(levels, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         along_y = cv2.Sobel(levels, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-        return cls(full, np.asarray(cv2.merge([levels, along_x, along_y])), normalised(small), small)
-
-    @property
-    def levels(self) -> Array:
-        """Normalised grey levels ``(H, W)``."""
-        return np.ascontiguousarray(self.fine[..., 0])
+        return cls(full, levels, (np.asarray(along_x), np.asarray(along_y)), normalised(small), small)
 
 
 def normalised(grey: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,14 +23,14 @@ class Projection:
         self._moved = (K @ T_neighbour_target[:3, 3]).astype(np.float32)
 
     def pixels(self, inverse_depth: Array) -> tuple[Array, Array, Array]:
-        """Columns, rows and inverse z in the neighbour, ``(H, W)`` each."""
-        x, y, z = (rotated + inverse_depth * moved for rotated, moved in zip(self._rotated, self._moved))
-        inverse_z = 1 / np.maximum(z, np.float32(LEAST_Z))
-        return x * inverse_z, y * inverse_z, inverse_z
+        """Columns, rows and z over the depth, ``(H, W)`` each."""
+        x, y, z = (cv2.scaleAdd(inverse_depth, float(m), r) for r, m in zip(self._rotated, self._moved, strict=True))
+        z = cv2.max(z, LEAST_Z)
+        return x / z, y / z, z
 
-    def motion(self, u: Array, v: Array, inverse_z: Array, inverse_depth: Array) -> tuple[Array, Array]:
+    def motion(self, u: Array, v: Array, z: Array, inverse_depth: Array) -> tuple[Array, Array]:
         """Derivatives of columns and rows with respect to the logarithm of the inverse depth."""
-        k = inverse_z * inverse_depth
+        k = inverse_depth / z
         moved = self._moved
         return (moved[0] - u * moved[2]) * k, (moved[1] - v * moved[2]) * k
 

@@ -70,12 +70,10 @@ def refine(
     inverse = (1 / depth).astype(np.float32)
     change = _coarse_change(target, inverse, neighbours, K, T_neighbour_target)
     change = _enlarged(np.asarray(cv2.medianBlur(change, 5), np.float32), target)
-    projections = [Projection(K, T, height, width) for T in T_neighbour_target]
-    views = list(zip(neighbours, projections))
+    views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
     for _ in range(STEPS):
-        step, _, _ = _gauss_newton(target, views, inverse * np.exp(change))
+        step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
-    _, information, fit = _gauss_newton(target, views, inverse * np.exp(change))
     measured = information > 1 / LEAST_PRIOR_SIGMA**2
     change[fit < LEAST_FIT] = 0
     if road is not None:
@@ -107,34 +105,35 @@ def _enlarged(change: Array, target: Appearance) -> Array:
     """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
     height, width = target.grey.shape
     h, w = change.shape
-    u, v = (np.arange(width, dtype=np.float32) - 0.5) / 2, (np.arange(height, dtype=np.float32) - 0.5) / 2
-    left, top = np.floor(u).astype(int), np.floor(v).astype(int)
-    best, nearest = np.zeros_like(target.grey), np.full_like(target.grey, np.inf)
+    rows, columns = (np.arange(height) - 1) // 2, (np.arange(width) - 1) // 2
+    best, nearest = np.empty_like(target.grey), np.full_like(target.grey, np.inf)
     for down in (0, 1):
         for right in (0, 1):
-            at = np.ix_(np.clip(top + down, 0, h - 1), np.clip(left + right, 0, w - 1))
-            apart = np.abs(target.coarse_grey[at] - target.grey)
+            at = np.clip(rows + down, 0, h - 1)[:, None], np.clip(columns + right, 0, w - 1)
+            apart = cv2.absdiff(target.coarse_grey[at], target.grey)
             closer = apart < nearest
-            best, nearest = np.where(closer, change[at], best), np.where(closer, apart, nearest)
+            np.copyto(best, change[at], where=closer)
+            np.copyto(nearest, apart, where=closer)
     return best
 
 
 def _gauss_newton(
-    target: Appearance, views: Sequence[tuple[Appearance, Projection]], inverse_depth: Array
+    levels: Array, views: Sequence[tuple[Appearance, Projection]], inverse_depth: Array
 ) -> tuple[Array, Array, Array]:
     """The next change of log inverse depth ``(H, W)``, the images' information about it, and their mean weight."""
-    levels = target.levels
     squares, products, errors, weights, seen = (np.zeros_like(levels) for _ in range(5))
     for other, projection in views:
-        u, v, inverse_z = projection.pixels(inverse_depth)
-        at, along_x, along_y = cv2.split(warped(other.fine, u, v))
-        du, dv = projection.motion(u, v, inverse_z, inverse_depth)
-        inside = is_inside(at)
-        residual = np.where(inside, at - levels, 0)
-        weight = np.where(inside, 1 / np.square(1 + np.square(residual / np.float32(RESIDUAL))), 0)
+        u, v, z = projection.pixels(inverse_depth)
+        residual = warped(other.levels, u, v) - levels
+        inside = is_inside(residual)
+        residual *= inside
+        weight = inside / np.square(1 + np.square(residual * np.float32(1 / RESIDUAL)))
+        along_x, along_y = (warped(slope, u, v) for slope in other.slopes)
+        du, dv = projection.motion(u, v, z, inverse_depth)
         slope = along_x * du + along_y * dv
-        squares += weight * slope * slope
-        products += weight * slope * residual
+        weighted = weight * slope
+        squares += weighted * slope
+        products += weighted * residual
         errors += weight * residual * residual
         weights += weight
         seen += inside

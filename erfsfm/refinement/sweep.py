@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from erfsfm.refinement.appearance import Array
 from erfsfm.refinement.projection import Projection
+from erfsfm.refinement.semi_global import LARGEST_COST, UNIT, Costs
 
-# changes of the logarithm of inverse depth; negative is farther, the first two reach the sky from a near guess
-CHANGES: Array = np.concatenate([[-2.4, -1.7], np.arange(-12, 15) / 10]).astype(np.float32)
+# changes of the logarithm of inverse depth, denser near the guess; negative is farther
+CHANGES: Array = np.array([-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32)
 LARGEST_DIFFERENCE = 0.8  # of normalised grey levels: more is an occlusion
 WINDOW_PX = 5
 WEIGHT_UNSEEN = 0.5  # of the cost of the guess, in views
@@ -20,7 +21,7 @@ COST_OF_CHANGE = 0.1  # a unit of log inverse depth
 _OUTSIDE = 1e3
 
 
-def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array) -> Array:
+def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array) -> Costs:
     """Cost ``(C, h, w)`` of each change of the inverse depth.
 
     Args:
@@ -28,14 +29,16 @@ def sweep(levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse
         neighbours: normalised images ``(h, w)``, each with the projection into it.
         inverse_depth: the guess ``(h, w)``.
     """
-    costs = np.empty((len(CHANGES), *levels.shape), np.float32)
+    costs = np.empty((len(CHANGES), *levels.shape), np.int16)
     total, seen = _differences(levels, neighbours, inverse_depth)
-    at_guess = total / np.maximum(seen, np.float32(1e-3))
+    # a change out of sight is neither better nor worse than the guess; the fewer see a pixel, the more that counts
+    unseen = total * np.float32(WEIGHT_UNSEEN) / np.maximum(seen, np.float32(1e-3))
     for cost, change in zip(costs, CHANGES):
         total, seen = _differences(levels, neighbours, inverse_depth * np.exp(change))
-        # a change out of sight is neither better nor worse than the guess; the fewer see a pixel, the more that counts
-        of_change = COST_OF_CHANGE * len(neighbours) * abs(change)
-        cost[:] = (total + at_guess * WEIGHT_UNSEEN + of_change) / (seen + WEIGHT_UNSEEN)
+        total += unseen
+        total += COST_OF_CHANGE * len(neighbours) * abs(change)
+        total /= seen + np.float32(WEIGHT_UNSEEN)
+        cost[:] = np.minimum(total, np.float32(LARGEST_COST)) * np.float32(UNIT)
     return costs
 
 
@@ -43,15 +46,15 @@ def _differences(
     levels: Array, neighbours: Sequence[tuple[Array, Projection]], inverse_depth: Array
 ) -> tuple[Array, Array]:
     """Sums ``(h, w)`` over neighbours of truncated differences, and of how many see a pixel; means over the window."""
-    total, seen = np.zeros_like(levels), np.zeros_like(levels)
+    total, unseen = np.zeros_like(levels), np.zeros(levels.shape, np.uint8)
     for other, projection in neighbours:
         u, v, _ = projection.pixels(inverse_depth)
-        difference = np.abs(warped(other, u, v) - levels)
-        inside = is_inside(difference)
-        total += np.where(inside, np.minimum(difference, np.float32(LARGEST_DIFFERENCE)), 0)
-        seen += inside
+        difference = cv2.absdiff(warped(other, u, v), levels)
+        unseen += ~is_inside(difference)
+        total += cv2.min(difference, LARGEST_DIFFERENCE)
     window = (WINDOW_PX, WINDOW_PX)
-    return np.asarray(cv2.boxFilter(total, -1, window)), np.asarray(cv2.boxFilter(seen, -1, window))
+    missing = cv2.boxFilter(unseen, cv2.CV_32F, window)
+    return cv2.boxFilter(total, -1, window) - np.float32(LARGEST_DIFFERENCE) * missing, len(neighbours) - missing
 
 
 def warped(image: Array, u: Array, v: Array) -> Array:
@@ -67,11 +70,12 @@ def is_inside(levels: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(levels) < _OUTSIDE / 100)
 
 
-def lowest(costs: Array) -> Array:
+def lowest(costs: Costs) -> Array:
     """The change ``(h, w)`` of least cost, between samples by a parabola."""
     best = costs.argmin(axis=0)
     middle = np.clip(best, 1, len(costs) - 2)
-    before, at, after = (np.take_along_axis(costs, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1e-6)), -0.5, 0.5)
+    around = (np.take_along_axis(costs, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    before, at, after = (cost.astype(np.float32) for cost in around)
+    shift = np.clip((before - after) / (2 * np.maximum(before + after - 2 * at, 1)), -0.5, 0.5)
     position = np.where(best == middle, middle + shift, best)
     return np.asarray(np.interp(position, np.arange(len(costs)), CHANGES), np.float32)

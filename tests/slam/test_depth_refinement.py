@@ -22,13 +22,19 @@ def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
     return DepthRefiner(CAMERA, range(len(distances)), T_world_camera, image)
 
 
-@pytest.mark.parametrize(("step_m", "expected"), [(1.0, {8, 9, 10, 11, 12}), (0.1, {10, 3, 17, 30, -10})])
+@pytest.mark.parametrize(("step_m", "expected"), [(1.0, {9, 10, 11, 12}), (0.1, {10, 3, 17, 30})])
 def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[int]) -> None:
     read: list[int] = []
     offset = 20 if step_m < 1 else 0
     n = 10 + offset
     assert refiner(np.arange(80) * step_m, read).refine(n, DEPTH, None) is not None
     assert {k - offset for k in read} == expected
+
+
+def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
+    read: list[int] = []
+    assert refiner(np.arange(20.0), read).refine(19, DEPTH, None) is not None
+    assert set(read) == {17, 18, 19}
 
 
 def test_a_standing_camera_has_no_neighbours() -> None:

@@ -26,8 +26,8 @@ def test_a_point_lands_where_the_camera_sees_it() -> None:
 def test_derivatives_are_those_of_small_differences() -> None:
     projection = Projection(K, a_motion(), 20, 30)
     inverse = np.full((20, 30), 0.2, np.float32)
-    u, v, inverse_z = projection.pixels(inverse)
-    du, dv = projection.motion(u, v, inverse_z, inverse)
+    u, v, z = projection.pixels(inverse)
+    du, dv = projection.motion(u, v, z, inverse)
     after, before = (projection.pixels(inverse * np.float32(np.exp(h))) for h in (0.01, -0.01))
     np.testing.assert_allclose(du, (after[0] - before[0]) / 0.02, atol=2e-2)
     np.testing.assert_allclose(dv, (after[1] - before[1]) / 0.02, atol=2e-2)

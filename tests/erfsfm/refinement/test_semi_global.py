@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.refinement.semi_global import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, smoothed
+from erfsfm.refinement.semi_global import EDGE_GREY_LEVELS, LARGE_STEP, SMALL_STEP, UNIT, smoothed
 
 
 def slowly(costs: np.ndarray, grey: np.ndarray) -> np.ndarray:
@@ -31,4 +31,5 @@ def test_paths_equal_those_of_an_obvious_loop() -> None:
     rng = np.random.default_rng(0)
     costs = rng.random((5, 6, 7)).astype(np.float32)
     grey = rng.uniform(0, 40, (6, 7)).astype(np.float32)
-    np.testing.assert_allclose(smoothed(costs, grey), slowly(costs, grey), rtol=1e-5)
+    found, expected = smoothed(np.asarray(UNIT * costs, np.int16), grey) / UNIT, slowly(costs, grey)
+    np.testing.assert_allclose(found - found.min(axis=0), expected - expected.min(axis=0), atol=0.01)

@@ -155,7 +155,8 @@ def receptive_field(
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.errors import ConfigError, DataError
+    from erfsfm.errors import DataError
+    from erfsfm.figure_file import require_figure
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
     from erfsfm.readers.images import list_images, resize_image
@@ -163,8 +164,7 @@ def receptive_field(
     from erfsfm.receptive_field.measure import field_table, measure_fields
     from erfsfm.receptive_field.street import street_snippet
 
-    if output.suffix not in (".png", ".pdf", ".svg"):
-        raise ConfigError(f"--output must end in .png, .pdf or .svg; got {output}")
+    require_figure(output)
     if images is None:
         snippet = street_snippet(5, height, width)
     else:

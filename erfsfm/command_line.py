@@ -31,7 +31,7 @@ _MEMORY = re.compile(
 def run(app: Callable[..., object], name: str) -> None:
     """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "ERROR"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
+    for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
         os.environ.setdefault(name_of_level, quiet)  # what they would say of a file is said in our own line
     try:
         app(args=_checked(sys.argv[1:], name), prog_name=name)

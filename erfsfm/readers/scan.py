@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 from erfsfm.errors import DataError
 
 VELODYNE_COLUMNS = 4
+_FARTHEST_M = 1e4
 
 
 def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.float64]:
     """The points of a file of float32 ``(P, 3)``, metres, in the LiDAR frame; x, y, z are the first of ``columns``.
 
-    Points that are not finite are left out.
-
     Raises:
-        DataError: it cannot be read, is cut off, or has no finite point.
+        DataError: it cannot be read, is cut off, or has none of the points of `measured_points`.
     """
     try:
         values = np.fromfile(path, dtype=np.float32)
@@ -26,8 +25,18 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
         raise DataError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
     if len(values) == 0 or len(values) % columns:
         raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {values.nbytes} bytes")
-    points = values.reshape(-1, columns)[:, :3].astype(np.float64)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        raise DataError(f"{path} has no point with finite coordinates; restore the scan or remove it")
-    return points[finite]
+    return measured_points(values.reshape(-1, columns)[:, :3].astype(np.float64), path)
+
+
+def measured_points(points: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    """Those of the points ``(P, 3)`` of a file that a LiDAR can measure: not its own place, and within 10 km.
+
+    Raises:
+        DataError: there are none.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        distances = np.linalg.norm(points, axis=1)
+    measured = (distances > 0) & (distances < _FARTHEST_M)
+    if not measured.any():
+        raise DataError(f"{path} has no point at a distance that a LiDAR measures; restore the scan or remove it")
+    return np.asarray(points[measured])

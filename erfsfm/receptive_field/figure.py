@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from erfsfm.files import write_atomically
+from erfsfm.figure_file import save_figure
 from erfsfm.receptive_field.measure import HELD, FieldRow
 
 _WIDTH_IN = 12.0
@@ -49,8 +49,7 @@ def draw_fields(rows: Sequence[FieldRow], image: NDArray[np.uint8], path: Path) 
         f"the image.  right: gradient magnitude; line: {HELD:.0%} of it",
         fontsize=9,
     )
-    kind = path.suffix.removeprefix(".") or "png"
-    write_atomically(path, lambda temporary: figure.savefig(temporary, format=kind, dpi=150))
+    save_figure(figure, path, dpi=150)
 
 
 def _draw_seen(axis: Axes, row: FieldRow, image: NDArray[np.uint8]) -> None:

@@ -55,9 +55,8 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
         raise SequenceError(f"{manifest_or_root} has no sequence {missing[0]}: it has {', '.join(known)}")
     chosen = known if "all" in sequences else sequences
     root = manifest_or_root.absolute()
-    return _named(
-        ("", Drive(name, root.parent, ("--dataset", str(root), "--sequence", name, *options))) for name in chosen
-    )
+    drives = [Drive(name, root.parent, ("--dataset", str(root), "--sequence", name, *options)) for name in chosen]
+    return _named([("", drive) for drive in drives], root)
 
 
 def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
@@ -68,8 +67,11 @@ def _manifest(path: Path, options: Sequence[str]) -> list[Drive]:
     if not rows:
         raise SequenceError(f"{path} names no drive: give a list of {', '.join(_KEYS)}")
     return _named(
-        (str(row.get("name") or ""), _drive(row, path, f"{path}, drive {number}", options))
-        for number, row in enumerate(rows, start=1)
+        [
+            (str(row.get("name") or ""), _drive(row, path, f"{path}, drive {number}", options))
+            for number, row in enumerate(rows, start=1)
+        ],
+        path,
     )
 
 
@@ -108,13 +110,13 @@ def _drive(row: dict[str, Any], path: Path, where: str, options: Sequence[str]) 
     return Drive(name, path.absolute().parent, (*named, *options, *own))
 
 
-def _named(drives: Iterable[tuple[str, Drive]]) -> list[Drive]:
-    """Drives with names for folders; a repeated name is numbered, unless the manifest gave it."""
+def _named(drives: Iterable[tuple[str, Drive]], path: Path) -> list[Drive]:
+    """Drives with names for folders; a repeated name is numbered, unless the manifest at ``path`` gave it."""
     found: dict[str, Drive] = {}
     for given, drive in drives:
         name = re.sub(r"[^\w.-]+", "-", drive.name).strip("-.") or "drive"
         if given and name in found:
-            raise SequenceError(f"two drives are named {name}: choose other names")
+            raise SequenceError(f"{path}: two drives are named {name}: choose other names")
         number, unique = 1, name
         while unique in found:
             number += 1

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from erfsfm.figure_file import save_figure
 from erfsfm.readers.camera_file import CameraFile
 from slam.calibration.solve import Calibration
-from slam.errors import CalibrationError
 from slam.sequences.recording import ImageSource
 from slam.sequences.undistortion import Undistortion
-from slam.storage.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,10 +21,10 @@ _ARROW_LENGTH = 0.05  # of the image's width, of an error as large as the root m
 
 
 def write_picture(path: Path, fit: Calibration, camera: CameraFile, images: ImageSource) -> None:
-    """Draw a fit as PNG: an image with corners and residuals, all corners, all residuals, the image undistorted.
+    """Draw a fit: an image with corners and residuals, all corners, all residuals, the image undistorted.
 
     Raises:
-        CalibrationError: it cannot be written.
+        ConfigError, OSError: it cannot be written, or another image is there.
         DataError, SequenceError: the image cannot be read again.
     """
     from matplotlib.figure import Figure
@@ -42,7 +41,7 @@ def write_picture(path: Path, fit: Calibration, camera: CameraFile, images: Imag
     for axis in (axes[0, 0], axes[0, 1], axes[1, 1]):
         axis.set_xticks([])
         axis.set_yticks([])
-    write_atomically(path, lambda partial: figure.savefig(partial, format="png"), CalibrationError)
+    save_figure(figure, path, _DPI)
 
 
 def _draw_view(axis: Axes, fit: Calibration, view: int, image: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> None:

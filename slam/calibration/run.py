@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from erfsfm.errors import DataError
+from erfsfm.figure_file import require_figure
 from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images
@@ -46,7 +47,8 @@ def calibrate_camera(
         recording: a video, or a folder of images of one size.
         board: the board.
         model: of the lens.
-        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``.
+        output: the ``camera.yaml`` to write; the picture is written beside it, as ``camera.png``, or among
+            images, where it would be one of them, as ``camera.pdf``.
         fps: to write; None for the rate of the video, or 10.
         progress: called with (stage, done, total).
 
@@ -56,6 +58,8 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+    picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
+    require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen(find_views(images, board, progress))
     fit = calibrate(views, images.width, images.height, model)
@@ -77,11 +81,15 @@ def calibrate_camera(
         source=source,
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
-    picture = output.with_suffix(".png")
     text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
     write_picture(picture, fit, camera, images)
     write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
     return CalibrationFiles(fit, camera, output, picture)
+
+
+def _among_images(output: Path) -> bool:
+    """Whether the folder of the output holds images, other than a picture of an earlier calibration."""
+    return any(path.stem != output.stem for path in list_images(output.parent))
 
 
 def _open(recording: Path) -> tuple[ImageSource, float | None]:

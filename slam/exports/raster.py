@@ -20,6 +20,7 @@ from slam.runtime.imports import import_rasterio
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
 
+RASTER = "raster.yaml"
 _HEIGHT_STEPS = 65535  # of a 16-bit image; 0 is unknown
 _FINEST_STEP = 0.001
 _OPAQUE = 255
@@ -106,7 +107,7 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     }
     description |= {} if raster.crs is None else {"crs": raster.crs}
     text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=200)
-    _write_text(output / "raster.yaml", text)
+    _write_text(output / RASTER, text)
 
 
 def _to_east_north(heading_deg: float) -> FloatArray:

@@ -5,12 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from slam.errors import RunError
+from slam.exports.raster import RASTER
+from slam.formats.colmap import MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
-from slam.formats.transforms import TRANSFORMS
+from slam.formats.transforms import TRANSFORMS, is_own_scene
 from slam.results.folder import RunFolder
 from slam.results.output import is_own
 
 _FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
+_NAMES = {
+    "colmap": MODEL_FILES,
+    "nerfstudio": ("images", TRANSFORMS),
+    "raster": ("height.png", "colour.png"),
+}
+_OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": lambda output: (output / RASTER).is_file()}
 _TEXTS = {"trajectory": (".txt", ".tum", ".kitti"), "graph": (".g2o", ".txt")}
 
 
@@ -24,8 +32,9 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
     if what in _FOLDERS:
         if output.exists() and not output.is_dir():
             raise RunError(f"{output} is a file: {_FOLDERS[what]} is several files, give the name of a folder")
-        if what == "nerfstudio" and (output / "images").is_dir() and not (output / TRANSFORMS).is_file():
-            raise RunError(f"{output / 'images'} holds other images, which would be replaced: choose another --output")
+        others = [name for name in _NAMES[what] if (output / name).exists()]
+        if others and not _OURS[what](output):
+            raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
         return
     if output.is_dir():
         raise RunError(f"{output} is a folder: give the name of a file to write")

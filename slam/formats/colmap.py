@@ -16,6 +16,8 @@ from slam.frames import Intrinsics
 from slam.se3 import FloatArray, invert
 from slam.storage.files import write_atomically
 
+MODEL_FILES = ("cameras.txt", "images.txt", "points3D.txt")
+_HEADER = "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"
 _HALF_PIXEL = 0.5
 
 
@@ -38,13 +40,15 @@ def write_colmap(
     Raises:
         RunError: a file cannot be written.
     """
-    contents = {
-        "cameras.txt": _camera(intrinsics),
-        "images.txt": _images(T_world_camera),
-        "points3D.txt": _points(points_world, colours),
-    }
-    for name, text in contents.items():
+    contents = _camera(intrinsics), _images(T_world_camera), _points(points_world, colours)
+    for name, text in zip(MODEL_FILES, contents, strict=True):
         _write(folder / name, text)
+
+
+def is_own_model(folder: Path) -> bool:
+    """Whether the model in a folder is one of `write_colmap`, whose comments are not COLMAP's."""
+    path = folder / MODEL_FILES[0]
+    return path.is_file() and path.read_bytes().startswith(_HEADER.encode())
 
 
 def _write(path: Path, text: str) -> None:
@@ -54,7 +58,7 @@ def _write(path: Path, text: str) -> None:
 def _camera(camera: Intrinsics) -> str:
     principal = [camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
     numbers = " ".join(map(repr, [float(value) for value in (camera.fx, camera.fy, *principal)]))
-    return f"# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
+    return f"{_HEADER}\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
 
 
 def _images(T_world_camera: FloatArray) -> str:

@@ -21,6 +21,13 @@ from slam.storage.files import write_atomically
 TRANSFORMS = "transforms.json"
 T_CAMERA_OPENGL: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_PIXEL = 0.5
+_MARK = "erfsfm-slam"
+
+
+def is_own_scene(folder: Path) -> bool:
+    """Whether the scene in a folder is one that `write_transforms` described."""
+    path = folder / TRANSFORMS
+    return path.is_file() and f'"made_by": "{_MARK}"'.encode() in path.read_bytes()
 
 
 def write_transforms(
@@ -42,6 +49,7 @@ def write_transforms(
         for name, pose in T_world_camera.items()
     ]
     scene: dict[str, Any] = {
+        "made_by": _MARK,
         "camera_model": "OPENCV",
         "fl_x": float(intrinsics.fx),
         "fl_y": float(intrinsics.fy),

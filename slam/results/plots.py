@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from erfsfm.figure_file import require_figure, save_figure
 from slam.errors import RunError
 from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.frames import DepthMap, Image
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.map_picture import AerialView
-from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, associate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-SUFFIXES = (".png", ".pdf", ".svg")
 CAMERA_HEIGHTS = "camera heights"
 
 _STYLE = {
@@ -206,7 +205,8 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
     """Write one figure: a column for each run, a row for each of ``what``.
 
     Raises:
-        RunError: an unknown ``what`` or suffix, or a run without what the figure needs.
+        RunError: an unknown ``what``, or a run without what the figure needs.
+        ConfigError: as `require_figure`.
     """
     panels = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
     what = [name.strip() for name in what]
@@ -214,8 +214,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
     if unknown or not what or not runs:
         wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
         raise RunError(f"{wanted}: give at least one run and some of {', '.join(panels)}")
-    if output.suffix.lower() not in SUFFIXES:
-        raise RunError(f"figures are written as {', '.join(SUFFIXES)}; got '{output.name}'")
+    require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [4.6 if name == "trajectory" else 3.2 for name in what]
     with figure_style() as new_figure:
@@ -227,7 +226,10 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
                 _share_heights(drawn)
         for part, run in zip(grid[0], runs):
             part.suptitle(run.path.resolve().name, fontsize=12)
-        _save(figure, output)
+        try:
+            save_figure(figure, output, dpi=200)
+        except OSError as error:
+            raise RunError(str(error)) from error
 
 
 def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, Trajectory]:
@@ -303,10 +305,3 @@ def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
         top = max(axes.get_ylim()[1] for axes in same)
         for axes in same:
             axes.set_ylim(0.0, top)
-
-
-def _save(figure: Figure, output: Path) -> None:
-    """Write atomically, without a date, so that equal figures are equal files."""
-    kind = output.suffix.lower().removeprefix(".")
-    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[kind]
-    write_atomically(output, lambda path: figure.savefig(path, format=kind, dpi=200, metadata=undated), RunError)

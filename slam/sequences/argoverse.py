@@ -12,6 +12,7 @@ from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import camera_of
 from erfsfm.readers.images import has_images, list_images
 from erfsfm.readers.numbering import by_name
+from erfsfm.readers.scan import measured_points
 from slam import se3
 from slam.errors import SequenceError
 from slam.runtime.imports import import_feather
@@ -87,7 +88,7 @@ def _read(path: Path) -> Table:
     feather = import_feather()
     try:
         table: Table = feather.read_table(path).to_pydict()
-    except (OSError, ValueError) as error:  # pyarrow's own errors are ValueErrors
+    except (OSError, ValueError, MemoryError) as error:  # pyarrow's own errors, also of a size announced but not there
         raise SequenceError(f"cannot read table {path}: {' '.join(str(error).split())}; copy it again") from error
     return table
 
@@ -120,9 +121,10 @@ def _scans(folder: Path, stamps: FloatArray) -> dict[int, ScanReader]:
 def _points(path: Path) -> FloatArray:
     table = _read(path)
     try:
-        return np.column_stack([np.asarray(table[axis], np.float64) for axis in "xyz"])
-    except (KeyError, ValueError) as error:
+        points = np.column_stack([np.asarray(table[axis], np.float64) for axis in "xyz"])
+    except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path} is no sweep of Argoverse 2: {error!r}") from error
+    return measured_points(points, path)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

@@ -17,7 +17,8 @@ from slam.sequences.recording import MAX_GAP_S, require_frame
 logger = logging.getLogger(__name__)
 
 _ROUNDING_PX = 0.01
-_NUMBERED = ("kitti_", "simulated/")  # of names whose frame numbers are those of the recording
+_SIMULATED = "simulated/"
+_NUMBERED = ("kitti_", _SIMULATED)  # of names whose frame numbers are those of the recording
 
 
 class Continued:
@@ -57,6 +58,8 @@ class Continued:
         self.name, self.intrinsics, self.camera_height_m = name, intrinsics, camera_height_m
         self.before = len(stamps)
         self._missing = missing_between(sources, following.provenance())
+        if _same_world(sources, following.provenance()):
+            self._missing = _missing_by_clock(name, stamps, following.stamps)
         self._following, self._sources = following, sources
         self.stamps = _joined_stamps(stamps, self._missing, following.stamps)
         self._require_short_gap()
@@ -109,7 +112,7 @@ class Continued:
 def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
     """Number of frames of a recording between the earlier ones and those that follow, by their leak-record names.
 
-    Names of simulated worlds have no frame numbers: none are missing. Folders with other names are assumed to follow,
+    Names of simulated worlds have no frame numbers: their stamps tell. Folders with other names are assumed to follow,
     with a warning.
 
     Raises:
@@ -135,6 +138,32 @@ def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
     if missing < 0:
         raise SequenceError(
             f"{name} does not come after {', '.join(before)}: give the frames that follow, with --frames A:B"
+        )
+    return missing
+
+
+def _same_world(before: tuple[str, ...], following: tuple[str, ...]) -> bool:
+    """Whether both are frames of one simulated world, which have one clock."""
+    return before[-1:] == following[:1] and following[0].startswith(_SIMULATED)
+
+
+def _missing_by_clock(name: str, stamps: FloatArray, following: FloatArray) -> int:
+    """Number of frames of one clock between the last stamp and the first that follows.
+
+    A clock that begins again is that of a copy, and assumed to follow, with a warning.
+
+    Raises:
+        SequenceError: the frames that follow begin before the last one.
+    """
+    if following[0] == 0:
+        logger.warning("stamps of %s begin again: its frames are assumed to follow without a gap", name)
+        return 0
+    periods = np.diff(np.concatenate([stamps[-2:], following[:2]]))[[0, -1]]
+    missing = round(float(following[0] - stamps[-1]) / float(periods.min())) - 1
+    if missing < 0:
+        raise SequenceError(
+            f"{name}: the frames that follow begin at {following[0]:g} s, before the last one at {stamps[-1]:g} s: "
+            "give the frames that follow, with --frames A:B"
         )
     return missing
 

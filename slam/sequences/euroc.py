@@ -26,6 +26,7 @@ from slam.sequences.undistortion import calibrated
 _CAMERAS = ("cam0", "cam1")
 _TRUTH = "state_groundtruth_estimate0"
 _NANOSECONDS = 10**9
+_RIGID_TOLERANCE = 0.01
 _MODELS: dict[str, Literal["pinhole", "opencv", "fisheye"]] = {
     "radial-tangential": "opencv",
     "radtan": "opencv",
@@ -113,6 +114,8 @@ def _read_sensor(path: Path) -> _Sensor:
         T_body_sensor = np.array(keys["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
     except (KeyError, TypeError, ValueError) as error:
         raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error!r}") from error
+    if not se3.is_se3(T_body_sensor, _RIGID_TOLERANCE):
+        raise SequenceError(f"{path} has a T_BS that is no rotation and translation: restore the file")
     return _Sensor(path, T_body_sensor, keys)
 
 

@@ -54,13 +54,13 @@ def open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> R
         own = camera_of(
             keys | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}, str(tables / "calibrated_sensor.json")
         )
+        T_camera_lidar, scans = (None, {}) if lidar is None else _scans(root, lidar, T_ego_camera, stamps)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise SequenceError(f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again") from error
     stored = ImageFiles(files)
     camera = own_camera(own, asked, stored, root)
     images, intrinsics = calibrated(stored, camera, f"{scene} in {root}")
     require_short_gaps(files, stamps)
-    T_camera_lidar, scans = (None, {}) if lidar is None else _scans(root, lidar, T_ego_camera, stamps)
     return RecordedSequence(
         name=scene,
         images=images,

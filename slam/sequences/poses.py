@@ -17,6 +17,8 @@ from slam.se3 import FloatArray
 logger = logging.getLogger(__name__)
 
 _MAX_GAP_S = 0.1
+_FARTHEST = 1e12
+_LENGTH_TOLERANCE = 0.1  # of quaternions, which are written with few digits
 
 
 def rebased(T_any_camera: FloatArray) -> FloatArray:
@@ -32,10 +34,14 @@ def poses_of(positions: FloatArray, quaternions_xyzw: FloatArray) -> FloatArray:
     """Poses ``(N, 4, 4)`` of positions ``(N, 3)`` and quaternions ``(N, 4)``, which are normalised.
 
     Raises:
-        ValueError: a quaternion is zero, or a number is not finite.
+        ValueError: the length of a quaternion is not 1, or a position is not finite or farther than 1e12.
     """
-    if not (np.isfinite(positions).all() and np.isfinite(quaternions_xyzw).all()):
-        raise ValueError("a number of a pose is not finite")
+    if not (np.abs(positions) <= _FARTHEST).all():
+        raise ValueError(f"a position is not finite, or farther than {_FARTHEST:g}")
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(quaternions_xyzw, axis=1)
+    if not (np.abs(lengths - 1) <= _LENGTH_TOLERANCE).all():
+        raise ValueError(f"a quaternion has length {lengths[np.argmax(~(np.abs(lengths - 1) <= _LENGTH_TOLERANCE))]:g}")
     return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), positions)
 
 

@@ -121,7 +121,7 @@ def test_usage(run: Run, arguments: list[str]) -> None:
         (["export", "--weights", "{weights}", "--output", "net.pt"], "must end in .onnx"),
         (["receptive-field", "--network", "resnet"], "unknown network 'resnet'"),
         (["receptive-field", "--images", "{empty}"], "five consecutive images; {empty} has 0"),
-        (["receptive-field", "--output", "field.txt"], ".png, .pdf or .svg"),
+        (["receptive-field", "--output", "field.txt"], ".png, .pdf, .svg"),
         (["networks", "--sources", "0"], "sources"),
         (["evaluate", "depth", "--dataset", "nowhere", "--weights", "{weights}"], "does not exist"),
         (["evaluate", "pose", "--dataset", "{root}", "--sequence", "44", "--weights", "{weights}"], "found 00"),

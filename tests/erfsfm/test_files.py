@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from erfsfm.files import write_atomically
+
+
+@pytest.mark.parametrize("through", ["itself", "a link"])
+def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path, through: str) -> None:
+    """A superuser's rename would put a file there, also in the place of /dev/null."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    (tmp_path / "link").symlink_to(pipe)
+    with pytest.raises(OSError, match="is a device or a pipe: give the name of a file"):
+        write_atomically(pipe if through == "itself" else tmp_path / "link", lambda path: path.write_text("x"))
+    assert pipe.is_fifo() and (tmp_path / "link").is_symlink() and len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_disk_that_is_full_names_the_file(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ def calibrate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     """Exit code, stdout and stderr."""
 
     def call(*arguments: object) -> tuple[int, str, str]:
-        words = ["erfsfm-slam", "calibrate", *arguments, "--output", tmp_path / "camera.yaml"]
+        words = ["erfsfm-slam", "calibrate", "--output", tmp_path / "camera.yaml", *arguments]
         monkeypatch.setattr(sys, "argv", list(map(str, words)))
         try:
             main()
@@ -78,6 +78,17 @@ def test_a_known_camera_is_found(
     assert picture is not None and picture.shape == (950, 1300, 3) and picture.std() > 20
     sequence = open_sequence(folder, camera=tmp_path / "camera.yaml")  # run reads it
     assert sequence.frame(0).image.shape == (360, 480, 3)
+
+
+def test_among_the_images_the_picture_is_none_of_them(make_studio, make_views, write_views, calibrate: Call) -> None:
+    folder = write_views(make_studio(), make_views(12, 40))
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    for _ in range(2):
+        code, _, err = calibrate(folder, "--board", "9x6", "--output", folder / "camera.yaml")
+        assert code == 0, err
+    assert (folder / "camera.pdf").is_file() and not (folder / "camera.png").exists()
+    code, _, err = calibrate(folder, "--board", "9x6", "--output", folder / "new.yaml")
+    assert code == 0 and all(path.read_bytes() == content for path, content in before.items())
 
 
 def test_a_video_gives_its_rate(tmp_path: Path, make_studio, make_views, calibrate: Call) -> None:

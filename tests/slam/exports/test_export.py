@@ -134,12 +134,16 @@ def test_errors_are_clear_and_leave_nothing(
         ("trajectory", "camera.yaml", r"exists and does not end in \.txt or \.tum"),
         ("graph", "camera.yaml", r"exists and does not end in \.g2o"),
         ("occupancy", "camera.yaml", "exists and is no map of ROS"),
-        ("nerfstudio", "drive", "images holds other images"),
+        ("nerfstudio", "drive", "drive/images is none of ours"),
+        ("colmap", "drive", "drive/images.txt is none of ours"),
+        ("raster", "drive", "drive/height.png is none of ours"),
     ],
 )
 def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str) -> None:
     folder = make_run()
     (tmp_path / "drive/images").mkdir(parents=True)
+    for other in ("images.txt", "height.png"):
+        (tmp_path / "drive" / other).write_text("another program's")
     (tmp_path / "camera.yaml").write_text("width: 40\n")
     before = {path: path.read_bytes() for path in folder.path.iterdir()}
     with pytest.raises(RunError, match=why):

@@ -50,9 +50,17 @@ def test_earlier_frames_are_not_kept(parts: tuple[Sequence, Sequence]) -> None:
         joined.frame(14)
 
 
-@pytest.mark.parametrize("gap", ["10:", "0:9"])
-def test_no_truth_across_a_gap(kitti_root: Path, parts: tuple[Sequence, Sequence], gap: str) -> None:
-    assert continued(parts[0], open_sequence(kitti_root, "sim", frames=gap)).reference is None
+def test_frames_of_a_simulated_world_are_told_by_its_clock(
+    kitti_root: Path, parts: tuple[Sequence, Sequence], caplog: pytest.LogCaptureFixture
+) -> None:
+    later = continued(parts[0], open_sequence(kitti_root, "sim", frames="11:"))
+    assert len(later) == 14 and later.reference is not None
+    with pytest.raises(MissingFrameError, match="frame 9 of sim is missing between two runs"):
+        later.frame(9)
+    with pytest.raises(SequenceError, match=r"begin at 0\.6 s, before the last one at 0\.8 s: give the frames that"):
+        continued(parts[0], open_sequence(kitti_root, "sim", frames="6:"))
+    again = continued(parts[0], open_sequence(kitti_root, "sim", frames="0:9"))
+    assert again.reference is None and "stamps of sim begin again" in caplog.text
 
 
 def test_no_truth_where_one_part_has_none(parts: tuple[Sequence, Sequence]) -> None:

@@ -78,6 +78,8 @@ def trajectory_metrics(
     snippet_metrics = _snippet_metrics(snippets)
     if snippets and _stands_still(T_world_reference):
         snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL)
+    elif snippets and _goes_backwards(T_world_estimate, T_world_reference):
+        snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS)
     return {
         "snippet5": _record(snippet_metrics),
         "align": {name: _record(metrics) for name, metrics in ours.items()},
@@ -234,6 +236,13 @@ def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -
         return None
     predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
     return snippet_errors(predicted, snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH))
+
+
+def _goes_backwards(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> bool:
+    """Whether the scale of snippets is negative on the whole: each would fit the truth by going the other way."""
+    trajectories = T_world_estimate, T_world_reference
+    p, g = (snippets_from_trajectory(T, SNIPPET_LENGTH)[..., :3, 3] for T in trajectories)
+    return bool((g * p).sum() < 0)
 
 
 def _snippet_metrics(errors: SnippetErrors | None) -> dict[str, Metric]:

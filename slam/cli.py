@@ -63,7 +63,7 @@ def run(
     camera: Annotated[
         Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
     ] = None,
-    weights: Annotated[str, typer.Option(help="default, sim, lite0, erf-dfc or a training output")] = "default",
+    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
@@ -208,6 +208,7 @@ def config() -> None:
 @app.command()
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
 ) -> None:
     """Check the installation. Missing parts come with what to do.
 
@@ -215,7 +216,7 @@ def doctor(
     """
     from slam.doctor import examine
 
-    for line in examine(dataset):
+    for line in examine(dataset, camera):
         typer.echo(line)
 
 
@@ -254,7 +255,11 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
 
     sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
     known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
-    print_table(metrics_table(known, f"{sequence['name']}, scale {metrics['scale']['mode']}"))
+    title = f"{sequence['name']}, scale {metrics['scale']['mode']}"
+    if sequence["length_m"] is None:
+        typer.echo(f"{title}: no errors, for {sequence['length_m_reason']}")
+    else:
+        print_table(metrics_table(known, title))
     for note in unit_notes(metrics):
         typer.echo(note)
     for gap in sequence["bridged"]:

@@ -14,16 +14,17 @@ from slam.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
 
-PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "lightning")
+PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "onnxruntime", "lightning")
 DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
-WEIGHTS = ("default", "sim", "erf-dfc")
+WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
 
 
-def examine(dataset: Path | None) -> list[str]:
+def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
     """Check the installation; one line for each finding, each starting with ``ok`` or ``missing``.
 
     Args:
         dataset: a data set to check; None for ``$KITTI_ODOMETRY``, if it is set.
+        camera: a ``camera.yaml`` in place of its own, or ``fov=DEGREES``.
     """
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
     lines += [_package(name) for name in PACKAGES]
@@ -34,7 +35,7 @@ def examine(dataset: Path | None) -> list[str]:
     if root is None:
         lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)")
     else:
-        lines += _dataset(root)
+        lines += _dataset(root, camera)
     return lines
 
 
@@ -62,19 +63,19 @@ def _weights(name: str) -> str:
         return f"missing  weights {name}: {error}"
 
 
-def _dataset(root: Path) -> list[str]:
+def _dataset(root: Path, camera: Path | None) -> list[str]:
     try:
         kinds = sequence_kinds(root)
     except SlamError as error:
         return [f"missing  {error}"]
     if not kinds:
         return [f"missing  {root} is not a data set of a kind that docs/recordings.md lists"]
-    return [_sequence(root, name, kind) for name, kind in kinds.items()]
+    return [_sequence(root, name, kind, camera) for name, kind in kinds.items()]
 
 
-def _sequence(root: Path, name: str, kind: str) -> str:
+def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
     try:
-        sequence = open_sequence(root, name)
+        sequence = open_sequence(root, name, camera)
     except SlamError as error:
         return f"missing  sequence {name}: {error} ({kind})"
     truth = "true poses" if sequence.reference is not None else "no true poses"

@@ -81,9 +81,14 @@ def scale_by_gps(
     estimated = fixes.antenna(T_world_camera_unscaled, stamps)
     span = max(len(estimated) // _CHORDS, 1)
     by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))
-    usable = (by_camera > 0) & (by_gps > _LEAST_MOTION_SIGMAS * np.median(fixes.sigmas[:, 0]))
+    least = _LEAST_MOTION_SIGMAS * float(np.median(fixes.sigmas[:, 0]))
+    usable = (by_camera > 0) & (by_gps > least)
     if usable.sum() < config.min_frames:
-        return MeasurementFailure("the camera moves too little between GPS fixes to measure a scale")
+        longest = float(by_gps.max(initial=0))
+        return MeasurementFailure(
+            f"the camera moves too little: a tenth of the fixes span {longest:.1f} m at most, and {least:.1f} m, five "
+            "sigmas, are needed; gps.sigma_m may be smaller for a good receiver"
+        )
     ratios = by_gps[usable] / by_camera[usable]
     value = float(np.median(ratios))
     return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))
@@ -93,8 +98,13 @@ def align(fixes: GpsFixes, T_world_camera: FloatArray, stamps: FloatArray) -> Fl
     """``T_enu_world`` ``(4, 4)`` by the fixes, robustly; about a straight path by the camera's own up."""
     camera = fixes.antenna(T_world_camera, stamps)
     sigma = fixes.sigmas * fixes.widening
-    if np.ptp(fixes.points[:, :2], axis=0).max() < _LEAST_MOTION_SIGMAS * np.median(sigma[:, 0]):
-        return MeasurementFailure("the camera moves too little for GPS to tell its heading")
+    extent = float(np.ptp(fixes.points[:, :2], axis=0).max())
+    least = _LEAST_MOTION_SIGMAS * float(np.median(sigma[:, 0]))
+    if extent < least:
+        return MeasurementFailure(
+            f"the camera moves too little for GPS to tell its heading: {extent:.1f} m, and {least:.1f} m are needed "
+            "with these gps.sigma_m and gps.correlation_s"
+        )
     up_world = -T_world_camera[:, :3, 1].mean(axis=0)
     by_up = np.outer([0.0, 0.0, 1.0], up_world) / _UP_SIGMA**2
     precision = 1.0 / (sigma**2).mean(axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,9 @@ from slam.sequences.camera_file import DEFAULT_FPS
 
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
 _POLL_S = 0.01
+_WRITING_S = 1.0  # that an image may take to be written
+
+logger = logging.getLogger(__name__)
 
 
 class Source(Protocol):
@@ -53,16 +57,30 @@ class FolderSource:
         self.height, self.width = first.shape[:2]
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
-        """Every image once it is whole, in order of names; a name before the last one that was read is left out."""
+        """Every usable image, in order of names; a name before the last one that was read is left out."""
         count, last = 0, ""
         while not stopped.is_set():
             fresh = [name for name in self._names() if name > last]
             for name in fresh[:1]:
-                image = self._read(name, time.monotonic() + 1.0)
-                yield count / self.fps, image
+                image = self._usable(name)
+                if image is not None:
+                    yield count / self.fps, image
                 count, last = count + 1, name
             if not fresh:
                 time.sleep(_POLL_S)
+
+    def _usable(self, name: str) -> Image | None:
+        """An image of the size of the first once it is whole; others are named in a warning."""
+        try:
+            image = self._read(name, time.monotonic() + _WRITING_S)
+        except SequenceError as error:
+            logger.warning("%s; it is left out", error)
+            return None
+        height, width = image.shape[:2]
+        if (height, width) == (self.height, self.width):
+            return image
+        logger.warning("%s is %d x %d, not %d x %d; it is left out", name, width, height, self.width, self.height)
+        return None
 
     def _names(self) -> list[str]:
         try:
@@ -72,12 +90,13 @@ class FolderSource:
 
     @sequence_errors()
     def _read(self, name: str, deadline: float) -> Image:
-        """An image; one that is still being written is read again until ``deadline``."""
+        """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
         while True:
+            is_newest = self._names()[-1:] == [name]
             try:
                 return read_image(self._folder / name)
             except DataError:
-                if time.monotonic() > deadline:
+                if time.monotonic() > deadline or not is_newest:
                     raise
                 time.sleep(_POLL_S)
 

@@ -89,7 +89,8 @@ def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
         )
     elif mode is not None and lookup(metrics, "scale", "value")[0] is None:
         reason = lookup(metrics, "scale", "value")[1]
-        notes.append(f"No scale was found ({reason}): lengths are in the networks' own unit, not in metres.")
+        own = "camera heights" if mode in ("gps", "known", "reference") else "the networks' own unit"
+        notes.append(f"No scale was found ({reason}): lengths are in {own}, not in metres.")
     return notes
 
 

@@ -39,10 +39,12 @@ _TRUTHS = {
 
 
 def map_sizes(metrics: Metrics) -> Table | None:
-    """Every count of the map; None without one."""
+    """Every count of the map; None without one, and the reason alone where fusion was left out."""
     numbers, _ = lookup(metrics, "map")
     if numbers is None:
         return None
+    if numbers.get("triangles") is None:
+        return Table((), [], notes=notes_on([f"map: {lookup(numbers, 'triangles')[1]}"]))
     counted = ("triangles", "points", "blocks")
     keys = [key for key, value in numbers.items() if key in counted or isinstance(value, int)]
     names = [key.replace("_", " ") for key in keys]
@@ -73,7 +75,7 @@ def map_filters(metrics: Metrics) -> Table | None:
 def map_errors_table(metrics: Metrics) -> Table | None:
     """Errors of the map under both alignments, and by distance from the camera; None without a map."""
     numbers, _ = lookup(metrics, "map")
-    if numbers is None:
+    if numbers is None or numbers.get("triangles") is None:
         return None
     scaled, _ = lookup(numbers, "with_scale")
     truth, reason = lookup(numbers, "truth")
@@ -102,6 +104,7 @@ def map_error_figure(metrics: Metrics) -> Figure:
         _draw(left, bins, (("accuracy_median_m",), "median"), color="#0072b2", linestyle="-")
         _draw(left, bins, (("accuracy_90_m",), "90 %"), color="#e69f00", linestyle="--")
         left.set(xlabel="distance from the camera (m)", ylabel="distance to the true surface (m)", yscale="log")
+        left.yaxis.set_major_formatter("{x:g}")
         _draw(right, bins, (("completeness",), "completeness, 0.3 m"), color="#0072b2", linestyle="-")
         _draw(right, bins, (("f_score", "0.5"), "F-score, 0.5 m"), color="#e69f00", linestyle="--")
         _draw(right, bins, (("f_score", "0.2"), "F-score, 0.2 m"), color="#009e73", linestyle=":")

@@ -71,9 +71,9 @@ def number(metrics: Metrics, *path: str, decimals: int = 0) -> Cell:
 
 
 def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
-    """The key numbers: name, value and unit of each."""
+    """The key numbers that there are: name, value and unit of each."""
     best = ("trajectories", "optimised")
-    return [
+    wanted = [
         ("Position error", number(metrics, *best, "align", "7dof", "ate_rmse_m", decimals=2), "m, 7 dof"),
         ("Drift, t_rel", number(metrics, *best, *T_REL.path, decimals=2), "%"),
         ("Path", number(metrics, "sequence", "length_m"), "m"),
@@ -82,6 +82,7 @@ def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
         ("Loops accepted", number(metrics, "loops", "accepted"), ""),
         ("Map triangles", number(metrics, "map", "triangles"), ""),
     ]
+    return [(name, cell, unit) for name, cell, unit in wanted if cell.style != "missing"]
 
 
 def what_ran(metrics: Metrics) -> Table:
@@ -171,6 +172,8 @@ def errors(metrics: Metrics) -> Table | None:
 
 def alignments(metrics: Metrics) -> Table | None:
     """Every statistic of every trajectory under every alignment; None where nothing was evaluated."""
+    if no_errors(metrics):
+        return None
     rows: list[Sequence[Cell] | str] = []
     for name in TRAJECTORIES:
         place = ("trajectories", name, "align")

@@ -250,6 +250,16 @@ def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[
     assert code == 0 and re.search(r"^INTERPOLATED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
 
 
+def test_a_run_without_truth_has_no_table_of_dashes(
+    call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
+) -> None:
+    root = copy_of_kitti_root()
+    (root / "poses" / "sim.txt").unlink()
+    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--set", "mapping.enabled=false")
+    assert code == 0 and "sim, scale camera-height: no errors, for the sequence has no true poses" in out
+    assert "–" not in out and "14 frames in" in out
+
+
 def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:
     arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6", *QUICK]
     assert "LEAK" in call(*arguments)[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +62,12 @@ def test_a_sequence_that_cannot_be_opened_says_why(copy_of_kitti_root: Callable[
     (root / "sequences" / "sim" / "calib.txt").unlink()
     line = finding(examine(root), "sequence sim")
     assert line.startswith("missing") and "calib.txt" in line
+
+
+def test_a_camera_may_be_given(kitti_root: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(kitti_root / "sequences" / "sim" / "image_2", tmp_path / "walk" / "images").parent
+    assert "--camera fov=70" in finding(examine(folder), "sequence walk")
+    assert finding(examine(folder, Path("fov=70")), "sequence walk").startswith("ok")
 
 
 @pytest.mark.parametrize("path", ["nowhere", "."])

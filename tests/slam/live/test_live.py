@@ -84,6 +84,38 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     assert folder.metrics()["status"] == "ok"
 
 
+def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
+    street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    contents = [path.read_bytes() for path in sorted((street / "images").iterdir())]
+    contents[5] = contents[5][:2000]
+    contents[8] = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
+
+    def fill_and_vanish() -> None:
+        answered = 0
+        for number, content in enumerate(contents):
+            (target / ".partial").write_bytes(content)
+            (target / ".partial").rename(target / f"{number:06d}.png")
+            answered += number not in (5, 8)
+            while len(messages) < answered:
+                time.sleep(0.01)
+        target.rename(tmp_path / "unplugged")
+
+    Thread(target=fill_and_vanish, daemon=True).start()
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=30)
+    folder = run_live(request, messages.append)
+    *poses, last = messages
+    used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
+    assert [message["stamp"] for message in poses] == pytest.approx(used) == last["stamps"]
+    assert last["ended"].startswith("the source died") and "cannot be read any more" in last["ended"]
+    assert folder.metrics()["status"] == "ok" and folder.metrics()["sequence"]["frames"] == len(used)
+    said = caplog.text
+    assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
+
+
 class Scripted:
     """A source of small images that does what its script says: waits, or dies."""
 

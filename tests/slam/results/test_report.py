@@ -172,6 +172,7 @@ def test_without_reference_and_map_the_report_has_the_reasons(make_run: MakeRun,
     assert "this part is not built yet" in words
     assert "camera heights" in words
     assert html.count("<img") == 1
+    assert "Position error" not in words and "Every alignment" not in words, "no numbers that are dashes alone"
 
 
 def test_a_failed_run_has_its_reason(make_run: MakeRun) -> None:

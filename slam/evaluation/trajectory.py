@@ -78,7 +78,7 @@ def trajectory_metrics(
     snippet_metrics = _snippet_metrics(snippets)
     if snippets and _stands_still(T_world_reference):
         snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL)
-    elif snippets and _goes_backwards(T_world_estimate, T_world_reference):
+    elif snippets and snippet5 is None and _goes_backwards(T_world_estimate, T_world_reference):
         snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS)
     return {
         "snippet5": _record(snippet_metrics),

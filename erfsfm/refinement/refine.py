@@ -104,17 +104,22 @@ def _coarse_change(
 def _enlarged(change: Array, target: Appearance) -> Array:
     """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
     height, width = target.grey.shape
-    h, w = change.shape
-    rows, columns = (np.arange(height) - 1) // 2, (np.arange(width) - 1) // 2
+    changes, greys = (_doubled(part) for part in (change, target.coarse_grey))
     best, nearest = np.empty_like(target.grey), np.full_like(target.grey, np.inf)
-    for down in (0, 1):
-        for right in (0, 1):
-            at = np.clip(rows + down, 0, h - 1)[:, None], np.clip(columns + right, 0, w - 1)
-            apart = cv2.absdiff(target.coarse_grey[at], target.grey)
+    for top in (0, 2):
+        for left in (0, 2):
+            at = slice(top, top + height), slice(left, left + width)
+            apart = cv2.absdiff(greys[at], target.grey)
             closer = apart < nearest
-            np.copyto(best, change[at], where=closer)
+            np.copyto(best, changes[at], where=closer)
             np.copyto(nearest, apart, where=closer)
     return best
+
+
+def _doubled(part: Array) -> Array:
+    """Each pixel ``(h, w)`` four times, with a border of one before and two behind."""
+    twice = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.copyMakeBorder(twice, 1, 2, 1, 2, cv2.BORDER_REPLICATE))
 
 
 def _gauss_newton(

@@ -79,8 +79,9 @@ def _through_open3d(ply: Ply, change: Any) -> Ply:
     vector = o3d.utility.Vector3dVector
     colours = np.full(ply.points.shape, _GREY, np.uint8) if ply.colours is None else ply.colours
     is_mesh = ply.triangles is not None
-    if is_mesh:
-        source = o3d.geometry.TriangleMesh(vector(ply.points), o3d.utility.Vector3iVector(ply.triangles))
+    if ply.triangles is not None:
+        corners = o3d.utility.Vector3iVector(ply.triangles.astype(np.int32))  # others are converted one by one
+        source = o3d.geometry.TriangleMesh(vector(ply.points), corners)
         source.vertex_colors = vector(colours / 255.0)
     else:
         source = o3d.geometry.PointCloud(vector(ply.points))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.se3 import FloatArray, invert
 
 Mask = NDArray[np.bool_]
+_OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
 FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement")
 
@@ -68,7 +70,7 @@ class DepthFilters:
         left = everything
         for number, mask in enumerate(masks):
             remaining = left & mask
-            self._taken[number] += (left.sum() - remaining.sum()) / depth.size
+            self._taken[number] += (np.count_nonzero(left) - np.count_nonzero(remaining)) / depth.size
             left = remaining
         self._frames += 1
         return np.where(left, depth, np.float32(0))
@@ -79,18 +81,15 @@ class DepthFilters:
             return view.depth
         return np.where(view.relative_sigma <= self._config.max_relative_sigma, view.depth, np.float32(0))
 
-    def projected(self, view: DepthView, other: DepthView, stride: int = 1) -> tuple[NDArray[np.int64], DepthMap]:
-        """For every ``stride``-th pixel of a view its flat pixel in the other, -1 outside, and its depth there."""
-        camera = self._camera
+    def projected(self, view: DepthView, other: DepthView) -> tuple[DepthMap, DepthMap, DepthMap]:
+        """Columns, rows and depth ``(H, W)`` of a view's pixels in the other; unknown ones lie outside of it."""
         T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
-        points = (self._rays * view.depth.ravel())[:, ::stride]
-        x, y, z = T_other_camera[:3, :3] @ points + T_other_camera[:3, 3:]
-        ahead = (z > 1e-3) & (points[2] > 0)
-        before = np.where(ahead, z, np.float32(np.inf))
-        u = np.rint(np.float32(camera.fx) * (x / before) + np.float32(camera.cx))
-        v = np.rint(np.float32(camera.fy) * (y / before) + np.float32(camera.cy))
-        inside = ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        return np.where(inside, v * camera.width + u, -1).astype(np.int64), z
+        K = self._camera.K.astype(np.float32)
+        turned, moved = K @ T_other_camera[:3, :3] @ self._rays, K @ T_other_camera[:3, 3]
+        x, y, z = (row.reshape(view.depth.shape) * view.depth + m for row, m in zip(turned, moved, strict=True))
+        ahead = (z > 1e-3) & (view.depth > 0)
+        before = np.where(ahead, z, np.float32(1))
+        return np.where(ahead, x / before, np.float32(_OUTSIDE)), y / before, z
 
     def _is_sky(self, image: Image) -> Mask:
         """Bright or blue pixels ``(H, W)`` above the horizon of a level camera, in one piece with the upper border.
@@ -99,18 +98,25 @@ class DepthFilters:
         """
         config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
         sky = np.zeros(image.shape[:2], dtype=bool)
-        red, _, blue = (each.astype(np.int16) for each in np.moveaxis(image[:horizon], 2, 0))
+        red, green, blue = (each.astype(np.int16) for each in cv2.split(image[:horizon]))
         is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
-        sky[:horizon] = (image[:horizon].min(axis=2) >= config.sky_brightness) | is_blue
-        _, piece = cv2.connectedComponents(sky.view(np.uint8), connectivity=4)
-        return sky & np.isin(piece, piece[: self._top_rows][sky[: self._top_rows]])
+        sky[:horizon] = (cv2.min(cv2.min(red, green), blue) >= config.sky_brightness) | is_blue
+        pieces, piece = cv2.connectedComponents(sky.view(np.uint8), connectivity=4)
+        is_above = np.zeros(pieces, dtype=bool)
+        is_above[piece[: self._top_rows]] = True
+        found: Mask = sky & is_above[piece]
+        return found
 
     def _agrees(self, view: DepthView, other: DepthView) -> Mask:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
-        pixel, z = self.projected(view, other)
-        there = self.trusted(other).ravel()[pixel]
-        agrees = (pixel >= 0) & (np.abs(there - z) < self._config.consistency * z)
-        return np.asarray(agrees.reshape(view.depth.shape))
+        u, v, z = self.projected(view, other)
+        there = sampled(self.trusted(other), u, v)
+        return np.asarray(np.abs(there - z) < np.float32(self._config.consistency) * z)
+
+
+def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:
+    """The pixels of an image nearest to columns and rows ``(H, W)``, 0 outside of it."""
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
 
 
 def _at_edges(depth: DepthMap, max_step: float) -> Mask:

@@ -72,9 +72,7 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     Those of at most 100 edges whose vertices look upwards in the mean; ``upwards`` ``(V,)`` are cosines.
     """
     vertices = len(upwards)
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    there, back = edges[:, 0] * vertices + edges[:, 1], edges[:, 1] * vertices + edges[:, 0]
-    begin, end = edges[~np.isin(there, back)].T
+    begin, end = _open_edges(triangles, vertices)
     simple = _once(begin, vertices) & _once(end, vertices)
     link = coo_array((np.ones(len(begin), dtype=bool), (begin, end)), shape=(vertices, vertices))
     _, label = connected_components(link, directed=False)
@@ -90,6 +88,18 @@ def _rings(triangles: Triangles, upwards: FloatArray) -> list[NDArray[np.int64]]
     chosen = begin[~broken[label[begin]]]
     _, first = np.unique(label[chosen], return_index=True)
     return [_walk(following, int(start)) for start in chosen[np.sort(first)]]
+
+
+def _open_edges(triangles: Triangles, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Begins and ends of the edges of one triangle alone, in its direction."""
+    begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    low, high = np.minimum(begin, end), np.maximum(begin, end)
+    codes = np.sort(2 * (low * vertices + high) + (begin > end))  # sorting numbers alone is fast
+    is_new = np.concatenate([[True], codes[1:] // 2 != codes[:-1] // 2, [True]])
+    codes = codes[is_new[1:] & is_new[:-1]]
+    low, high = np.divmod(codes // 2, vertices)
+    is_down = codes % 2 == 1
+    return np.where(is_down, high, low), np.where(is_down, low, high)
 
 
 def _once(ends: NDArray[np.int64], vertices: int) -> Mask:

@@ -30,7 +30,8 @@ class Patch:
     def normals(self) -> FloatArray:
         """Unit normals ``(V, 3)``: means of the triangles around each vertex, by their area."""
         o3d = import_open3d()
-        vertices, triangles = o3d.utility.Vector3dVector(self.vertices), o3d.utility.Vector3iVector(self.triangles)
+        vertices = o3d.utility.Vector3dVector(self.vertices)
+        triangles = o3d.utility.Vector3iVector(self.triangles.astype(np.int32))  # others are converted one by one
         return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
 
 

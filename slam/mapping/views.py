@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.mapping.filters import DepthFilters, DepthView
+from slam.mapping.filters import DepthFilters, DepthView, sampled
 from slam.se3 import FloatArray, invert, rotation_angle
 
 _STEP_M = 2.0
@@ -74,9 +74,9 @@ class ViewChooser:
 
     def _brightness_step(self, view: DepthView, before: DepthView) -> float:
         """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
-        pixel, z = self._filters.projected(view, before, _STRIDE)
-        same = (pixel >= 0) & (np.abs(before.depth.ravel()[pixel] - z) < _SAME_SURFACE * z)
-        here, there = _grey(view.image).ravel()[::_STRIDE][same], _grey(before.image).ravel()[pixel[same]]
+        u, v, z = self._filters.projected(view, before)
+        same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z
+        here, there = (grey[same][::_STRIDE] for grey in (_grey(view.image), sampled(_grey(before.image), u, v)))
         usable = (np.minimum(here, there) > _DARK) & (np.maximum(here, there) < _BRIGHT)
         if usable.sum() < _LEAST_SHARED:
             return float("nan")

@@ -40,7 +40,9 @@ class MapMesh:
             coarse = _clustered(lambda: iter([self.points]), self.colours, iter([self.triangles]), cell)
         o3d = import_open3d()
         vector = o3d.utility.Vector3dVector
-        mesh = o3d.geometry.TriangleMesh(vector(coarse.points), o3d.utility.Vector3iVector(coarse.triangles))
+        mesh = o3d.geometry.TriangleMesh(
+            vector(coarse.points), o3d.utility.Vector3iVector(coarse.triangles.astype(np.int32))
+        )
         mesh.vertex_colors = vector(coarse.colours / 255.0)
         mesh = mesh.simplify_quadric_decimation(triangles)
         mesh.remove_degenerate_triangles().remove_unreferenced_vertices()

@@ -16,9 +16,15 @@ Fidelity = Annotated[Literal["default", "paper"], typer.Option(help="paper: exac
 
 
 def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:
-    """A row a line, or JSON."""
+    """A table with a row a line and the keys as its head, numbers to the right; or JSON."""
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
         return
-    for row in rows:
-        typer.echo("  ".join(f"{k} {v:.4f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+    columns = []
+    for key in dict.fromkeys(key for row in rows for key in row):
+        values = [row.get(key, "-") for row in rows]
+        cells = [key, *(f"{value:.4f}" if isinstance(value, float) else str(value) for value in values)]
+        width = max(map(len, cells))
+        columns.append([cell.ljust(width) if isinstance(values[0], str) else cell.rjust(width) for cell in cells])
+    for line in zip(*columns):
+        typer.echo("  ".join(line).rstrip())

@@ -62,6 +62,8 @@ def _checked(words: Sequence[str], name: str) -> list[str]:
 def _explained(error: Exception) -> str:
     if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
         return OUT_OF_MEMORY
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return one_line(f"{error.filename}: {error.strerror}: check the path")
     if isinstance(error, OneLineError | OSError):
         return one_line(str(error))
     place = traceback.extract_tb(error.__traceback__)[-1]

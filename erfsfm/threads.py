@@ -1,12 +1,17 @@
-"""How many threads libraries may start, without importing torch."""
+"""How many threads libraries may start, and the memory that they work in, without importing torch."""
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import cv2
+import numpy as np
 from threadpoolctl import threadpool_limits
+
+_LINEAR_ALGEBRA_BYTES = 192 * 2**20
+_LARGE_MATRIX = 64  # rows; smaller ones are decomposed without it
 
 
 @contextmanager
@@ -21,6 +26,19 @@ def single_threaded_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(threads)
+
+
+def take_working_memory() -> None:
+    """Let OpenCV's linear algebra take its memory now: later, where none is left, it would end the process.
+
+    Raises:
+        MemoryError: there is not enough.
+    """
+    try:
+        mmap.mmap(-1, _LINEAR_ALGEBRA_BYTES).close()
+    except OSError as error:
+        raise MemoryError from error
+    cv2.SVDecomp(np.random.default_rng(0).normal(size=(_LARGE_MATRIX, _LARGE_MATRIX)))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import numpy as np
 
 from erfsfm.errors import ErfsfmError
 from erfsfm.signals import Terminated
-from erfsfm.threads import limit_library_threads
+from erfsfm.threads import limit_library_threads, take_working_memory
 from slam.config import SlamConfig, dump_yaml
 from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics
@@ -75,6 +75,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
     try:
         log.begin(folder.path / LOG)
         with limit_library_threads():
+            take_working_memory()
             _run(job, folder)
     except BaseException as error:
         ignore_signals()

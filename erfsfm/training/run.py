@@ -155,6 +155,7 @@ def _fit(
             warnings.simplefilter("ignore", PossibleUserWarning)
             warnings.filterwarnings("ignore", message=".*isinstance.treespec.*")
             warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")
+            warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
     except DataError as error:

@@ -27,7 +27,9 @@ def calibrate(
     marker_share: Annotated[
         float, typer.Option(min=0.1, max=0.99, help="side of a marker over that of a square")
     ] = 0.75,
-    fps: Annotated[float | None, typer.Option(min=1e-3, help="to write; default: that of the video, or 10")] = None,
+    fps: Annotated[
+        float | None, typer.Option(min=1e-3, max=1e4, help="to write; default: that of the video, or 10")
+    ] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:

@@ -40,6 +40,7 @@ _FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof
 _NO_REFERENCE = "there is no reference trajectory"
 _NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no error to measure"
 _BACKWARDS = "the best scale is negative: the estimate goes the other way"
+_OPPOSITE = -0.9  # cosine between the positions of snippets
 _REFERENCE_STANDS_STILL = "the reference does not move, so scaling would hide every error"
 
 
@@ -78,6 +79,8 @@ def trajectory_metrics(
     snippet_metrics = _snippet_metrics(snippets)
     if snippets and _stands_still(T_world_reference):
         snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL)
+    elif snippets and snippet5 is None and _goes_backwards(T_world_estimate, T_world_reference):
+        snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS)
     return {
         "snippet5": _record(snippet_metrics),
         "align": {name: _record(metrics) for name, metrics in ours.items()},
@@ -234,6 +237,13 @@ def _cut_snippets(T_world_estimate: FloatArray, T_world_reference: FloatArray) -
         return None
     predicted = snippets_from_trajectory(T_world_estimate, SNIPPET_LENGTH)
     return snippet_errors(predicted, snippets_from_trajectory(T_world_reference, SNIPPET_LENGTH))
+
+
+def _goes_backwards(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> bool:
+    """Whether snippets point against the true ones, which a negative scale would take for a good fit."""
+    trajectories = T_world_estimate, T_world_reference
+    p, g = (snippets_from_trajectory(T, SNIPPET_LENGTH)[..., :3, 3] for T in trajectories)
+    return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
 def _snippet_metrics(errors: SnippetErrors | None) -> dict[str, Metric]:

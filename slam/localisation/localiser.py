@@ -15,6 +15,7 @@ from erfsfm.readers.camera_file import CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images, read_image
 from erfsfm.readers.numbering import by_name
+from erfsfm.threads import take_working_memory
 from slam.config import LoopsConfig, load_stored
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
@@ -75,6 +76,7 @@ def localise(
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
     own_camera = _camera_file(camera, paths)
+    take_working_memory()
     localiser = Localiser(
         places,
         load_stored(run.path / "config.yaml", "loops").loops,

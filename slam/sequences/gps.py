@@ -17,6 +17,9 @@ from slam.se3 import FloatArray
 
 _COLUMNS = ("stamp", "latitude", "longitude", "altitude")
 _DAY_S = 86400.0
+_EARTH_RADIUS_M = 6.371e6
+_FASTEST_M_S = 300.0
+_LEAST_FIXES = 3  # one step may be an error of one fix
 _MOST = np.array([90.0, 180.0, 1e5])
 
 
@@ -46,7 +49,22 @@ def read_gps(path: Path) -> GpsTrack:
     if (np.diff(stamps) <= 0).any():
         row = int(np.argmax(np.diff(stamps) <= 0)) + 2
         raise SequenceError(f"{path}: the stamp of fix {row} does not follow that of the one before: sort the file")
+    _require_possible_speed(table, path)
     return GpsTrack(stamps, table[:, 1:4], table[:, 4])
+
+
+def _require_possible_speed(table: FloatArray, path: Path) -> None:
+    """Refuse fixes that move faster than anything on the road, most of them: another column, unit or clock."""
+    if len(table) < _LEAST_FIXES:
+        return
+    angles = np.deg2rad(table[:, 1:3])
+    steps = np.diff(angles, axis=0)
+    steps[:, 1] *= np.cos(angles[1:, 0])
+    speeds = _EARTH_RADIUS_M * np.linalg.norm(steps, axis=1) / np.diff(table[:, 0])
+    if np.median(speeds) > _FASTEST_M_S:
+        raise SequenceError(
+            f"{path}: its fixes move at {np.median(speeds):.0f} m/s: check its columns, and that stamps are seconds"
+        )
 
 
 def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:

@@ -55,7 +55,7 @@ def raising(error: Exception) -> Callable[[object], object]:
     "error, line",
     [
         (DataError("two\nlines"), "program: two lines"),
-        (FileNotFoundError(2, "No such file", "a"), "program: [Errno 2] No such file: 'a'"),
+        (FileNotFoundError(2, "No such file", "a"), "program: a: No such file: check the path"),
         (MemoryError(), "program: memory ran out"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: not enough memory"), "program: memory ran out"),
         (RuntimeError("can't start new thread"), "program: memory ran out"),

@@ -195,6 +195,7 @@ def test_the_other_way_has_no_scale() -> None:
     metrics = trajectory_metrics(trajectory(line(20, -1.0)), trajectory(line(20)))
     check_shape(metrics)
     assert "the other way" in metrics["align"]["scale"]["ate_rmse_m_reason"]
+    assert metrics["snippet5"]["ate_mean"] is None and "the other way" in metrics["snippet5"]["ate_mean_reason"]
 
 
 @pytest.mark.parametrize("rows", [1, 2, 4])

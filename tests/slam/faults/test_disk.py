@@ -281,16 +281,21 @@ main()
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="memory in use is read from /proc")
-def test_memory_that_runs_out_is_one_line(tmp_path: Path, tiny_weights: Path) -> None:
+@pytest.mark.parametrize("verb", ["predict", "localize"])
+def test_memory_that_runs_out_is_one_line(
+    tmp_path: Path, tiny_weights: Path, kitti_root: Path, whole: Path, verb: str
+) -> None:
     import cv2
     import numpy as np
 
     cv2.imwrite(str(tmp_path / "wide.png"), np.zeros((4000, 6000, 3), np.uint8))
     words = ["erfsfm", "predict", tmp_path / "wide.png", "--weights", tiny_weights, "--output", tmp_path / "depth"]
+    if verb == "localize":
+        words = ["slam", "localize", kitti_root / "sequences/sim/image_2", "--map", whole]
     ended = subprocess.run(
         [sys.executable, "-c", LIMITED, str(2**26), *map(str, words)], capture_output=True, text=True, check=False
     )
-    lines = [line for line in ended.stderr.splitlines() if line.startswith("erfsfm: ")]
+    lines = [line for line in ended.stderr.splitlines() if line.startswith(("erfsfm: ", "erfsfm-slam: "))]
     assert (ended.returncode, len(lines)) == (1, 1), ended.stderr
     assert "Traceback" not in ended.stderr
 

@@ -52,6 +52,7 @@ def test_a_wrong_checksum_is_left_out(tmp_path: Path) -> None:
         ("stamp,latitude,longitude,altitude\n0,95,8,100\n", "row 2 is no GPS fix"),
         ("stamp,latitude,longitude,altitude\n0,x,8,100\n", "row 2 is no GPS fix"),
         ("stamp,latitude,longitude,altitude\n1,49,8,100\n1,49,8,100\n", "fix 2 does not follow"),
+        ("stamp,latitude,longitude,altitude\n1,49,8,100\n2,50,8,100\n3,51,8,100\n", "fixes move at 11119[45] m/s"),
         ("$GPGGA,123519,48x07.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,", "row 1 is no GPS fix"),
     ],
 )

@@ -133,7 +133,7 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
     """Undistorted images and their pinhole camera.
 
     Raises:
-        SequenceError: if the images have another size than the camera.
+        SequenceError: if the images have another size than the camera, or its lens cannot be undistorted.
     """
     if (images.width, images.height) != (camera.width, camera.height):
         raise SequenceError(
@@ -143,7 +143,10 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
         )
     if not camera.is_distorted:
         return images, Intrinsics.of(camera.pinhole)
-    undistortion = Undistortion(camera)
+    try:
+        undistortion = Undistortion(camera)
+    except SequenceError as error:
+        raise SequenceError(f"{where}: {error}") from error
     return UndistortedImages(images, undistortion), undistortion.intrinsics
 
 

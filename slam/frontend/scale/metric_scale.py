@@ -14,7 +14,7 @@ import numpy as np
 from slam.config import LengthConfig, LidarConfig, ScaleConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.road_homography import RoadStep, level_on_average
+from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
@@ -80,12 +80,11 @@ def find_scale(
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps)."""
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in measured.lidar_steps}
-    road_steps = level_on_average(measured.road_steps)
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
-        height = _height_by_lidar(metres, road_steps) or camera_height_m
+        height = _height_by_lidar(metres, measured.road_steps) or camera_height_m
     unit = 1.0 if height is None else height
-    absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in road_steps.items()}
+    absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in measured.road_steps.items()}
     if mode == "lidar":
         absolute |= {
             ends: (length, lidar.translation_sigma_m / length) for ends, length in metres.items() if length > 0

@@ -11,7 +11,7 @@ from slam import se3
 from slam.config import RoadConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.road_homography import RoadHomography, RoadStep, level_on_average
+from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = RoadConfig()
@@ -77,22 +77,17 @@ def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch
     assert CONFIG.relative_sigma <= road.relative_sigma < 2 * CONFIG.relative_sigma
 
 
-def test_the_mean_tilt_that_alignment_finds_on_a_level_road_does_not_shorten_a_drive(texture):
-    steps = {}
-    for k in range(32):
+def test_lengths_are_right_on_average(texture):
+    """The alignment alone makes them 1 % short."""
+    ratios = []
+    for k in range(16):
         T_road_camera = se3.make(np.eye(3), np.array([3.7 * k, 0.0, 11.3 * k % 20]))
-        ahead = se3.make(np.eye(3), np.array([0.0, 0.0, 0.6]))
+        ahead = se3.make(np.eye(3), np.array([0.0, 0.0, 0.6 if k % 2 else 1.1]))
         frames = [render(T, texture, index) for index, T in enumerate((T_road_camera, T_road_camera @ ahead))]
-        measured = RoadHomography(CONFIG, CAMERA).measure(*frames, ahead)
-        assert isinstance(measured, RoadStep)
-        steps[k, k + 1] = measured
-    few = dict(list(steps.items())[:10])
-    assert level_on_average(few) == few, "the mean of a few steps may be real"
-    raw, levelled = (
-        np.mean([step.length_heights * HEIGHT_M / 0.6 - 1.0 for step in each.values()])
-        for each in (steps, level_on_average(steps))
-    )
-    assert abs(levelled) < 0.004 < 0.008 < abs(raw)
+        road = RoadHomography(CONFIG, CAMERA).measure(*frames, ahead)
+        assert isinstance(road, RoadStep)
+        ratios.append(road.length_heights * HEIGHT_M / ahead[2, 3])
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.005)
 
 
 def test_a_car_ahead_does_not_shorten_the_step(texture):

@@ -33,16 +33,16 @@ class Measured:
 
 
 KITTI = (
-    Measured("00", "sim", 0.218, 0.311, 0.945),
+    Measured("00", "sim", 0.213, 0.323, 0.947),
     Measured("02", "default", 0.367, 0.836, 0.427),
 )
 MORE_KITTI = (
     Measured("00", "default", 0.184, 0.208, 0.940),
-    Measured("02", "sim", 0.360, 0.535, 0.332),
-    Measured("05", "sim", 0.213, 0.443, 0.501),
-    Measured("05", "default", 0.316, 0.477, 0.453),
+    Measured("02", "sim", 0.329, 0.500, 0.373),
+    Measured("05", "sim", 0.208, 0.233, 0.483),
+    Measured("05", "default", 0.344, 0.387, 0.450),
 )
-LOOP = (Measured("loop", "sim", 0.136, 0.538, 0.186), Measured("loop", "default", 0.149, 0.338, 0.156))
+LOOP = (Measured("loop", "sim", 0.139, 0.291, 0.217), Measured("loop", "default", 0.149, 0.338, 0.156))
 LOOPS_CLOSED = 43
 
 

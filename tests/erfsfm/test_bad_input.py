@@ -186,7 +186,7 @@ def test_a_video_of_another_resolution(refusal: Refusal, tmp_path: Path, trip: P
 def test_a_video_without_camera(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
     (trip / "camera.yaml").unlink()
     error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "images or a video with camera.yaml; found drive.mp4" in error
+    assert "images or a video with camera.yaml, or a pack (pack.yaml); found drive.mp4" in error
 
 
 def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:

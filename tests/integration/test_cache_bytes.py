@@ -55,6 +55,7 @@ def contents(run: RunFolder) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_a_warm_cache_measures_nothing_and_leaves_the_same_bytes(tmp_path: Path, calls: Counter[str]) -> None:
     cache = tmp_path / "cache"
     files: dict[str, dict[str, bytes]] = {}

@@ -257,7 +257,7 @@ def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
     plain, cold = run("plain", cache=None), run("cold")
     for name in ("disparity", "poses"):
         monkeypatch.setattr(slam.run.DepthPosePredictor, name, forbidden)
-    for name in ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat", "remap"):
+    for name in ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat"):
         monkeypatch.setattr(cv2, name, forbidden)
     warm = run("warm")
     names = sorted(path.name for path in plain.path.iterdir())

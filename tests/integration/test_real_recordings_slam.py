@@ -23,6 +23,7 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_the_map_of_a_drive_against_its_scans(
     data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
 ) -> None:

@@ -37,5 +37,6 @@ def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_seeds_on_kitti(tmp_path: Path, data_root: Path) -> None:
     check_seeds(tmp_path, data_root / "kitti_odometry", "00", "0:30", 0.189)

@@ -132,6 +132,7 @@ def steps(path: Path) -> FloatArray:
     return se3.invert(T_world_camera[:-1]) @ T_world_camera[1:]
 
 
+@pytest.mark.slow
 def test_rotations_of_the_shipped_networks_follow_the_road(
     learned: Path, check_run: Callable[[Path], dict[str, Any]]
 ) -> None:

@@ -99,6 +99,7 @@ def test_it_runs(installed: Installed, tmp_path: Path, check_run: Callable[[Path
     assert metrics["sequence"]["frames"] == 40 and metrics["map"]["triangles"] > 1000
 
 
+@pytest.mark.slow
 def test_it_trains_by_name(installed: Installed, tmp_path: Path) -> None:
     assert {row["name"] for row in json.loads(installed.run(tmp_path, "erfsfm", "networks", "--json"))} >= {"depthnet"}
     size = ("--route", "straight", "--frames", 12, "--width", 208, "--height", 64)

@@ -366,6 +366,7 @@ def test_the_command_has_all_options_but_no_paths_and_hosts(benchmark: ModuleTyp
     assert command.endswith("--conditions clean --excerpt 0:9 --seeds 0 1 2 --device cpu")
 
 
+@pytest.mark.slow
 def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) -> None:
     words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
     words += ["--weights", "sim", "nonesuch", "--set", "mapping.enabled=false", "--output", str(tmp_path / "out")]

@@ -742,7 +742,8 @@ def free_port() -> int:
         return int(each.getsockname()[1])
 
 
-@pytest.mark.parametrize(("spread", "workers"), [pytest.param("devices", 1, marks=pytest.mark.slow), ("nodes", 0)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("spread", "workers"), [("devices", 1), ("nodes", 0)])
 def test_two_processes_are_one_with_twice_the_batch(
     small: Small, world: Path, held_out: Path, tmp_path: Path, spread: str, workers: int
 ) -> None:

@@ -53,7 +53,7 @@ def ate(result: SlamResult, name: str) -> float:
     return float(trajectory_metrics(getattr(result, name), result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
-@pytest.mark.parametrize("seed", [610, 611])
+@pytest.mark.parametrize("seed", [610, pytest.param(611, marks=pytest.mark.slow)])
 def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
     sequence = drive("loop", 250, seed)
     result = run(sequence, "loops.frame_stride=3")

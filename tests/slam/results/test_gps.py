@@ -41,6 +41,7 @@ def test_a_run_without_a_track_says_so(kitti_root: Path, tiny_weights: Path, tmp
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
     """Fixes with 0.2 m of noise added give a metric scale without the road, and hold the heading."""
     drive = data_root / DRIVE

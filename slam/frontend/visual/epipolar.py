@@ -77,6 +77,30 @@ def _in_front(E: FloatArray, rays_previous: FloatArray, rays_current: FloatArray
     return max(unit_poses, key=in_front_of_both)
 
 
+def unit_poses_by_homography(
+    rays_previous: FloatArray, rays_current: FloatArray, tolerance: float, seed: int = 0
+) -> list[UnitRelativePose]:
+    """The motions, at most two, by which a plane explains the matched rays ``(M, 3)`` with z = 1, within ``tolerance``.
+
+    The plane must lie in front of both cameras where its inliers see it.
+    """
+    order = ransac_order(len(rays_previous), seed)
+    rays_previous, rays_current = rays_previous[order], rays_current[order]
+    cv2.setRNGSeed(seed)
+    H, mask = cv2.findHomography(
+        rays_previous[:, :2].copy(), rays_current[:, :2].copy(), cv2.USAC_MAGSAC, tolerance, maxIters=1000
+    )
+    if H is None or int(mask.sum()) < _LEAST_POINTS:
+        return []
+    inliers = rays_previous[mask.ravel().astype(bool)]
+    _, rotations, translations, normals = cv2.decomposeHomographyMat(H, np.eye(3))
+    return [
+        UnitRelativePose(R, t.ravel() / np.linalg.norm(t))
+        for R, t, normal in zip(rotations, translations, normals, strict=True)
+        if np.linalg.norm(t) > 0 and np.median(inliers @ normal) > 0
+    ]
+
+
 def unit_pose_by_pnp(
     rays_previous: FloatArray, rays_current: FloatArray, depth_previous: FloatArray, tolerance: float, seed: int = 0
 ) -> UnitRelativePose | None:

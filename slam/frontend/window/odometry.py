@@ -15,16 +15,11 @@ from numpy.typing import NDArray
 
 from slam.config import WindowConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
-from slam.frontend.visual.epipolar import (
-    depth_in_current,
-    parallax_px,
-    rotation_between,
-    triangulated_depth,
-    unit_pose_by_essential,
-)
+from slam.frontend.visual.epipolar import parallax_px, rotation_between
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.window.descriptors import describe
 from slam.frontend.window.flow import Pixels, flow, new_corners
+from slam.frontend.window.initialisation import View, first_points
 from slam.frontend.window.local_map import (
     CORNER_QUALITY,
     FORWARD_BACKWARD_PX,
@@ -33,14 +28,11 @@ from slam.frontend.window.local_map import (
     TrackIds,
     WindowKeyframe,
 )
-from slam.se3 import FloatArray, invert, make
+from slam.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
 
-_LEAST_START = 40
 _LEAST_START_TRACKS = 60
-_START_PX = 1.0
-_START_PARALLAX_PX = 4.0
 _START_KEYFRAMES = 3
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
@@ -205,19 +197,14 @@ class WindowOdometry:
         unexplained = parallax_px(rays_first, rays, rotation_between(rays_first, rays), intrinsics)
         if np.median(unexplained) < _START_PARALLAX_RATIO * intrinsics.width:
             return
-        motion = unit_pose_by_essential(rays_first, rays, _START_PX / intrinsics.fx, self._seed)
-        if motion is None:
+        between = [_common(track_ids, each) for each in _spread(segment.frames[:-1])]
+        found = first_points(rays_first, pixels, between, intrinsics, self._seed)
+        if found is None:
             return
-        depth = triangulated_depth(rays_first, rays, motion)
-        parallax = parallax_px(rays_first, rays, motion.R_current_previous, intrinsics)
-        solid = (depth > 0) & (depth_in_current(rays_first, depth, motion) > 0) & (parallax > _START_PARALLAX_PX)
-        if solid.sum() < _LEAST_START or solid.mean() < 0.5:
-            return
-        unit = float(np.median(depth[solid]))
-        segment.map.points[track_ids[solid]] = rays_first[solid] * (depth[solid] / unit)[:, None]
+        segment.map.points[track_ids[found.solid]] = found.points[found.solid]
         segment.started = True
-        self._note(frame.index, "map begun", support=int(solid.sum()))
-        self._state.T_camera_world = make(motion.R_current_previous, motion.direction / unit)
+        self._note(frame.index, "map begun", support=int(found.solid.sum()))
+        self._state.T_camera_world = found.T_current_first
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
 
@@ -291,9 +278,7 @@ class WindowOdometry:
 
     def _add_first_keyframes(self, segment: Segment) -> None:
         """Some of the frames between the first two keyframes: more views of the first points."""
-        between = segment.frames[:-1]
-        chosen = np.linspace(0, len(between) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
-        for frame in (between[row] for row in np.unique(chosen) if between):
+        for frame in _spread(segment.frames[:-1]):
             known = segment.map.known(frame.track_ids)
             if known.sum() < MIN_POINTS:
                 continue
@@ -314,3 +299,15 @@ class WindowOdometry:
     def _tracked(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         last = len(segment.map.keyframes) - 1
         return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world, last)
+
+
+def _spread(frames: list[TrackedFrame]) -> list[TrackedFrame]:
+    """Some of these frames, evenly spread, neither the first nor the last."""
+    chosen = np.linspace(0, len(frames) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
+    return [frames[row] for row in np.unique(chosen) if frames]
+
+
+def _common(track_ids: TrackIds, frame: TrackedFrame) -> View:
+    """Rows of those corners that a frame sees, and their pixels there."""
+    _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
+    return rows, frame.pixels[seen]

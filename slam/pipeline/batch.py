@@ -304,7 +304,7 @@ class SlamPipeline:
         config, sequence = self._config, self._sequence
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
         with self._watch.stage("scale"):
-            scale = find_scale(mode, sequence.camera_height_m, measured, config.scale, config.lengths, config.lidar)
+            scale = find_scale(mode, sequence.camera_height_m, measured, config.lengths, config.lidar)
             if mode not in ("reference", "known", "gps"):
                 return scale
             T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)
@@ -316,11 +316,11 @@ class SlamPipeline:
         unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
         positioning = self._positioning(mode)
         if mode == "reference" and sequence.reference is not None:
-            unit = scale_from_reference(T_odometry, sequence.reference, config)
+            unit = scale_from_reference(T_odometry, sequence.reference)
         elif mode == "known":
             unit = scale_from_distance(T_odometry, sequence.stamps, config)
         elif positioning is not None:
-            unit = positioning.scale(T_odometry, config)
+            unit = positioning.scale(T_odometry)
         if isinstance(unit, MeasurementFailure):
             logger.warning("no scale (%s): lengths stay in camera heights", unit.reason)
         return unit

@@ -75,7 +75,8 @@ def load_config(
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
         shipped: folders of named configurations, the first one that has a name wins.
         old_names: of earlier releases.
-        sections: of the file that are read, the others keep their defaults; None for all of them.
+        sections: of the file that are read, without keys that are unknown now; the others keep their defaults. None
+            for all sections, and no unknown key.
 
     Raises:
         ConfigError: one line that names the key and the file or override, what came and what is allowed.
@@ -87,7 +88,8 @@ def load_config(
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), _read_tree(path)
         if sections is not None:
-            tree = {name: tree[name] for name in sections if name in tree}
+            known = set(_known_keys(model))
+            tree = {name: _only(tree[name], name, known) for name in sections if name in tree}
         old_names.refuse(tree, origin)
     for text in overrides:
         change: dict[str, Any] = {}
@@ -155,6 +157,12 @@ def _read_tree(path: Path) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
     return tree
+
+
+def _only(section: Any, name: str, known: Collection[str]) -> Any:
+    if not isinstance(section, dict):
+        return section
+    return {key: value for key, value in section.items() if f"{name}.{key}" in known}
 
 
 def _override(tree: dict[str, Any], text: str) -> None:

@@ -100,34 +100,18 @@ class LoopsConfig(Section):
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
     max_features: int = Field(default=500, ge=50, le=5000, description="largest number of corners kept of a frame")
-    corner_contrast: int = Field(default=10, ge=1, le=100, description="least contrast of a corner, grey levels")
-    max_depth_heights: float = Field(default=30.0, gt=0, description="largest depth used, in camera heights")
     words: int = Field(default=1000, ge=10, le=20000, description="size of the binary vocabulary learned on the run")
     min_gap_frames: int = Field(default=30, ge=1, description="least distance of the two frames of a loop, frames")
     min_path_m: float = Field(
         default=15.0, ge=0, description="least distance of the two frames of a loop along the path"
     )
-    candidates_per_frame: int = Field(
-        default=2, ge=1, le=20, description="largest number of places verified for a frame"
-    )
-    peak_frames: int = Field(default=10, ge=0, description="least distance between candidate places, frames")
-    min_score: float = Field(
-        default=0.2, ge=0, description="least retrieval score, relative to that of neighbouring frames"
-    )
-    ratio: float = Field(
-        default=0.85, gt=0, le=1, description="largest ratio of nearest to second nearest descriptor distance"
-    )
     max_hamming: int = Field(
         default=64, ge=1, le=256, description="largest Hamming distance of matching descriptors, bits"
     )
-    ransac_iterations: int = Field(default=200, ge=10, description="RANSAC iterations of PnP")
     reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier, pixels")
     min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
     min_inlier_ratio: float = Field(
         default=0.4, gt=0, le=1, description="least inlier ratio among the matches with depth"
-    )
-    min_spread_ratio: float = Field(
-        default=0.1, ge=0, lt=1, description="least standard deviation of the inliers' columns over the image width"
     )
     agreement_deg: float = Field(
         default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"
@@ -137,10 +121,6 @@ class LoopsConfig(Section):
         gt=0,
         description="largest difference of the translations measured in both directions, over the depth",
     )
-    corner_sigma_widening: float = Field(default=1.25, gt=0, description="factor on the sigmas by corners")
-    rotation_floor_deg: float = Field(default=0.02, gt=0, description="least rotation sigma, degrees")
-    translation_floor_ratio: float = Field(default=0.0003, gt=0, description="least translation sigma over the depth")
-    length_relative_sigma: float = Field(default=0.04, gt=0, description="translation sigma over the translation")
     max_drift_ratio: float = Field(
         default=0.3, gt=0, description="largest correction over the path between the two frames"
     )
@@ -149,10 +129,6 @@ class LoopsConfig(Section):
     )
     min_support: int = Field(default=2, ge=0, description="least number of images with loops that support a loop")
     alone_inliers: int = Field(default=120, ge=6, description="number of inliers from which on a loop needs no support")
-    support_sigmas: float = Field(default=3.0, gt=0, description="largest difference of supporting loops, sigmas")
-    support_drift_ratio: float = Field(
-        default=0.1, ge=0, description="drift of the odometry between supporting loops over the path between them"
-    )
     support_drift_deg: float = Field(
         default=0.1, ge=0, description="rotation drift of the odometry between supporting loops, degrees a frame"
     )
@@ -161,18 +137,8 @@ class LoopsConfig(Section):
 class PoseGraphConfig(Section):
     """The pose graph, see ``pose_graph.py``."""
 
-    kernel: Literal["none", "huber", "huber-cauchy"] = Field(
-        default="huber", description="robust loss; huber-cauchy: Huber, then Cauchy from its result"
-    )
+    kernel: Literal["none", "huber"] = Field(default="huber", description="robust loss")
     huber_k: float = Field(default=1.345, gt=0, description="whitened residual at which Huber becomes linear")
-    cauchy_k: float = Field(default=3.0, gt=0, description="whitened residual at which the Cauchy weight is one half")
-    max_iterations: int = Field(default=100, ge=1, description="Levenberg-Marquardt iterations of a stage")
-    relative_tolerance: float = Field(
-        default=1e-6, gt=0, lt=1, description="relative decrease of the error below which a stage ends"
-    )
-    max_dropped_loops: int = Field(
-        default=10, ge=0, description="largest number of loops removed where the system is singular"
-    )
     max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual beyond which a loop is removed")
 
 
@@ -282,7 +248,7 @@ def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str]
 def load_stored(path: Path, *sections: str) -> SlamConfig:
     """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
 
-    A run of an earlier release may have keys elsewhere that are gone.
+    A run of an earlier release may have keys that are gone: they are left out.
 
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.

@@ -39,21 +39,11 @@ OLD_NAMES = OldNames(
         "bridging": "gaps",
         "bridging.min_likeness": "gaps.min_correlation",
         "bridging.translation_sigma_share": "gaps.translation_relative_sigma",
-        "road.near_sigma_share": "road.near_relative_sigma",
-        "road.min_likeness": "road.min_correlation",
-        "road.sigma_share": "road.relative_sigma",
-        "lengths.chain_widening": "lengths.correlated_widening",
         "scale.road_top_share": "scale.road_top_ratio",
         "scale.road_bottom_share": "scale.road_bottom_ratio",
-        "scale.inlier_share_of_depth": "scale.inlier_relative_depth",
-        "scale.min_inlier_share": "scale.min_inlier_ratio",
         "loops.min_inlier_share": "loops.min_inlier_ratio",
-        "loops.min_spread_share": "loops.min_spread_ratio",
         "loops.agreement_share": "loops.agreement_ratio",
-        "loops.translation_floor_share": "loops.translation_floor_ratio",
-        "loops.length_sigma_share": "loops.length_relative_sigma",
         "loops.max_drift_share": "loops.max_drift_ratio",
-        "loops.support_drift_share": "loops.support_drift_ratio",
         "mapping.max_blocks": "mapping.memory_mb",
     },
     values={("frontend.use", "bridge"): "gaps"},
@@ -68,7 +58,7 @@ def load_sections(
 ) -> M:
     """Read a YAML file, or one of those under ``configs/slam`` by its name, and apply ``section.key=value`` overrides.
 
-    ``sections`` are those of the file that are read; None for all of them.
+    ``sections`` are those of the file that are read, without unknown keys; None for all of them.
 
     Raises:
         ConfigError: one line that names the key or file, what came and what is allowed.

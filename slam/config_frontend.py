@@ -133,35 +133,11 @@ class RoadConfig(Section):
     enabled: bool = Field(
         default=True, description="measure steps by the homography of the ground plane, in camera heights"
     )
-    far_heights: float = Field(default=9.0, gt=0, description="farthest ground used, in camera heights")
-    half_width_heights: float = Field(
-        default=1.0, gt=0, description="half the width of the strip of ground used, in camera heights"
-    )
     near_heights: float = Field(
         default=4.5,
         gt=0,
         description="farthest ground of the short strip, used behind a vehicle ahead, in camera heights",
     )
-    near_half_width_heights: float = Field(
-        default=2.0, gt=0, description="half the width of the short strip, in camera heights"
-    )
-    near_relative_sigma: float = Field(
-        default=0.1, gt=0, description="least relative sigma of a length from the short strip"
-    )
-    points: int = Field(default=4000, ge=100, description="approximate number of aligned pixels")
-    min_points: int = Field(default=300, ge=50, description="least number of aligned pixels of a measurement")
-    tilt_sigma_deg: float = Field(
-        default=0.1, gt=0, description="sigma of the ground plane's tilt against the direction of motion, degrees"
-    )
-    max_tilt_deg: float = Field(default=4.0, gt=0, lt=90, description="largest tilt of the ground plane, degrees")
-    min_correlation: float = Field(default=0.3, ge=0, le=1, description="least correlation of the aligned pixels")
-    min_gain: float = Field(
-        default=0.25,
-        ge=0,
-        le=1,
-        description="least fraction of the photometric error without motion that the alignment removes",
-    )
-    relative_sigma: float = Field(default=0.06, gt=0, description="least relative sigma of a length")
     tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma of a length per radian of estimated tilt")
 
 
@@ -169,22 +145,12 @@ class LengthConfig(Section):
     """Joint estimation of all step lengths, see ``frontend/scale/step_lengths.py``; sigmas are of logarithms."""
 
     ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of the ratio of two consecutive steps")
-    ratio_widening: float = Field(
-        default=1.5, gt=0, description="factor on the sigma of a ratio measured by triangulated points"
-    )
     learned_sigma: float = Field(default=0.1, gt=0, description="sigma of a length by learned depth")
-    unit_walk_sigma: float = Field(
-        default=0.003, gt=0, description="sigma per step of the random walk of learned depth's scale"
-    )
-    unit_sigma: float = Field(default=0.2, gt=0, description="sigma of that scale by the learned ground plane")
     max_contradiction: float = Field(
         default=2.5, gt=1, description="largest factor between a measured length and that by learned depth"
     )
     outlier_sigmas: float = Field(
         default=2.0, gt=0, description="residual at which the robust weight of a measurement is one half, sigmas"
-    )
-    correlated_widening: float = Field(
-        default=1.5, gt=0, description="factor on the sigmas in the pose graph, for errors correlated along the road"
     )
 
 
@@ -254,16 +220,6 @@ class ScaleConfig(Section):
     known_between: tuple[int | str, int | str] | None = Field(
         default=None, description="mode known: two frames of the run, or stamps in seconds such as 12.5s"
     )
-    reference_frames: int = Field(default=50, ge=2, description="number of first frames that mode reference compares")
-    min_frames: int = Field(default=5, ge=1, description="least number of usable frames of a scale")
-    rejection_mads: float = Field(
-        default=3.0,
-        gt=0,
-        description="distance from the median beyond which a frame is left out, median absolute deviations",
-    )
-    smoothing_frames: int = Field(
-        default=41, ge=1, description="window over which the scale of a frame is averaged, frames"
-    )
     road_top_ratio: float = Field(
         default=0.35,
         ge=0,
@@ -273,20 +229,6 @@ class ScaleConfig(Section):
     road_bottom_ratio: float = Field(
         default=0.97, gt=0, le=1, description="bottom edge of the road trapezoid, from horizon (0) to image bottom (1)"
     )
-    road_top_width: float = Field(default=0.16, gt=0, le=1, description="width of the top edge over that of the image")
-    road_bottom_width: float = Field(
-        default=0.5, gt=0, le=1, description="width of the bottom edge over that of the image"
-    )
-    max_tilt_deg: float = Field(
-        default=12.0,
-        gt=0,
-        lt=90,
-        description="largest angle between the plane's normal and the camera's y axis, degrees",
-    )
-    inlier_relative_depth: float = Field(
-        default=0.05, gt=0, lt=1, description="largest relative depth error of a plane inlier"
-    )
-    min_inlier_ratio: float = Field(default=0.5, gt=0, le=1, description="least inlier ratio of a usable frame")
 
     @field_validator("known_between")
     @classmethod

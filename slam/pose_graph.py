@@ -1,8 +1,7 @@
 """The pose graph: relative poses in, the most likely trajectory out.
 
 GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
-that order. A Huber kernel limits outliers. Redescending kernels do not recover from a drifted start, so Cauchy is only
-a second stage after Huber.
+that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted start.
 """
 
 from __future__ import annotations
@@ -29,6 +28,9 @@ _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions ho
 _OUTLYING = 3.0
 
 logger = logging.getLogger(__name__)
+_MAX_ITERATIONS = 100  # Levenberg-Marquardt iterations of a stage
+_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
+_RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which a stage ends
 
 
 class PoseGraph:
@@ -91,7 +93,7 @@ class PoseGraph:
         _check_connected(self._relative_poses, len(T_world_camera_initial))
         if not is_se3(T_world_camera_initial, tolerance=1e-5):
             raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
-        for _ in range(self._config.max_dropped_loops + 1):
+        for _ in range(_MAX_DROPPED_LOOPS + 1):
             try:
                 self._T_world_camera = self._solve(T_world_camera_initial)
                 return self._T_world_camera.copy()
@@ -135,9 +137,7 @@ class PoseGraph:
         values = gtsam.Values()
         for k, T in enumerate(self._T_fixed_world @ T_world_camera_initial):
             values.insert(k, _pose3(T))
-        stages = {"none": ["none"], "huber": ["huber"], "huber-cauchy": ["huber", "cauchy"]}
-        for kernel in stages[self._config.kernel]:
-            values = self._minimise(values, kernel)
+        values = self._minimise(values)
         T_fixed_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
         if not np.isfinite(T_fixed_camera).all():
             raise RuntimeError("the solution is not finite")
@@ -148,21 +148,21 @@ class PoseGraph:
         rebased[0] = T_world_camera_initial[0]
         return rebased
 
-    def _minimise(self, values: Any, kernel: str) -> Any:
+    def _minimise(self, values: Any) -> Any:
         graph = gtsam.NonlinearFactorGraph()
         graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
         for edge in self._relative_poses:
-            graph.add(_between(edge, kernel, self._config))
+            graph.add(_between(edge, self._config))
         for position in self._positions:
-            graph.add(_position(position, kernel, self._config))
+            graph.add(_position(position, self._config))
         parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(self._config.max_iterations)
-        parameters.setRelativeErrorTol(self._config.relative_tolerance)
+        parameters.setMaxIterations(_MAX_ITERATIONS)
+        parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         solved = optimiser.optimize()
         logger.info(
             "pose graph (%s): %d factors, error %.4g to %.4g in %d iterations",
-            kernel,
+            self._config.kernel,
             len(self._relative_poses),
             graph.error(values),
             optimiser.error(),
@@ -209,24 +209,21 @@ def _anchor(pose: Any, is_loose: bool = False) -> Any:
     return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
-def _between(edge: RelativePose, kernel: str, config: PoseGraphConfig) -> Any:
-    noise = _noise(edge.graph_sigmas, kernel, config)
+def _between(edge: RelativePose, config: PoseGraphConfig) -> Any:
+    noise = _noise(edge.graph_sigmas, config)
     return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
 
 
-def _position(measured: MeasuredPosition, kernel: str, config: PoseGraphConfig) -> Any:
-    noise = _noise(measured.sigmas, kernel, config)
+def _position(measured: MeasuredPosition, config: PoseGraphConfig) -> Any:
+    noise = _noise(measured.sigmas, config)
     return gtsam.GPSFactorArm(measured.index, measured.position, measured.lever_arm, noise)
 
 
-def _noise(sigmas: FloatArray, kernel: str, config: PoseGraphConfig) -> Any:
+def _noise(sigmas: FloatArray, config: PoseGraphConfig) -> Any:
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
-    if kernel == "none":
+    if config.kernel == "none":
         return noise
-    estimators = gtsam.noiseModel.mEstimator
-    huber = kernel == "huber"
-    estimator = estimators.Huber.Create(config.huber_k) if huber else estimators.Cauchy.Create(config.cauchy_k)
-    return gtsam.noiseModel.Robust.Create(estimator, noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber_k), noise)
 
 
 def _check(edge: RelativePose) -> None:

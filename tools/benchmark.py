@@ -165,9 +165,9 @@ def _parser() -> argparse.ArgumentParser:
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
-        if mode == "maps":
-            add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives with LiDAR")
-            names = [each.name for each in MAPS if each is not EVERYTHING]
+        if mode in ("maps", "ablation"):
+            add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
+            names = [each.name for each in (MAPS if mode == "maps" else ABLATION) if each is not EVERYTHING]
             add("--parts", nargs="*", choices=names, metavar="PART", help=f"to turn off: {', '.join(names)}; else all")
         if fast:
             add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")

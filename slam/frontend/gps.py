@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam import se3
-from slam.config import GpsConfig, ScaleConfig
+from slam.config import GpsConfig
 from slam.frames import MeasuredPosition
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate
 from slam.geodesy import GpsTrack, LocalFrame
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
@@ -75,7 +75,7 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
 
 
 def scale_by_gps(
-    fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray, config: ScaleConfig
+    fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray
 ) -> ScaleEstimate | MeasurementFailure:
     """Chords by GPS over those of the estimate: the median, so that drift and outliers count little."""
     estimated = fixes.antenna(T_world_camera_unscaled, stamps)
@@ -83,7 +83,7 @@ def scale_by_gps(
     by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))
     least = _LEAST_MOTION_SIGMAS * float(np.median(fixes.sigmas[:, 0]))
     usable = (by_camera > 0) & (by_gps > least)
-    if usable.sum() < config.min_frames:
+    if usable.sum() < MIN_FRAMES:
         longest = float(by_gps.max(initial=0))
         return MeasurementFailure(
             f"the camera moves too little: a tenth of the fixes span {longest:.1f} m at most, and {least:.1f} m, five "

@@ -14,6 +14,9 @@ from slam.config import LoopsConfig
 from slam.loops.verification import Loop, RejectedLoop
 from slam.se3 import FloatArray, invert, rotation_angle
 
+_SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
+_SUPPORT_DRIFT_RATIO = 0.1  # drift of the odometry between supporting loops over the path between them
+
 
 def agreeing(
     loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfig
@@ -63,7 +66,7 @@ def _votes(loops: Sequence[Loop], T_world_camera: FloatArray, config: LoopsConfi
         own = np.hypot(sigmas[near], sigmas[k])
         length = np.linalg.norm(T_earlier[:, :3, 3], axis=1) + np.linalg.norm(T_later[:, :3, 3], axis=1)
         drift = np.deg2rad(config.support_drift_deg) * distance[near].sum(axis=1)
-        agrees = rotation < config.support_sigmas * own[:, 0] + drift
-        agrees &= translation < config.support_sigmas * own[:, 3] + config.support_drift_ratio * length
+        agrees = rotation < _SUPPORT_SIGMAS * own[:, 0] + drift
+        agrees &= translation < _SUPPORT_SIGMAS * own[:, 3] + _SUPPORT_DRIFT_RATIO * length
         votes.append((len(np.unique(ends[near[agrees], 1])), len(np.unique(ends[near[~agrees], 1]))))
     return votes

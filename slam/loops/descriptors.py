@@ -17,6 +17,8 @@ Descriptors = NDArray[np.uint8]
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
 _EDGE_PX = 16
+_CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
+_MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class FeatureExtractor:
             nfeatures=_DETECTED_PER_KEPT * config.max_features,
             nlevels=6,
             edgeThreshold=_EDGE_PX,
-            fastThreshold=config.corner_contrast,
+            fastThreshold=_CORNER_CONTRAST,
         )
 
     def view(self, frame: Frame, depth_unscaled: DepthMap, height_unscaled: float | None = None) -> View:
@@ -65,7 +67,7 @@ class FeatureExtractor:
             height_unscaled: camera height in the same unit; where known, depths farther than
                 ``max_depth_heights`` of it are not trusted.
         """
-        settings = (self._config.max_features, self._config.corner_contrast)
+        settings = (self._config.max_features, _CORNER_CONTRAST)
         pixels, descriptors = self._get_or_compute(
             "features", (frame, repr(settings)), lambda: self._features(frame.grey)
         )
@@ -87,7 +89,7 @@ class FeatureExtractor:
         columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, depth.shape[1] - 1)
         rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, depth.shape[0] - 1)
         z = depth[rows, columns].astype(np.float64)
-        farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
+        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
         z = np.where(np.isfinite(z) & (z > 0) & (z < farthest), z, np.nan)
         return np.asarray(self._intrinsics.rays(pixels) * z[:, None], dtype=np.float32)
 

@@ -23,6 +23,9 @@ _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
 _BLOCK = 256
 _BLOCK_DESCRIPTORS = 200  # fit the processor's cache
+_CANDIDATES_PER_FRAME = 2  # largest number of places verified for a frame
+_PEAK_FRAMES = 10  # least distance between candidate places, frames
+_MIN_SCORE = 0.2  # least retrieval score, relative to that of neighbouring frames
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def find_candidates(
         near |= path_m[block, None] - path_m[None, :] < config.min_path_m
         scores[near] = 0.0
         for later, row in zip(block, scores, strict=True):
-            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices, config)]
+            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices)]
     return found
 
 
@@ -166,14 +169,14 @@ def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
     return weights
 
 
-def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]], config: LoopsConfig) -> list[int]:
-    """The best columns, none within ``peak_frames`` of a better one."""
+def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[int]:
+    """The best columns, none within ten frames of a better one."""
     scores = scores.copy()
     peaks: list[int] = []
-    while len(peaks) < config.candidates_per_frame:
+    while len(peaks) < _CANDIDATES_PER_FRAME:
         best = int(np.argmax(scores))
-        if scores[best] < config.min_score or scores[best] <= 0:
+        if scores[best] < _MIN_SCORE or scores[best] <= 0:
             break
         peaks.append(best)
-        scores[np.abs(indices - indices[best]) <= config.peak_frames] = 0.0
+        scores[np.abs(indices - indices[best]) <= _PEAK_FRAMES] = 0.0
     return peaks

@@ -18,6 +18,14 @@ from slam.resection import Resection, consensus, refine
 from slam.se3 import FloatArray, invert, make, rotation_angle
 from slam.storage.cache import GetOrCompute, without_cache
 
+_RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
+_RANSAC_ITERATIONS = 200  # RANSAC iterations of PnP
+_CORNER_SIGMA_WIDENING = 1.25  # factor on the sigmas by corners
+_ROTATION_FLOOR_DEG = 0.02  # least rotation sigma, degrees
+_TRANSLATION_FLOOR_RATIO = 0.0003  # least translation sigma over the depth
+_LENGTH_RELATIVE_SIGMA = 0.04  # translation sigma over the translation
+_MIN_SPREAD_RATIO = 0.1  # least standard deviation of the inliers' columns over the image width
+
 
 @dataclass(frozen=True)
 class Loop:
@@ -66,7 +74,7 @@ class LoopVerifier:
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
-        given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, self._config.ratio)))
+        given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, _RATIO)))
         rows_earlier, rows_later = self._get_or_compute(
             "loop matches", given, lambda: matches(earlier, later, self._config)
         )
@@ -111,12 +119,12 @@ class LoopVerifier:
         K = self._intrinsics.K
         if min_inlier_ratio is None:
             min_inlier_ratio = config.min_inlier_ratio
-        found = consensus(points_known, pixels_known, K, config.ransac_iterations, config.reprojection_px, self._seed)
+        found = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, config.reprojection_px, self._seed)
         count = 0 if found is None else len(found[2])
         if found is None or count < config.min_inliers or count < min_inlier_ratio * len(points_known):
             return f"only {count} of {len(points_known)} matches are inliers"
         extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
-        if extent[0] < config.min_spread_ratio or extent[1] < config.min_spread_ratio / 2:
+        if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
             return f"{count} inliers in a small part of the image"
         return Sighting(refine(points_known, pixels_known, K, found), float(np.median(points_known[found[2], 2])))
 
@@ -127,13 +135,12 @@ class LoopVerifier:
 
         Both directions use the same corners, whose errors are correlated: averaging does not reduce the sigmas.
         """
-        config = self._config
-        corners = config.corner_sigma_widening * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
+        corners = _CORNER_SIGMA_WIDENING * np.hypot(forward.resection.sigmas, backward.resection.sigmas)
         rotation = Rotation.from_matrix(difference[:3, :3]).as_rotvec()
         disagreement = np.concatenate([rotation, difference[:3, 3]]) / 2
-        length_sigma = config.length_relative_sigma * float(np.linalg.norm(T_a_b[:3, 3]))
+        length_sigma = _LENGTH_RELATIVE_SIGMA * float(np.linalg.norm(T_a_b[:3, 3]))
         floors = np.repeat(
-            [np.deg2rad(config.rotation_floor_deg), np.hypot(config.translation_floor_ratio * depth, length_sigma)], 3
+            [np.deg2rad(_ROTATION_FLOOR_DEG), np.hypot(_TRANSLATION_FLOOR_RATIO * depth, length_sigma)], 3
         )
         return np.asarray(np.linalg.norm([corners, disagreement, floors], axis=0))
 
@@ -165,7 +172,7 @@ def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.
     best = distance[rows, nearest]
     kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= config.max_hamming)
     distance[rows, nearest] = np.inf
-    kept &= best < config.ratio * distance.min(axis=1)
+    kept &= best < _RATIO * distance.min(axis=1)
     return rows[kept], nearest[kept]
 
 

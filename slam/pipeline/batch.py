@@ -36,8 +36,9 @@ from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.map_closure import close_maps
 from slam.pipeline.measurements import Measurements
 from slam.pipeline.observations import ClosedObservations
-from slam.pipeline.observer import Observer, ObserverState, read_frame
+from slam.pipeline.observer import Observer, ObserverState
 from slam.pipeline.positioning import Location, Positioning
+from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
 from slam.pipeline.solution import Solution
 from slam.pose_graph import PoseGraph
@@ -258,8 +259,7 @@ class SlamPipeline:
         self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
     ) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
-        checkpoint, total = self._checkpoint, len(self._sequence)
-        first = self.first
+        checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
         if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
             logger.warning(
@@ -304,7 +304,7 @@ class SlamPipeline:
         config, sequence = self._config, self._sequence
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
         with self._watch.stage("scale"):
-            scale = find_scale(mode, sequence.camera_height_m, measured, config.scale, config.lengths, config.lidar)
+            scale = find_scale(mode, sequence.camera_height_m, measured, config.lengths, config.lidar)
             if mode not in ("reference", "known", "gps"):
                 return scale
             T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)
@@ -316,11 +316,11 @@ class SlamPipeline:
         unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
         positioning = self._positioning(mode)
         if mode == "reference" and sequence.reference is not None:
-            unit = scale_from_reference(T_odometry, sequence.reference, config)
+            unit = scale_from_reference(T_odometry, sequence.reference)
         elif mode == "known":
             unit = scale_from_distance(T_odometry, sequence.stamps, config)
         elif positioning is not None:
-            unit = positioning.scale(T_odometry, config)
+            unit = positioning.scale(T_odometry)
         if isinstance(unit, MeasurementFailure):
             logger.warning("no scale (%s): lengths stay in camera heights", unit.reason)
         return unit

@@ -23,6 +23,8 @@ from slam.se3 import FloatArray, invert
 _RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
+_DECISION_STEPS = 30  # triangulated steps after which auto decides
+_VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 
 
 def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
@@ -64,10 +66,14 @@ class KeyframeTracking:
             self._odometry.follow(frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned depth ``(H, W)`` of that frame; a lost camera is looked for."""
+        """Learned depth ``(H, W)`` of one of the last two frames."""
+        if self._odometry is not None:
+            self._odometry.learn(frame, depth)
+
+    def look_for_lost(self, frame: Frame, depth: DepthMap) -> None:
+        """Look for a lost camera in the last frame, of which depth ``(H, W)`` is known."""
         if self._odometry is None:
             return
-        self._odometry.learn(frame, depth)
         lost = self._odometry.lost_map()
         if lost is None:
             self._places = None
@@ -94,7 +100,7 @@ class KeyframeTracking:
         """End the tracking where the first steps are those of a vehicle."""
         if self._odometry is None or self._is_carried:
             return
-        vehicle = False if self._config.use == "always" else is_vehicle(seen, self._config)
+        vehicle = False if self._config.use == "always" else is_vehicle(seen)
         self._is_carried = vehicle is False
         if vehicle:
             self._odometry = None
@@ -106,6 +112,17 @@ class KeyframeTracking:
         if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
             return False
         return self._odometry.locates(index - 1, index)
+
+    def measure_alone(self, seen: Observations, index: int) -> bool:
+        """Whether keyframes locate one of the last frames and no step was measured to it."""
+        if self._odometry is None or not self._is_carried:
+            return False
+        has_step = any(motion.ends[1] == index for motion in seen.motions[-_FRAMES:])
+        return not has_step and self._odometry.has_located(index)
+
+    def is_keyframe(self, index: int) -> bool:
+        """Whether the last frame is a keyframe."""
+        return self._odometry is not None and self._odometry.is_keyframe(index)
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
@@ -131,16 +148,16 @@ class KeyframeTracking:
 
     def poses(self, maps: Sequence[Segment]) -> WindowPoses:
         """Relative poses of all frames of some maps."""
-        return window_poses(maps, self._intrinsics, self._config, self._seed)
+        return window_poses(maps, self._intrinsics, self._seed)
 
 
-def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:
+def is_vehicle(seen: Observations) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
     triangulated = (motion for motion in seen.motions if motion.triangulated is not None)
-    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, config.decision_steps)]
-    if len(first) < config.decision_steps:
+    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]
+    if len(first) < _DECISION_STEPS:
         return None
     directions = np.array(first) / np.linalg.norm(first, axis=1, keepdims=True)
     usual = np.median(directions, axis=0)
     cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
-    return float(np.median(cosine)) > float(np.cos(np.deg2rad(config.vehicle_scatter_deg)))
+    return float(np.median(cosine)) > float(np.cos(np.deg2rad(_VEHICLE_SCATTER_DEG)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
-from slam.config import GpsConfig, ScaleConfig, ScaleMode
+from slam.config import GpsConfig, ScaleMode
 from slam.errors import SlamError
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
@@ -41,9 +41,9 @@ class Positioning:
             raise SlamError(fixes.reason)
         self._fixes, self._stamps, self._config = fixes, stamps, config
 
-    def scale(self, T_odometry: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
+    def scale(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry ``(N, 4, 4)``."""
-        return gps.scale_by_gps(self._fixes, T_odometry, self._stamps, config)
+        return gps.scale_by_gps(self._fixes, T_odometry, self._stamps)
 
     def locate(self, T_odometry: FloatArray) -> Location | MeasurementFailure:
         """Where an odometry ``(N, 4, 4)`` in metres lies on the earth; a failure is logged."""

@@ -19,8 +19,8 @@ def test_default_file_is_the_defaults_complete_and_explained():
 
 
 def test_dump_reads_back(tmp_path):
-    config = load_config(None, ["pose_graph.relative_tolerance=1e-4", "geometry.steps=[1, 2]", "scale.mode=none"])
-    assert config.pose_graph.relative_tolerance == 1e-4
+    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "geometry.steps=[1, 2]", "scale.mode=none"])
+    assert config.pose_graph.max_loop_residual == 1e-4
     assert config.geometry.steps == (1, 2)
     path = tmp_path / "mine.yaml"
     path.write_text(dump_yaml(config))

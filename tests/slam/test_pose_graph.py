@@ -50,13 +50,13 @@ def solve(edges, initial, **config):
     return graph, graph.optimise(initial)
 
 
-@pytest.mark.parametrize("kernel", ["none", "huber", "huber-cauchy"])
+@pytest.mark.parametrize("kernel", ["none", "huber"])
 def test_exact_factors_recover_the_chain_from_a_bent_start(kernel):
     truth = circle(40, rounds=0.8)
     exact = [edge(truth, k, k + 1) for k in range(39)] + [edge(truth, k + 2, k) for k in range(38)]
     bent = truth.copy()
     bent[1:, :3, 3] += np.random.default_rng(0).normal(scale=0.5, size=(39, 3))
-    graph, solved = solve(exact, bent, kernel=kernel, relative_tolerance=1e-12)
+    graph, solved = solve(exact, bent, kernel=kernel)
     np.testing.assert_allclose(solved, truth, atol=1e-5)
     assert graph.errors.max() < 1e-6
     assert se3.is_se3(solved)
@@ -71,8 +71,7 @@ def test_loops_cut_the_drift():
     np.testing.assert_array_equal(solved[0], initial[0])
 
 
-@pytest.mark.parametrize("kernel", ["huber", "huber-cauchy"])
-def test_robust_kernels_survive_gross_outliers(kernel):
+def test_the_robust_kernel_survives_gross_outliers():
     truth, odometry, skips, loops, initial = noisy_problem()
     rng = np.random.default_rng(1)
     false = []
@@ -81,7 +80,7 @@ def test_robust_kernels_survive_gross_outliers(kernel):
         false.append(RelativePose(10 * k, 190 - 10 * k, wrong, loops[0].sigmas, LOOP_SOURCE))
     edges = odometry + skips + loops + false
     _, plain = solve(edges, initial, kernel="none")
-    graph, robust = solve(edges, initial, kernel=kernel)
+    graph, robust = solve(edges, initial, kernel="huber")
     assert ate(robust, truth) < ate(initial, truth)
     assert ate(robust, truth) < 0.2 * ate(plain, truth)
     errors = graph.errors

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.config import LengthConfig, LidarConfig, ScaleConfig, ScaleMode
+from slam.config import LengthConfig, LidarConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.frontend.scale.scale_estimate import ScaleEstimate, scale_from_road, scale_track
+from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
 from slam.frontend.step_table import links
 from slam.frontend.visual.motion import Motion
@@ -74,7 +74,6 @@ def find_scale(
     mode: ScaleMode,
     camera_height_m: float | None,
     measured: LengthMeasurements,
-    config: ScaleConfig,
     lengths: LengthConfig,
     lidar: LidarConfig,
 ) -> Scale:
@@ -89,7 +88,7 @@ def find_scale(
         absolute |= {
             ends: (length, lidar.translation_sigma_m / length) for ends, length in metres.items() if length > 0
         }
-    by_planes = scale_from_road(measured.planes, height, config)
+    by_planes = scale_from_road(measured.planes, height)
     frames = len(measured.planes)
     if isinstance(by_planes, MeasurementFailure):
         prior_unit = np.full(frames, _unit_by_steps(measured.motions, absolute))
@@ -97,7 +96,7 @@ def find_scale(
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
         prior_unit = np.full(frames, by_planes.value)
     else:
-        prior_unit = scale_track(measured.planes, height, by_planes, config)
+        prior_unit = scale_track(measured.planes, height, by_planes)
     steps = links(measured.motions, frames)
     evidence = gather_evidence(steps, measured.motions, absolute, prior_unit)
     if not isinstance(by_planes, MeasurementFailure):
@@ -109,7 +108,7 @@ def find_scale(
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
-    if used >= config.min_frames:
+    if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(by_planes, MeasurementFailure):

@@ -30,6 +30,17 @@ _STEPS_KEPT = 100
 _ALIGNED_OVER_TRUE = 0.99
 
 _Layer = NDArray[np.float32]
+_FAR_HEIGHTS = 9.0  # farthest ground used, in camera heights
+_HALF_WIDTH_HEIGHTS = 1.0  # half the width of the strip of ground used, in camera heights
+_NEAR_HALF_WIDTH_HEIGHTS = 2.0  # half the width of the short strip, in camera heights
+_NEAR_RELATIVE_SIGMA = 0.1  # least relative sigma of a length from the short strip
+_RELATIVE_SIGMA = 0.06  # least relative sigma of a length
+_POINTS = 4000  # approximate number of aligned pixels
+_MIN_POINTS = 300  # least number of aligned pixels of a measurement
+_TILT_SIGMA_DEG = 0.1  # sigma of the ground plane's tilt against the direction of motion, degrees
+_MAX_TILT_DEG = 4.0  # largest tilt of the ground plane, degrees
+_MIN_CORRELATION = 0.3  # least correlation of the aligned pixels
+_MIN_GAIN = 0.25  # least fraction of the photometric error without motion that the alignment removes
 
 
 @dataclass(frozen=True)
@@ -59,10 +70,10 @@ class RoadHomography:
         self._config = config
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
-        long = _Shape(config.far_heights, config.half_width_heights, config.relative_sigma)
-        near = _Shape(config.near_heights, config.near_half_width_heights, config.near_relative_sigma)
+        long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
+        near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
-        self._strips = [_strip(intrinsics, self._top_row, shape, config.points) for shape in (long, near)]
+        self._strips = [_strip(intrinsics, self._top_row, shape, _POINTS) for shape in (long, near)]
         self._directions = directions
 
     def state(self) -> tuple[FloatArray, ...]:
@@ -91,17 +102,17 @@ class RoadHomography:
     def _measured_on(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> RoadStep | MeasurementFailure:
-        if len(strip.rows) < self._config.min_points:
+        if len(strip.rows) < _MIN_POINTS:
             return MeasurementFailure("the image shows too little of the road")
         plane, correlation, standing = self._aligned(strip, previous, current, T_unit, expected)
         length = float(np.linalg.norm(plane))
         normal = plane / length
         deviation = float(np.arccos(np.clip(normal @ expected, -1.0, 1.0)))
-        if not np.isfinite(length) or deviation > np.deg2rad(self._config.max_tilt_deg):
+        if not np.isfinite(length) or deviation > np.deg2rad(_MAX_TILT_DEG):
             return MeasurementFailure(f"the road would be tilted by {np.rad2deg(deviation):.0f} deg")
-        if correlation < self._config.min_correlation:
+        if correlation < _MIN_CORRELATION:
             return MeasurementFailure(f"both images of the road do not correlate ({correlation:.2f})")
-        if 1.0 - correlation > (1.0 - self._config.min_gain) * (1.0 - standing):
+        if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
             return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
         length /= _ALIGNED_OVER_TRUE
         return RoadStep(length, float(np.hypot(strip.shape.relative_sigma, self._config.tilt_gain * deviation)), normal)
@@ -110,20 +121,19 @@ class RoadHomography:
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray
     ) -> tuple[FloatArray, float, float]:
         """The plane ``m`` ``(3,)`` that aligns the road, and the correlation of both images with and without it."""
-        config = self._config
 
         def align() -> Answer:
             before, now = self._layers(previous), self._layers(current)
             plane = self._search(strip, before[0], now[0], T_unit, expected)
             for layer_before, layer_now in zip(before, now, strict=True):
                 plane, correlation = self._refine(
-                    strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(config.tilt_sigma_deg))
+                    strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(_TILT_SIGMA_DEG))
                 )
             standing = _correlation(*(layers[-1][strip.rows, strip.columns, 0] for layers in (before, now)))
             return plane, np.array([correlation, standing])
 
-        settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, config.points)
-        given = (previous, current, T_unit, expected, repr((*settings, config.tilt_sigma_deg)))
+        settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, _POINTS)
+        given = (previous, current, T_unit, expected, repr((*settings, _TILT_SIGMA_DEG)))
         plane, correlations = self._get_or_compute("road homography", given, align)
         return plane, float(correlations[0]), float(correlations[1])
 

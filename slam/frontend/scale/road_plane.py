@@ -20,6 +20,11 @@ _POINTS = 1500
 _LEAST_POINTS = 50
 _HYPOTHESES = 150
 _REWEIGHTINGS = 8
+_ROAD_TOP_WIDTH = 0.16  # width of the top edge over that of the image
+_ROAD_BOTTOM_WIDTH = 0.5  # width of the bottom edge over that of the image
+_MAX_TILT_DEG = 12.0  # largest angle between the plane's normal and the camera's y axis, degrees
+_INLIER_RELATIVE_DEPTH = 0.05  # largest relative depth error of a plane inlier
+_MIN_INLIER_RATIO = 0.5  # least inlier ratio of a usable frame
 
 
 @dataclass(frozen=True)
@@ -36,30 +41,26 @@ class GroundPlaneFitter:
 
     def __init__(self, config: ScaleConfig, intrinsics: Intrinsics, seed: int = 0) -> None:
         """Sample the pixels of the trapezoid; ``seed`` is that of RANSAC."""
-        self._config = config
         self._seed = seed
         self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)
 
     def fit(self, depth_unscaled: DepthMap) -> GroundPlane | MeasurementFailure:
         """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics; unknown depth is left out."""
-        config = self._config
         inverse_depth = 1.0 / np.maximum(depth_unscaled[self._rows, self._columns].astype(np.float64), 1e-9)
         usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
         if usable.sum() < _LEAST_POINTS:
             return MeasurementFailure("the depth in front of the car is not usable")
         rays, inverse_depth = self._rays[usable], inverse_depth[usable]  # (P, 3), (P,)
-        scaled_normal = _ransac(rays, inverse_depth, config, self._seed)
+        scaled_normal = _ransac(rays, inverse_depth, self._seed)
         if scaled_normal is None:
-            return MeasurementFailure(f"no plane within {config.max_tilt_deg:g} deg of level in front of the car")
-        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, config.inlier_relative_depth)
+            return MeasurementFailure(f"no plane within {_MAX_TILT_DEG:g} deg of level in front of the car")
+        scaled_normal = _reweighted(rays, inverse_depth, scaled_normal, _INLIER_RELATIVE_DEPTH)
         height = 1.0 / float(np.linalg.norm(scaled_normal))
         normal = scaled_normal * height
-        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None], config)[0].mean())
-        if normal[1] < np.cos(np.deg2rad(config.max_tilt_deg)):
-            return MeasurementFailure(
-                f"the plane in front of the car is tilted by more than {config.max_tilt_deg:g} deg"
-            )
-        if inlier_ratio < config.min_inlier_ratio:
+        inlier_ratio = float(_inliers(rays, inverse_depth, scaled_normal[None])[0].mean())
+        if normal[1] < np.cos(np.deg2rad(_MAX_TILT_DEG)):
+            return MeasurementFailure(f"the plane in front of the car is tilted by more than {_MAX_TILT_DEG:g} deg")
+        if inlier_ratio < _MIN_INLIER_RATIO:
             return MeasurementFailure(f"only {inlier_ratio:.0%} of the pixels in front of the car lie on one plane")
         return GroundPlane(height, normal, inlier_ratio)
 
@@ -72,13 +73,13 @@ def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.
     horizon, bottom = intrinsics.cy, intrinsics.height - 1.0
     shares = (config.road_top_ratio, config.road_bottom_ratio)
     top_row, bottom_row = (horizon + share * (bottom - horizon) for share in shares)
-    area = intrinsics.width * (bottom_row - top_row) * (config.road_top_width + config.road_bottom_width) / 2
+    area = intrinsics.width * (bottom_row - top_row) * (_ROAD_TOP_WIDTH + _ROAD_BOTTOM_WIDTH) / 2
     step = max(1.0, float(np.sqrt(max(area, 1.0) / _POINTS)))
     rows_seen = np.unique(np.clip(np.arange(top_row, bottom_row, step), 0, bottom).astype(np.int64))
     rows, columns = [], []
     for row in rows_seen:
         share = (row - top_row) / (bottom_row - top_row)
-        width = config.road_top_width + share * (config.road_bottom_width - config.road_top_width)
+        width = _ROAD_TOP_WIDTH + share * (_ROAD_BOTTOM_WIDTH - _ROAD_TOP_WIDTH)
         half = width * intrinsics.width / 2
         across = np.arange(intrinsics.cx - half, intrinsics.cx + half, step)
         across = np.unique(across[(across >= 0) & (across < intrinsics.width)].astype(np.int64))
@@ -89,7 +90,7 @@ def _trapezoid(intrinsics: Intrinsics, config: ScaleConfig) -> tuple[NDArray[np.
     return v, u, intrinsics.rays(np.stack([u, v], axis=-1))
 
 
-def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig, seed: int) -> FloatArray | None:
+def _ransac(rays: FloatArray, inverse_depth: FloatArray, seed: int) -> FloatArray | None:
     """``n / h`` ``(3,)`` of the level plane with most inliers, or None."""
     rng = np.random.default_rng(seed)
     samples = rng.integers(len(rays), size=(_HYPOTHESES, 3))
@@ -98,21 +99,21 @@ def _ransac(rays: FloatArray, inverse_depth: FloatArray, config: ScaleConfig, se
     if not solvable.any():
         return None
     planes = np.linalg.solve(minimal[solvable], inverse_depth[samples[solvable]][..., None])[..., 0]  # (S, 3)
-    level = planes[:, 1] > np.cos(np.deg2rad(config.max_tilt_deg)) * np.linalg.norm(planes, axis=1)
+    level = planes[:, 1] > np.cos(np.deg2rad(_MAX_TILT_DEG)) * np.linalg.norm(planes, axis=1)
     if not level.any():
         return None
     planes = planes[level]
-    votes = _inliers(rays, inverse_depth, planes, config).sum(axis=1)
+    votes = _inliers(rays, inverse_depth, planes).sum(axis=1)
     best: FloatArray = planes[votes.argmax()]
     return best
 
 
-def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray, config: ScaleConfig) -> NDArray[np.bool_]:
+def _inliers(rays: FloatArray, inverse_depth: FloatArray, planes: FloatArray) -> NDArray[np.bool_]:
     """Inliers ``(S, P)`` of planes ``n / h`` ``(S, 3)`` by the relative error of depth."""
     over_measured = (rays / inverse_depth[:, None]).T.astype(np.float32)
     relative = planes.astype(np.float32) @ over_measured
     relative -= 1.0
-    return np.asarray(np.abs(relative, out=relative) < config.inlier_relative_depth)
+    return np.asarray(np.abs(relative, out=relative) < _INLIER_RELATIVE_DEPTH)
 
 
 def _reweighted(rays: FloatArray, inverse_depth: FloatArray, plane: FloatArray, sigma: float) -> FloatArray:

@@ -14,6 +14,11 @@ from slam.frontend.scale.road_plane import GroundPlane
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 
+_REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
+_REJECTION_MADS = 3.0  # distance from the median beyond which a frame is left out, median absolute deviations
+MIN_FRAMES = 5  # least number of usable frames of a scale
+_SMOOTHING_FRAMES = 41  # window over which the scale of a frame is averaged, frames
+
 
 @dataclass(frozen=True)
 class ScaleEstimate:
@@ -37,24 +42,24 @@ def resolve_mode(config: ScaleConfig, camera_height_m: float | None, has_gps: bo
 
 
 def scale_from_road(
-    roads: Sequence[GroundPlane | MeasurementFailure], camera_height_m: float | None, config: ScaleConfig
+    roads: Sequence[GroundPlane | MeasurementFailure], camera_height_m: float | None
 ) -> ScaleEstimate | MeasurementFailure:
     """Metres per unscaled length; without a known height, camera heights per unscaled length (mode none)."""
     height = 1.0 if camera_height_m is None else camera_height_m
     ratios = [height / road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
-    return estimate_scale(np.array(ratios), config)
+    return estimate_scale(np.array(ratios))
 
 
 def scale_from_reference(
-    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray, config: ScaleConfig
+    T_world_camera_unscaled: FloatArray, T_world_camera_true: FloatArray
 ) -> ScaleEstimate | MeasurementFailure:
-    """True path length over estimated path length of the first ``reference_frames`` frames."""
+    """True path length over estimated path length of the first 50 frames."""
     estimated, true = (
-        np.linalg.norm(np.diff(T[: config.reference_frames, :3, 3], axis=0), axis=1)
+        np.linalg.norm(np.diff(T[:_REFERENCE_FRAMES, :3, 3], axis=0), axis=1)
         for T in (T_world_camera_unscaled, T_world_camera_true)
     )
     if estimated.sum() <= 0 or true.sum() <= 0:
-        return MeasurementFailure(f"the camera does not move within the first {config.reference_frames} frames")
+        return MeasurementFailure(f"the camera does not move within the first {_REFERENCE_FRAMES} frames")
     value = float(true.sum() / estimated.sum())
     moving = estimated > 0.1 * estimated.mean()
     spread = float(np.std(true[moving] / estimated[moving] / value))
@@ -99,15 +104,15 @@ def scale_from_distance(
     return ScaleEstimate(config.known_m / float(apart), 0.0, 2)
 
 
-def estimate_scale(ratios: FloatArray, config: ScaleConfig) -> ScaleEstimate | MeasurementFailure:
+def estimate_scale(ratios: FloatArray) -> ScaleEstimate | MeasurementFailure:
     """One scale from a ratio per frame ``(K,)``: their median without outliers, which are many MADs away."""
     ratios = np.asarray(ratios, dtype=np.float64)
     ratios = ratios[np.isfinite(ratios) & (ratios > 0)]
-    if len(ratios) < config.min_frames:
-        return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {config.min_frames} are needed")
+    if len(ratios) < MIN_FRAMES:
+        return MeasurementFailure(f"only {len(ratios)} frames measure the scale, {MIN_FRAMES} are needed")
     logarithms = np.log(ratios)
     deviations = np.abs(logarithms - np.median(logarithms))
-    kept = logarithms[deviations <= config.rejection_mads * mad_sigma(deviations) + 1e-12]
+    kept = logarithms[deviations <= _REJECTION_MADS * mad_sigma(deviations) + 1e-12]
     spread = mad_sigma(kept - np.median(kept))
     return ScaleEstimate(float(np.exp(np.median(kept))), spread, len(kept))
 
@@ -116,21 +121,20 @@ def scale_track(
     roads: Sequence[GroundPlane | MeasurementFailure],
     camera_height_m: float | None,
     estimate: ScaleEstimate,
-    config: ScaleConfig,
 ) -> FloatArray:
     """The scale near each frame ``(N,)``: a running median over ground planes.
 
-    The unit of learned depth drifts along a drive. Where ``smoothing_frames`` around a frame hold too few
+    The unit of learned depth drifts along a drive. Where the 41 frames around a frame hold too few
     usable planes, the estimate of the whole drive is used.
     """
     height = 1.0 if camera_height_m is None else camera_height_m
     ratios = np.array([height / r.height_unscaled if isinstance(r, GroundPlane) else np.nan for r in roads])
-    bound = config.rejection_mads * max(estimate.spread, 0.02)
+    bound = _REJECTION_MADS * max(estimate.spread, 0.02)
     ratios[np.abs(np.log(ratios / estimate.value)) > bound] = np.nan
-    half = config.smoothing_frames // 2
+    half = _SMOOTHING_FRAMES // 2
     track = np.full(len(ratios), estimate.value)
     for k in range(len(ratios)):
         near = ratios[max(k - half, 0) : k + half + 1]
-        if np.isfinite(near).sum() >= config.min_frames:
+        if np.isfinite(near).sum() >= MIN_FRAMES:
             track[k] = np.nanmedian(near)
     return track

@@ -30,6 +30,10 @@ _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
 _MOST_CORRELATED = 0.999
+_RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
+_UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
+_UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
+_CORRELATED_WIDENING = 1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
 
 
 @dataclass(frozen=True)
@@ -122,15 +126,15 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     """Robust least squares on all evidence: Huber weights first, then Cauchy weights against outliers."""
     steps = len(evidence.learned)
     lengths, units = np.arange(steps), steps + np.arange(steps)
-    ratio_sigma = np.hypot(config.ratio_widening * evidence.ratio_sigma, config.ratio_sigma)
+    ratio_sigma = np.hypot(_RATIO_WIDENING * evidence.ratio_sigma, config.ratio_sigma)
     ones = np.ones(steps)
     rows = [
         _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
         _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
-        _Rows(units[1:], units[:-1], 0.0 * ones[1:], config.unit_walk_sigma * ones[1:]),
+        _Rows(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
-        _Rows(units, None, 0.0 * ones, config.unit_sigma * np.sqrt(steps) * ones),
+        _Rows(units, None, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
     ]
     A, target = _whitened(rows, 2 * steps)
     measured = np.zeros(steps, dtype=bool)
@@ -147,7 +151,7 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         weights = 1.0 / np.maximum(residual / _HUBER_K, 1.0) if iteration < _HUBER_ITERATIONS else robust
     known = np.where(measured, 1.0, np.nan)
     sigmas, correlations = marginals(information, steps)
-    correlated_sigmas = config.correlated_widening * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
+    correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
     return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * correlated_sigmas, np.exp(state[steps:]))
 
 

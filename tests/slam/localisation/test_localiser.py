@@ -215,8 +215,13 @@ def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp
 
 
 def test_the_run_of_an_earlier_release_serves_still(run: RunFolder, album: Path) -> None:
-    stored = (run.path / "config.yaml").read_text().replace("  memory_mb: 1000", "  max_blocks: 12000")
-    assert "max_blocks" in stored
+    stored = (
+        (run.path / "config.yaml")
+        .read_text()
+        .replace("  memory_mb: 1000", "  max_blocks: 12000")
+        .replace("  words: 1000", "  words: 1000\n  peak_frames: 10")
+    )
+    assert "max_blocks" in stored and "peak_frames" in stored
     run.write_text("config.yaml", stored)
     (found,) = localise(album, run, numbers=range(1, 2))
     assert found.T_world_camera is not None

@@ -5,6 +5,7 @@ import pytest
 
 from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics
+from slam.loops import verification
 from slam.loops.descriptors import View
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
@@ -67,7 +68,8 @@ def test_noisy_depth_stays_within_its_sigmas() -> None:
     assert moved < 2 * loop.measured.sigmas[3] and np.deg2rad(turned_deg) < 3 * loop.measured.sigmas[0]
 
 
-def test_sigmas_grow_with_the_error_of_corners_and_cover_it() -> None:
+def test_sigmas_grow_with_the_error_of_corners_and_cover_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verification, "_LENGTH_RELATIVE_SIGMA", 1e-6)
     whitened, sizes = [], []
     for sigma_px in (0.3, 1.0):
         for seed in range(12):
@@ -75,7 +77,7 @@ def test_sigmas_grow_with_the_error_of_corners_and_cover_it() -> None:
             rng = np.random.default_rng(seed)
             for view in views:
                 view.pixels[:] += rng.normal(size=view.pixels.shape) * sigma_px
-            loop = verify(*views, length_relative_sigma=1e-6)
+            loop = verify(*views)
             assert isinstance(loop, Loop)
             T_error = invert(from_rotation_vector(np.array([0.0, 0.05, 0.0]), np.array([0.5, 0.0, 0.0])))
             T_error = T_error @ loop.measured.T_from_to
@@ -94,15 +96,15 @@ def test_wrong_matches_are_ransac_outliers() -> None:
     assert error(loop, T_A_B)[0] < 0.05
 
 
-def test_seeds_draw_other_ransac_samples_and_one_seed_the_same() -> None:
+def test_seeds_draw_other_ransac_samples_and_one_seed_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Noisy depth and wrong matches: the inliers depend on the samples, the pose hardly does."""
+    monkeypatch.setattr(verification, "_RANSAC_ITERATIONS", 50)
     scene = Scene(noise=0.15)
     earlier, later = scene.views()
     later.pixels[:80] = np.random.default_rng(1).uniform([0, 0], [415, 127], (80, 2))
-    config = LoopsConfig(ransac_iterations=50)
     poses = []
     for seed in (0, 0, 1, 2, 3):
-        loop = LoopVerifier(config, CAMERA, seed=seed).verify(earlier, later, 0.7)
+        loop = LoopVerifier(LoopsConfig(), CAMERA, seed=seed).verify(earlier, later, 0.7)
         assert isinstance(loop, Loop) and error(loop, T_A_B)[0] < 0.5
         poses.append(loop.measured.T_from_to.tobytes())
     assert poses[0] == poses[1] and len(set(poses[1:])) > 1

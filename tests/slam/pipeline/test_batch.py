@@ -121,7 +121,7 @@ def test_the_graph_reduces_the_noise_of_the_pose_network() -> None:
 
 def test_scale_drift_is_corrected_by_the_ground_plane() -> None:
     noise = OracleNoise(scale_drift_sigma=0.03)
-    result = run(LevelRoad(turning(200)), "scale.smoothing_frames=11", noise=noise)
+    result = run(LevelRoad(turning(200)), noise=noise)
     drifted = result.network.length_m / FACTOR / turning_length(200)
     assert abs(np.log(drifted)) > 0.1
     assert result.optimised.length_m == pytest.approx(turning_length(200), rel=0.03)

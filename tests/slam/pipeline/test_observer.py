@@ -22,7 +22,8 @@ from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.pipeline.batch import SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.observer import Observer, ObserverState, read_frame
+from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.reading import read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray

@@ -11,6 +11,7 @@ from slam import se3
 from slam.config import RoadConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale import road_homography
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
@@ -54,16 +55,14 @@ def pitched(pitch_deg: float) -> np.ndarray:
     return se3.from_rotation_vector(np.deg2rad([pitch_deg, 0.0, 0.0]), np.zeros(3))
 
 
-def measure(
-    texture, step: np.ndarray, pitch_deg: float = 0.0, config=CONFIG, car_ahead=False
-) -> RoadStep | MeasurementFailure:
+def measure(texture, step: np.ndarray, pitch_deg: float = 0.0, car_ahead=False) -> RoadStep | MeasurementFailure:
     """One step of a camera that looks down by ``pitch_deg``; only the direction of its motion is given."""
     T_body_camera = pitched(-pitch_deg)
     previous = render(T_body_camera, texture, 0, car_ahead)
     current = render(step @ T_body_camera, texture, 1, car_ahead)
     T_previous_current = se3.invert(T_body_camera) @ step @ T_body_camera
     T_previous_current[:3, 3] *= 7.0
-    return RoadHomography(config, CAMERA).measure(previous, current, T_previous_current)
+    return RoadHomography(CONFIG, CAMERA).measure(previous, current, T_previous_current)
 
 
 @pytest.mark.parametrize("length_m", [0.15, 0.6, 1.3, 2.4])
@@ -74,7 +73,7 @@ def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(length_m, rel=0.02)
     assert np.rad2deg(np.arctan2(road.normal[2], road.normal[1])) == pytest.approx(pitch_deg, abs=0.3)
-    assert CONFIG.relative_sigma <= road.relative_sigma < 2 * CONFIG.relative_sigma
+    assert 0.06 <= road.relative_sigma < 0.12
 
 
 def test_lengths_are_right_on_average(texture):
@@ -110,12 +109,12 @@ def test_before_a_car_that_hides_most_of_the_road_the_short_strip_measures(textu
     road = RoadHomography(CONFIG, CAMERA).measure(*frames, step)
     assert isinstance(road, RoadStep)
     assert road.length_heights * HEIGHT_M == pytest.approx(1.0, rel=0.1)
-    assert road.relative_sigma >= CONFIG.near_relative_sigma
+    assert road.relative_sigma >= 0.1
     long_only = RoadConfig(near_heights=0.1)
     assert isinstance(RoadHomography(long_only, CAMERA).measure(*frames, step), MeasurementFailure)
 
 
-def test_what_is_no_road_is_refused_with_a_reason(texture):
+def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
     step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)
     noise = [Frame(k, 0.0, rng.integers(0, 255, (188, 620, 3), np.uint8)) for k in range(2)]
@@ -124,7 +123,9 @@ def test_what_is_no_road_is_refused_with_a_reason(texture):
     sky = Intrinsics(620, 188, 360.0, 360.0, 303.0, 180.0)
     failure = RoadHomography(CONFIG, sky).measure(*noise, step)
     assert isinstance(failure, MeasurementFailure) and "too little of the road" in failure.reason
-    failure = measure(texture, step, pitch_deg=3.0, config=RoadConfig(max_tilt_deg=0.01, tilt_sigma_deg=5.0))
+    monkeypatch.setattr(road_homography, "_MAX_TILT_DEG", 0.01)
+    monkeypatch.setattr(road_homography, "_TILT_SIGMA_DEG", 5.0)
+    failure = measure(texture, step, pitch_deg=3.0)
     assert isinstance(failure, MeasurementFailure) and "tilted" in failure.reason
 
 

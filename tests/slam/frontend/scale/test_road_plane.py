@@ -51,7 +51,7 @@ def test_scale_is_within_one_percent_under_noise_and_outliers():
     assert all(isinstance(road, GroundPlane) for road in roads)
     heights = np.array([road.height_unscaled for road in roads])
     np.testing.assert_allclose(heights, HEIGHT, rtol=0.02)
-    estimate = scale_from_road(roads, 1.65, CONFIG)
+    estimate = scale_from_road(roads, 1.65)
     assert isinstance(estimate, ScaleEstimate)
     assert estimate.value == pytest.approx(1.65 / HEIGHT, rel=0.01)
     assert estimate.frames_used >= 15

@@ -15,6 +15,7 @@ from slam.se3 import from_rotation_vector
 
 CONFIG = LengthConfig()
 STEPS = 200
+RATIO_WIDENING, CORRELATED_WIDENING = 1.5, 1.5  # of the sigmas of ratios, and of those in the pose graph
 TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
 
 
@@ -184,12 +185,12 @@ def test_correlated_sigmas_are_those_of_sums_of_lengths() -> None:
             absolute=noisy(0.06, seed=300 + seed),
             absolute_sigma=np.full(STEPS, 0.06),
             ratio=chained,
-            ratio_sigma=np.full(STEPS, 0.02 / CONFIG.ratio_widening),
+            ratio_sigma=np.full(STEPS, 0.02 / RATIO_WIDENING),
         )
-        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9, correlated_widening=1.0))
+        solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))
         summed = np.log(solved.length / TRUE)[middle].sum()
         alone.append(summed / np.linalg.norm(solved.relative_sigma[middle]))
-        together.append(summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
+        together.append(CORRELATED_WIDENING * summed / np.linalg.norm(solved.relative_correlated_sigma[middle]))
     assert 0.75 < np.sqrt(np.square(together).mean()) < 1.3
     assert np.sqrt(np.square(alone).mean()) > 1.5
 
@@ -207,7 +208,7 @@ def test_sigmas_are_those_of_the_errors_of_lengths() -> None:
             absolute=road,
             absolute_sigma=np.full(STEPS, 0.06),
             ratio=chained,
-            ratio_sigma=np.full(STEPS, 0.01 / CONFIG.ratio_widening),
+            ratio_sigma=np.full(STEPS, 0.01 / RATIO_WIDENING),
             learned=noisy(0.1, seed=200 + seed),
         )
         solved = solve_lengths(measured, LengthConfig(outlier_sigmas=1e9))

@@ -99,7 +99,7 @@ class ImageGate:
     def _scene_failure(self, thumbnail: _Layer, small: _Grey) -> MeasurementFailure | None:
         state, flip = self._state, self._flip_of(thumbnail, small)
         if flip is not None:
-            turned, tracked = (np.ascontiguousarray(each[_FLIPS[flip]]) for each in (thumbnail, small))
+            turned, tracked = np.ascontiguousarray(thumbnail[_FLIPS[flip]]), np.ascontiguousarray(small[_FLIPS[flip]])
             self._state = replace(state, usable=turned, doubtful=None, tracked=tracked, flip=flip)
             return MeasurementFailure(f"the image is {flip}")
         known = [each for each in (state.usable, state.doubtful) if each is not None]

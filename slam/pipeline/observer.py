@@ -28,12 +28,15 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
 from slam.pipeline.pending import PendingFrame, PendingTask
+from slam.runtime.memory import return_freed_memory
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray, chain
 from slam.storage.cache import GetOrCompute, without_cache
 from slam.storage.spill import SpillFile
 
 logger = logging.getLogger(__name__)
+
+_FRAMES_UNTIL_TRIM = 200
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,8 @@ class Observer:
         Raises:
             SequenceError: the frame's own, where too many in a row could not be read.
         """
+        if index % _FRAMES_UNTIL_TRIM == 0:
+            return_freed_memory()
         if isinstance(frame, SequenceError):
             self._require_readable(frame)
             self._leave_out(index, str(frame))

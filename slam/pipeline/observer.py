@@ -36,8 +36,6 @@ from slam.storage.spill import SpillFile
 
 logger = logging.getLogger(__name__)
 
-_FRAMES_UNTIL_TRIM = 200
-
 
 @dataclass(frozen=True)
 class RecentFrame:
@@ -141,7 +139,7 @@ class Observer:
         Raises:
             SequenceError: the frame's own, where too many in a row could not be read.
         """
-        if index % _FRAMES_UNTIL_TRIM == 0:
+        if index % 200 == 0:  # 24 MB
             return_freed_memory()
         if isinstance(frame, SequenceError):
             self._require_readable(frame)

@@ -67,6 +67,11 @@ class ImageGate:
         """The state to resume from."""
         return self._state
 
+    @property
+    def was_moving(self) -> bool:
+        """Whether the camera moved between the last two new images."""
+        return self._state.difference > _MOVING * self._config.repeat_difference
+
     def check(self, frame: Frame) -> Verdict:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
         state = self._state
@@ -139,7 +144,7 @@ class ImageGate:
             return False
         difference = _difference(before, shrunk)
         largest = min(max(limit, _COPY_OVER_MOTION * motion), _LARGEST_COPY * limit)
-        if difference < largest and motion > _MOVING * limit:
+        if difference < largest and self.was_moving:
             return True
         self._state = replace(self._state, shrunk=shrunk, difference=difference)
         return False

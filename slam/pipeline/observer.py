@@ -153,7 +153,7 @@ class Observer:
                 self._leave_out(index, verdict.reason)
                 return
             if verdict == "repeated":
-                self._seen.repeated.append(index)
+                self._seen.repeat(index, self._gate.was_moving)
         pending = self._submit_networks(frame)
         try:
             self._process_pending()

@@ -22,6 +22,8 @@ _MOVING = 3.0
 _COPY_OVER_MOTION = 0.25
 _LARGEST_COPY = 2.0
 _LEAST_FLIPPED_CORRELATION = 0.3
+# of the median grey level from an image to the next, in logarithms
+_EXPOSURE_STEP = 0.1
 # corners followed from the last image to a flipped one: a least share, and so many times those without flipping
 _WIDTH_OF_TRACKING = 208
 _CORNERS = 100
@@ -43,7 +45,8 @@ class GateState:
 
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
     from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length; ``tracked``, the image of
-    ``usable`` at a smaller size, turned the right way; ``flip``, how the image before was flipped.
+    ``usable`` at a smaller size, turned the right way; ``flip``, how the image before was flipped;
+    of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
     """
 
     last: Frame | None = None
@@ -54,6 +57,8 @@ class GateState:
     doubtful: _Layer | None = None
     tracked: _Grey | None = None
     flip: str | None = None
+    compared: int = 0
+    exposed: int = 0
 
 
 class ImageGate:
@@ -86,7 +91,7 @@ class ImageGate:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < self._config.blank_contrast:
             # images after a dark one are not compared with those before it
-            self._state = GateState()
+            self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
@@ -98,8 +103,16 @@ class ImageGate:
         failure = self._scene_failure(thumbnail, small)
         if failure is not None:
             return failure
+        self._count_exposure(small)
         self._state = replace(self._state, usable=thumbnail, doubtful=None, tracked=small, flip=None)
         return "repeated" if self._is_copy(frame) else "new"
+
+    def _count_exposure(self, small: _Grey) -> None:
+        state = self._state
+        if state.tracked is not None:
+            before, now = np.median(state.tracked), np.median(small)
+            exposed = abs(float(np.log((now + 1.0) / (before + 1.0)))) > _EXPOSURE_STEP
+            self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + exposed)
 
     def _scene_failure(self, thumbnail: _Layer, small: _Grey) -> MeasurementFailure | None:
         state, flip = self._state, self._flip_of(thumbnail, small)

@@ -12,6 +12,9 @@ logger = logging.getLogger(__name__)
 
 DOUBLED = "the image repeats the one before while the camera moves"
 _MOST_NAMED = 10
+# real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
+_ROLLING_EXPOSURE = 0.6
+_LEAST_COMPARED = 30
 
 
 def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
@@ -23,6 +26,14 @@ def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) 
     if doubled:
         named = ", ".join(map(str, doubled[:_MOST_NAMED])) + (", ..." if len(doubled) > _MOST_NAMED else "")
         logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named)
+    gate = state.gate
+    if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
+        logger.warning(
+            "the exposure rolls: %d of %d images are more than a tenth brighter or darker than the one before; fix the "
+            "exposure, or its flicker under lamps",
+            gate.exposed,
+            gate.compared,
+        )
     end = frames - 1
     for first, last in runs(state.seen.repeated):
         if last == end and end not in seen.interpolated:

@@ -187,6 +187,20 @@ def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     assert result.observations.interpolated == {} and ate(result) < 0.6
 
 
+def rolling_exposure(sequence: SimulatedSequence, index: int) -> Frame:
+    frame = sequence.frame(index)
+    image = np.clip(frame.image * (1.0 + 0.6 * np.sin(0.4 * index)), 0, 255).astype(np.uint8)
+    return replace(frame, image=image)
+
+
+def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    run(rolling_exposure, range(FRAMES), "mapping.enabled=false")
+    assert "the exposure rolls: " in caplog.text
+    caplog.clear()
+    run(rolling_exposure, range(0), "mapping.enabled=false")
+    assert "exposure" not in caplog.text
+
+
 def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
     assert (result := run(bad=range(0))).observations.interpolated == {}
     assert doubled_frames(FRAMES, result.observations, result.state) == []

@@ -70,7 +70,7 @@ def find_candidates(
         near |= path_m[block, None] - path_m[None, :] < config.min_path_m
         scores[near] = 0.0
         for later, row in zip(block, scores, strict=True):
-            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices, config)]
+            found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices)]
     return found
 
 
@@ -169,8 +169,8 @@ def _weighted(counts: csr_array, inverse_frequency: FloatArray) -> csr_array:
     return weights
 
 
-def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]], config: LoopsConfig) -> list[int]:
-    """The best columns, none within ``peak_frames`` of a better one."""
+def _peaks(scores: FloatArray, indices: np.ndarray[tuple[int], np.dtype[np.int64]]) -> list[int]:
+    """The best columns, none within ten frames of a better one."""
     scores = scores.copy()
     peaks: list[int] = []
     while len(peaks) < _CANDIDATES_PER_FRAME:

@@ -23,6 +23,8 @@ from slam.se3 import FloatArray, invert
 _RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
+_DECISION_STEPS = 30  # triangulated steps after which auto decides
+_VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 
 
 def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
@@ -94,7 +96,7 @@ class KeyframeTracking:
         """End the tracking where the first steps are those of a vehicle."""
         if self._odometry is None or self._is_carried:
             return
-        vehicle = False if self._config.use == "always" else is_vehicle(seen, self._config)
+        vehicle = False if self._config.use == "always" else is_vehicle(seen)
         self._is_carried = vehicle is False
         if vehicle:
             self._odometry = None
@@ -131,16 +133,16 @@ class KeyframeTracking:
 
     def poses(self, maps: Sequence[Segment]) -> WindowPoses:
         """Relative poses of all frames of some maps."""
-        return window_poses(maps, self._intrinsics, self._config, self._seed)
+        return window_poses(maps, self._intrinsics, self._seed)
 
 
-def is_vehicle(seen: Observations, config: WindowConfig) -> bool | None:
+def is_vehicle(seen: Observations) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
     triangulated = (motion for motion in seen.motions if motion.triangulated is not None)
-    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, config.decision_steps)]
-    if len(first) < config.decision_steps:
+    first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]
+    if len(first) < _DECISION_STEPS:
         return None
     directions = np.array(first) / np.linalg.norm(first, axis=1, keepdims=True)
     usual = np.median(directions, axis=0)
     cosine = directions @ usual / max(float(np.linalg.norm(usual)), 1e-9)
-    return float(np.median(cosine)) > float(np.cos(np.deg2rad(config.vehicle_scatter_deg)))
+    return float(np.median(cosine)) > float(np.cos(np.deg2rad(_VEHICLE_SCATTER_DEG)))

@@ -70,13 +70,13 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, config.loops, seed)
     loops, rejected = list(found.found), list(found.rejected)
     while True:
-        closed, wrong = _closed(rows, loops, intrinsics, config)
+        closed, wrong = _closed(rows, loops, intrinsics)
         if not wrong:
             break
         loops = [loop for loop in loops if loop not in wrong]
         rejected += [rows.refused(loop, "its corners are not the same points after the adjustment") for loop in wrong]
     ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
-    poses = window_poses(closed, intrinsics, config.window, seed, ends)
+    poses = window_poses(closed, intrinsics, seed, ends)
     joins = rows.joins(loops)
     for joined in joins:
         logger.info("%s", joined)
@@ -155,9 +155,7 @@ class _Rows:
         return T, scales
 
 
-def _closed(
-    rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics, config: SlamConfig
-) -> tuple[list[Segment], list[MapLoop]]:
+def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tuple[list[Segment], list[MapLoop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
     count = len(rows.segments)
     ends = rows.maps[np.array([loop.rows for loop in loops], np.intp).reshape(-1, 2)]
@@ -170,14 +168,14 @@ def _closed(
         if not inside:
             closed += [rows.segments[member] for member in members]
             continue
-        joined, kept = _joined(rows, inside, members, intrinsics, config)
+        joined, kept = _joined(rows, inside, members, intrinsics)
         closed.append(joined)
         wrong += [loop for loop, ratio in zip(inside, kept, strict=True) if ratio < _LEAST_KEPT]
     return closed, wrong
 
 
 def _joined(
-    rows: _Rows, loops: Sequence[MapLoop], members: NDArray[np.intp], intrinsics: Intrinsics, config: SlamConfig
+    rows: _Rows, loops: Sequence[MapLoop], members: NDArray[np.intp], intrinsics: Intrinsics
 ) -> tuple[Segment, list[float]]:
     T, scales = rows.start(loops, members)
     chosen = np.flatnonzero(np.isin(rows.maps, members))
@@ -190,7 +188,7 @@ def _joined(
     ]
     T, scales = optimise_similarities(T[chosen], scales[chosen], edges)
     shared = [SharedCorners(int(place[loop.rows[0]]), int(place[loop.rows[1]]), loop.corners) for loop in loops]
-    return join([rows.segments[member] for member in members], T, scales, shared, intrinsics, config.window)
+    return join([rows.segments[member] for member in members], T, scales, shared, intrinsics)
 
 
 def _steps(rows: _Rows, chosen: NDArray[np.intp]) -> list[RelativeSimilarity]:

@@ -44,9 +44,9 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Noise:
-    """Sigma of a pixel coordinate; residuals beyond ``huber`` sigmas weigh less."""
+    """Sigma of a tracked corner's coordinate, pixels; residuals beyond ``huber`` sigmas weigh less."""
 
-    pixel: float = 1.0
+    pixel: float = 0.7
     huber: float = 1.5
 
 
@@ -86,7 +86,9 @@ class BundleAdjustment:
         self._of_point = _summing(sightings.point, self._points)
         self._blocks = self._eliminated_together()
 
-    def solve(self, T_camera_world: FloatArray, points: FloatArray, iterations: int, tolerance: float) -> Adjusted:
+    def solve(
+        self, T_camera_world: FloatArray, points: FloatArray, iterations: int, tolerance: float = 1e-4
+    ) -> Adjusted:
         """Adjust from a start until the cost falls by less than ``tolerance`` of itself."""
         T, X = T_camera_world.copy(), points.copy()
         residuals = self.residuals(T, X)

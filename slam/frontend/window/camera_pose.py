@@ -14,6 +14,8 @@ from slam.resection import consensus
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray, apply, from_rotation_vector, make
 
+MIN_POINTS = 20  # least number of points that give a camera its pose
+INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels
 _ITERATIONS = 12
 _CONVERGED = 1e-7
 _LEAST_PIXEL_SIGMA = 0.1

@@ -10,10 +10,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import WindowConfig
 from slam.frames import Intrinsics
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise
-from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
+from slam.frontend.window.local_map import OUTLIER_PX, LocalMap, TrackIds, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame
 from slam.se3 import FloatArray, apply, invert
 
@@ -39,7 +38,6 @@ def join(
     scales: FloatArray,
     shared: Sequence[SharedCorners],
     intrinsics: Intrinsics,
-    config: WindowConfig,
 ) -> tuple[Segment, list[float]]:
     """One map of several, or of one with loops; the segments stay as they are.
 
@@ -49,7 +47,6 @@ def join(
         scales: units of that world per unit of each keyframe's own map ``(K,)``.
         shared: between keyframes, by rows of these.
         intrinsics: of all images.
-        config: noise and outliers.
 
     Returns:
         The map, and for each of ``shared`` the ratio of its corners that the adjustment left in one point.
@@ -58,7 +55,7 @@ def join(
     keyframes = united.map.keyframes
     tracks = _merged_tracks(keyframes, len(united.map.points), shared)
     joined = _renumbered(united, tracks)
-    _adjust_all(joined.map, intrinsics, config)
+    _adjust_all(joined.map, intrinsics)
     return joined, [_kept_ratio(each, keyframes, joined.map.keyframes, tracks) for each in shared]
 
 
@@ -145,17 +142,17 @@ def _renumbered(segment: Segment, tracks: TrackIds) -> Segment:
     return Segment(LocalMap(keyframes, points), frames, started=True)
 
 
-def _adjust_all(local: LocalMap, intrinsics: Intrinsics, config: WindowConfig) -> None:
+def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
     """Adjust all keyframes but the first, in rounds between which outliers are taken out."""
-    noise = Noise(config.pixel_sigma, huber=config.huber_sigmas)
+    noise = Noise()
     for limit in _OUTLIER_LIMITS:
         sightings, track_ids = local.sightings(range(len(local.keyframes)), np.isfinite(local.points[:, 0]))
         free = np.arange(len(local.keyframes)) > 0
         poses = np.array([keyframe.T_camera_world for keyframe in local.keyframes])
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
-        solved = problem.solve(poses, local.points[track_ids], _ITERATIONS, config.tolerance)
+        solved = problem.solve(poses, local.points[track_ids], _ITERATIONS)
         local.points[track_ids] = solved.points
-        bad = solved.residual_px > limit * config.outlier_px
+        bad = solved.residual_px > limit * OUTLIER_PX
         for row, keyframe in enumerate(local.keyframes):
             gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
             local.keyframes[row] = replace(keyframe.without(gone), T_camera_world=solved.T_camera_world[row])

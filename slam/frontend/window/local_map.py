@@ -30,6 +30,12 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
+_MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
+_ITERATIONS = 12  # most iterations of a bundle adjustment
+CORNER_QUALITY = 0.002  # least corner strength over that of the strongest corner
+WINDOW_PX = 15  # side of the Lucas-Kanade window, pixels
+FORWARD_BACKWARD_PX = 0.7  # largest forward-backward tracking error, pixels
+OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class WindowKeyframe:
 def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
     """Corners ``(M, 2)`` of an image without tracks."""
     none = np.zeros((0, 2), np.float32)
-    return new_corners(grey, none, config.max_corners, config.corner_spacing_px, config.corner_quality)
+    return new_corners(grey, none, config.max_corners, config.corner_spacing_px, CORNER_QUALITY)
 
 
 @dataclass
@@ -119,7 +125,7 @@ class LocalMap:
         error = np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)
         worst = np.zeros(len(track_ids))
         np.maximum.at(worst, row, error)
-        good = (angle > np.deg2rad(config.min_angle_deg)) & (worst < config.outlier_px)
+        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)
         self.points[track_ids[good]] = X[good]
 
     def adjust(self, intrinsics: Intrinsics, config: WindowConfig) -> TrackIds:
@@ -137,12 +143,12 @@ class LocalMap:
         sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
         free[: max(len(fixed), 1)] = False
-        noise = Noise(config.pixel_sigma, huber=config.huber_sigmas)
+        noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
-        solved = problem.solve(poses, self.points[track_ids], config.iterations, config.tolerance)
+        solved = problem.solve(poses, self.points[track_ids], _ITERATIONS)
         self.points[track_ids] = solved.points
-        bad = solved.residual_px > config.outlier_px
+        bad = solved.residual_px > OUTLIER_PX
         for row, k in enumerate(chosen):
             gone = track_ids[sightings.point[bad & (sightings.camera == row)]]
             self.keyframes[k] = replace(self.keyframes[k].without(gone), T_camera_world=solved.T_camera_world[row])
@@ -178,7 +184,6 @@ class LocalMap:
         track_ids: TrackIds,
         pixels: Pixels,
         intrinsics: Intrinsics,
-        config: WindowConfig,
     ) -> Pixels:
         """Corners of a new keyframe aligned to the earliest of the last keyframes that sees them, against drift."""
         pixels, pending = pixels.copy(), np.ones(len(track_ids), np.bool_)
@@ -187,14 +192,14 @@ class LocalMap:
             a, b = a[pending[b]], b[pending[b]]
             if len(a) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics, config)
+            found, kept = _matched(keyframe, a, grey, T_camera_world, pixels[b], intrinsics)
             kept &= np.linalg.norm(found - pixels[b], axis=1) < _ALIGNED_PX
             pixels[b[kept]] = found[kept]
             pending[b[kept]] = False
         return pixels
 
     def found_again(
-        self, grey: Grey, T_camera_world: FloatArray, track_ids: TrackIds, intrinsics: Intrinsics, config: WindowConfig
+        self, grey: Grey, T_camera_world: FloatArray, track_ids: TrackIds, intrinsics: Intrinsics
     ) -> tuple[TrackIds, Pixels]:
         """Known points that are not among the tracks of a new keyframe, found near their projections."""
         missing = np.isfinite(self.points[:, 0])
@@ -211,7 +216,7 @@ class LocalMap:
             rows, projected = rows[inside], projected[inside]
             if len(rows) < _LEAST_MATCHED:
                 continue
-            found, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics, config)
+            found, kept = _matched(keyframe, rows, grey, T_camera_world, projected, intrinsics)
             kept &= np.linalg.norm(found - projected, axis=1) < _PROJECTED_PX
             tracks.append(keyframe.track_ids[rows[kept]])
             places.append(found[kept])
@@ -243,7 +248,6 @@ def _matched(
     T_camera_world: FloatArray,
     guesses: Pixels,
     intrinsics: Intrinsics,
-    config: WindowConfig,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     """Corners of a keyframe found in an image, the keyframe's image turned as the new camera is."""
     if keyframe.grey is None:
@@ -254,4 +258,4 @@ def _matched(
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     moved = np.column_stack([keyframe.pixels[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    return flow(turned, grey, pixels, guesses, config.window_px, _MATCHED_LEVELS, config.forward_backward_px)
+    return flow(turned, grey, pixels, guesses, WINDOW_PX, _MATCHED_LEVELS, FORWARD_BACKWARD_PX)

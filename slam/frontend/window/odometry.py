@@ -22,10 +22,17 @@ from slam.frontend.visual.epipolar import (
     triangulated_depth,
     unit_pose_by_essential,
 )
-from slam.frontend.window.camera_pose import CameraPose, resect
+from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.window.descriptors import describe
 from slam.frontend.window.flow import Pixels, flow, new_corners
-from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
+from slam.frontend.window.local_map import (
+    CORNER_QUALITY,
+    FORWARD_BACKWARD_PX,
+    WINDOW_PX,
+    LocalMap,
+    TrackIds,
+    WindowKeyframe,
+)
 from slam.se3 import FloatArray, invert, make
 
 logger = logging.getLogger(__name__)
@@ -38,6 +45,10 @@ _START_KEYFRAMES = 3
 # a track this far from its projection has slipped
 _SLIPPED = 8.0 / 3.0
 _MOST_FLOW = 4.0
+_PYRAMID_LEVELS = 3  # image pyramid levels above the full image
+_START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
+_KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
+_MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
 
 
 @dataclass(frozen=True)
@@ -129,7 +140,7 @@ class WindowOdometry:
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        if not self._state.segments or self._state.lost > self._config.max_lost_frames:
+        if not self._state.segments or self._state.lost > _MAX_LOST_FRAMES:
             self._begin(frame)
             return
         segment = self._state.segments[-1]
@@ -164,7 +175,7 @@ class WindowOdometry:
 
     def _track(self, segment: Segment, frame: Frame) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places."""
-        state, config, keyframe = self._state, self._config, segment.map.keyframes[-1]
+        state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
         if keyframe.grey is None or not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
@@ -174,9 +185,9 @@ class WindowOdometry:
             frame.grey,
             keyframe.pixels[rows].astype(np.float32),
             guesses,
-            config.window_px,
-            config.pyramid_levels,
-            config.forward_backward_px,
+            WINDOW_PX,
+            _PYRAMID_LEVELS,
+            FORWARD_BACKWARD_PX,
         )
         shift = np.median(found[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
         state.places[rows] = np.where(kept[:, None], found, guesses + shift)
@@ -192,7 +203,7 @@ class WindowOdometry:
         rows = np.searchsorted(first.track_ids, track_ids)
         rays_first, rays = intrinsics.rays(first.pixels[rows]), intrinsics.rays(pixels.astype(np.float64))
         unexplained = parallax_px(rays_first, rays, rotation_between(rays_first, rays), intrinsics)
-        if np.median(unexplained) < self._config.start_parallax_ratio * intrinsics.width:
+        if np.median(unexplained) < _START_PARALLAX_RATIO * intrinsics.width:
             return
         motion = unit_pose_by_essential(rays_first, rays, _START_PX / intrinsics.fx, self._seed)
         if motion is None:
@@ -222,7 +233,7 @@ class WindowOdometry:
         state.lost = 0
         before, state.T_camera_world = state.T_camera_world, pose.T_camera_world
         state.T_last_step = state.T_camera_world @ invert(before)
-        slipped = track_ids[known][pose.residual_px > _SLIPPED * self._config.inlier_px]
+        slipped = track_ids[known][pose.residual_px > _SLIPPED * INLIER_PX]
         state.slipped |= np.isin(segment.map.keyframes[-1].track_ids, slipped)
         kept = ~np.isin(track_ids, slipped)
         track_ids, pixels = track_ids[kept], pixels[kept]
@@ -232,17 +243,17 @@ class WindowOdometry:
 
     def _resected(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
         """From the last pose and from the predicted one; None with too few inliers."""
-        if len(track_ids) < self._config.min_points:
+        if len(track_ids) < MIN_POINTS:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points, inlier_px = segment.map.points[track_ids], self._config.inlier_px
+        points, inlier_px = segment.map.points[track_ids], INLIER_PX
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, inlier_px, self._seed)
-        return pose if (pose.residual_px < inlier_px).sum() >= self._config.min_points else None
+        return pose if (pose.residual_px < inlier_px).sum() >= MIN_POINTS else None
 
     def _wants_keyframe(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> bool:
         keyframe, config = segment.map.keyframes[-1], self._config
-        if len(track_ids) < max(config.keyframe_tracks_ratio * len(keyframe.track_ids), config.min_points):
+        if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(keyframe.track_ids), MIN_POINTS):
             return True
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
@@ -257,11 +268,11 @@ class WindowOdometry:
         state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
         T = state.T_camera_world
         if segment.started:
-            pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics, config)
-            again, found = local.found_again(frame.grey, T, track_ids, intrinsics, config)
+            pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
+            again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
         fresh = new_corners(
-            frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px, config.corner_quality
+            frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px, CORNER_QUALITY
         )
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
@@ -284,10 +295,10 @@ class WindowOdometry:
         chosen = np.linspace(0, len(between) - 1, _START_KEYFRAMES + 2).astype(int)[1:-1]
         for frame in (between[row] for row in np.unique(chosen) if between):
             known = segment.map.known(frame.track_ids)
-            if known.sum() < self._config.min_points:
+            if known.sum() < MIN_POINTS:
                 continue
             points, pixels = segment.map.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
-            pose = resect((np.eye(4),), points, pixels, self._intrinsics, self._config.inlier_px, self._seed)
+            pose = resect((np.eye(4),), points, pixels, self._intrinsics, INLIER_PX, self._seed)
             unknown = np.full(len(frame.track_ids), np.nan)
             places = frame.pixels.astype(np.float64)
             first = segment.map.keyframes[0]

@@ -8,10 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.config import WindowConfig
 from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose
 from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.frontend.window.camera_pose import resect
+from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
 from slam.frontend.window.odometry import Segment
 from slam.se3 import FloatArray, apply, invert
@@ -19,6 +18,8 @@ from slam.se3 import FloatArray, apply, invert
 WINDOW_SOURCE = "window"
 _LEAST_DEPTHS = 20
 _LEAST_LENGTH = 1e-6
+_RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
+_ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,13 @@ class WindowPoses:
 
 
 def window_poses(
-    maps: Sequence[Segment], intrinsics: Intrinsics, config: WindowConfig, seed: int = 0, loops: Sequence[Ends] = ()
+    maps: Sequence[Segment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> WindowPoses:
     """All relative poses of some maps, in the unit of learned depth.
 
     Args:
         maps: of one drive.
         intrinsics: of all images.
-        config: least sigmas, inliers.
         seed: of RANSAC.
         loops: keyframes of one map that see the same place, by their frames.
     """
@@ -66,22 +66,22 @@ def window_poses(
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
     for number, segment in enumerate(part for part in maps if part.started):
-        found = _segment_poses(segment, intrinsics, config, seed)
+        found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
-        closing |= _loop_poses(segment.map, loops, intrinsics, config, seed)
+        closing |= _loop_poses(segment.map, loops, intrinsics, seed)
     return WindowPoses(poses, segments, [closing[ends] for ends in loops])
 
 
-def _segment_poses(segment: Segment, intrinsics: Intrinsics, config: WindowConfig, seed: int) -> list[RelativePose]:
+def _segment_poses(segment: Segment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
     local = segment.map
     unit, keyframes = learned_unit(local), local.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
     found: list[RelativePose] = []
     for before, after in pairwise(keyframes):
-        seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, config, seed)
+        seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
         sigmas = None if seen is None else seen[1]
-        found.append(_relative(before, after.index, after.T_camera_world, sigmas, unit, config))
+        found.append(_relative(before, after.index, after.T_camera_world, sigmas, unit))
     T_guess = keyframes[0].T_camera_world
     for frame in segment.frames:
         if frame.index in place:
@@ -89,17 +89,15 @@ def _segment_poses(segment: Segment, intrinsics: Intrinsics, config: WindowConfi
             continue
         pixels = frame.pixels.astype(np.float64)
         guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
-        located = _seen_from(local, frame.track_ids, pixels, guess, intrinsics, config, seed)
+        located = _seen_from(local, frame.track_ids, pixels, guess, intrinsics, seed)
         if located is not None:
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
-            found.append(_relative(nearest, frame.index, T_guess, sigmas, unit, config))
+            found.append(_relative(nearest, frame.index, T_guess, sigmas, unit))
     return found
 
 
-def _loop_poses(
-    local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, config: WindowConfig, seed: int
-) -> dict[Ends, RelativePose]:
+def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int) -> dict[Ends, RelativePose]:
     """Between keyframes of this map, their sigmas by the points that both see."""
     unit, keyframes = learned_unit(local), {keyframe.index: keyframe for keyframe in local.keyframes}
     found = {}
@@ -109,8 +107,8 @@ def _loop_poses(
         before, after = keyframes[first], keyframes[last]
         both = np.isin(after.track_ids, before.track_ids)
         T = after.T_camera_world
-        seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, config, seed)
-        pose = _relative(before, last, T, None if seen is None else seen[1], unit, config)
+        seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, seed)
+        pose = _relative(before, last, T, None if seen is None else seen[1], unit)
         found[first, last] = replace(pose, source=LOOP_SOURCE)
     return found
 
@@ -133,15 +131,14 @@ def _seen_from(
     pixels: FloatArray,
     T_guess: FloatArray,
     intrinsics: Intrinsics,
-    config: WindowConfig,
     seed: int,
 ) -> tuple[FloatArray, FloatArray] | None:
     """``T_camera_world`` by the map's points and its sigmas ``(6,)``; None with too few inliers."""
     known = local.known(track_ids)
-    if known.sum() < config.min_points:
+    if known.sum() < MIN_POINTS:
         return None
-    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, config.inlier_px, seed)
-    if (pose.residual_px < config.inlier_px).sum() < config.min_points:
+    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, INLIER_PX, seed)
+    if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS:
         return None
     return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas
 
@@ -152,11 +149,10 @@ def _relative(
     T_camera_world: FloatArray,
     sigmas: FloatArray | None,
     unit: float,
-    config: WindowConfig,
 ) -> RelativePose:
     """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
-    floors = np.repeat([np.deg2rad(config.rotation_sigma_deg), config.relative_sigma * max(length, _LEAST_LENGTH)], 3)
+    floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
     own = 10.0 * floors if sigmas is None else sigmas
     return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), WINDOW_SOURCE).scaled(unit)

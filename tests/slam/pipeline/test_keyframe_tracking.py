@@ -34,7 +34,7 @@ def steps(count: int, scatter: float) -> Observations:
 
 @pytest.mark.parametrize(("count", "scatter", "vehicle"), [(60, 0.02, True), (60, 1.0, False), (20, 0.02, None)])
 def test_a_vehicle_goes_the_same_way_for_a_while(count: int, scatter: float, vehicle: bool | None) -> None:
-    assert is_vehicle(steps(count, scatter), WindowConfig()) is vehicle
+    assert is_vehicle(steps(count, scatter)) is vehicle
 
 
 def test_a_known_camera_height_decides() -> None:

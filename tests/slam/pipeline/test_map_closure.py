@@ -124,7 +124,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     for k in indices:
         odometry.follow(replace(sequence.frame(k), index=k // 4))
     maps = odometry.state().segments
-    before = window_poses(maps, sequence.intrinsics, WindowConfig())
+    before = window_poses(maps, sequence.intrinsics)
     after = close_maps(maps, sequence.intrinsics, SlamConfig())
     T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))
     T_world_camera[:, :3] = truth

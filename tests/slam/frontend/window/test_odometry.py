@@ -31,7 +31,7 @@ def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> Windo
 
 
 def poses(state: WindowState) -> WindowPoses:
-    return window_poses(state.segments, room.INTRINSICS, CONFIG)
+    return window_poses(state.segments, room.INTRINSICS)
 
 
 def chained(found: WindowPoses) -> dict[int, FloatArray]:

@@ -47,6 +47,7 @@ class Tracker:
         update: int = 10,
     ) -> None:
         """Prepare for the first frame."""
+        self._sources = predictor.sources
         self._recent = GrowingSequence(intrinsics, camera_height_m)
         self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
         self._window, self._update = window, update

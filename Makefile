@@ -8,19 +8,31 @@ TORCH_INDEX ?=
 
 export OMP_WAIT_POLICY ?= PASSIVE
 
+# Writes requirements.lock with `make lock`; a program, not a part of the environment
+UV ?= uv
+
 # Tests are of one thread each; a file's tests stay together, for they share what they prepare
 PYTEST := $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-.PHONY: setup demo test test-all lint benchmark clean
+.PHONY: setup lock demo test test-all lint benchmark clean
 
 setup: $(READY)
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"Python 3.11 or newer is wanted; $(PYTHON) is {sys.version.split()[0]}; set PYTHON=")'
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $(READY)
+
+# The versions of constraints.txt with the hashes of their files, for every platform and Python; torch, whose build the
+# user chooses, and the libraries of its builds are left out
+lock:
+	echo "torch; sys_platform == 'never'" > .no-torch.txt
+	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra dev --constraint constraints.txt \
+		--override .no-torch.txt --no-annotate --no-header --output-file requirements.lock pyproject.toml
+	rm .no-torch.txt
 
 demo: setup
 	$(BIN)/erfsfm-slam run

@@ -17,6 +17,8 @@ from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
 from erfsfm.cli_pack import pack
 
+logger = logging.getLogger(__name__)
+
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -80,7 +82,7 @@ def predict(
     device: Device = "auto",
     seed: UnusedSeed = 0,
 ) -> None:
-    """Depth of images: unscaled z-depth as .npy, and a coloured picture of disparity.
+    """Depth of images: unscaled z-depth as .npy, and a coloured picture of disparity; unreadable ones are left out.
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
@@ -101,12 +103,27 @@ def predict(
                 f"{output / file.stem}.png is no earlier prediction and would be replaced: choose another --output"
             )
     predictor = DepthPosePredictor.from_weights(weights, device)
-    output.mkdir(parents=True, exist_ok=True)
+    unreadable = []
     for file in files:
-        depth = predictor.depth(read_image(file))
-        save_depth(output / f"{file.stem}.npy", depth)
-        save_image(output / f"{file.stem}.png", colour_disparity(depth))
-    typer.echo(f"depth of {len(files)} images in {output}")
+        depth_file = output / f"{file.stem}.npy"
+        try:
+            image = read_image(file)
+        except DataError as error:
+            if depth_file.exists():
+                raise DataError(
+                    f"{error}; {depth_file} is of an earlier image: remove it, or restore the image"
+                ) from error
+            unreadable.append(str(error))
+            continue
+        output.mkdir(parents=True, exist_ok=True)
+        depth = predictor.depth(image)
+        save_depth(depth_file, depth)
+        save_image(depth_file.with_suffix(".png"), colour_disparity(depth))
+    if len(unreadable) == len(files):
+        raise DataError(unreadable[0])
+    if unreadable:
+        logger.warning("%d of %d images are left out: %s", len(unreadable), len(files), unreadable[0])
+    typer.echo(f"depth of {len(files) - len(unreadable)} images in {output}")
 
 
 @app.command()

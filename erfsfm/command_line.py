@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import re
 import sys
@@ -17,13 +18,14 @@ from erfsfm.errors import OUT_OF_MEMORY, OneLineError, one_line
 from erfsfm.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
+_LOADING_BYTES = 256 * 2**20
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
 # what libraries in C++ say when memory ran out, whatever they raise
 _MEMORY = re.compile(
     r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
-    r"|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
+    r"|failed to map segment|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
     re.IGNORECASE,
 )
 
@@ -34,6 +36,7 @@ def run(app: Callable[..., object], name: str) -> None:
     for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
         os.environ.setdefault(name_of_level, quiet)  # what they would say of a file is said in our own line
     try:
+        _require_memory()
         app(args=_checked(sys.argv[1:], name), prog_name=name)
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):
@@ -44,6 +47,14 @@ def run(app: Callable[..., object], name: str) -> None:
         if os.environ.get(SHOW_TRACEBACK):
             raise
         _end(f"{name}: {_explained(error)}", 1)
+
+
+def _require_memory() -> None:
+    """Refuse to begin where NumPy and SciPy could not be loaded: OpenBLAS waits for ever for memory it cannot have."""
+    try:
+        mmap.mmap(-1, _LOADING_BYTES).close()
+    except OSError as error:
+        raise MemoryError from error
 
 
 def _checked(words: Sequence[str], name: str) -> list[str]:

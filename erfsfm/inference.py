@@ -68,13 +68,14 @@ class _Networks(NamedTuple):
     pose: Network
     features: Network | None  # of one image, for a pose network that encodes each by itself
 
-    def as_graphs(self) -> _Networks:
-        features = self.features and _graph(self.features)
-        return _Networks(_graph(self.depth), _graph(self.pose), features)
+    def as_graphs(self, identity: str) -> _Networks:
+        features = self.features and _graph(self.features, identity and f"features {identity}")
+        depth, pose = (_graph(getattr(self, name), identity and f"{name} {identity}") for name in ("depth", "pose"))
+        return _Networks(depth, pose, features)
 
 
-def _graph(network: Network) -> Network:
-    return OnnxGraph(network, NETWORK_THREADS) if isinstance(network, nn.Module) else network
+def _graph(network: Network, identity: str) -> Network:
+    return OnnxGraph(network, NETWORK_THREADS, identity) if isinstance(network, nn.Module) else network
 
 
 _graphs: dict[tuple[object, str], _Networks] = {}  # of the last weights in this process
@@ -129,13 +130,14 @@ class DepthPosePredictor:
     def freeze(self) -> Self:
         """On a CPU, run the networks by ONNX Runtime: the same outputs up to rounding, in less time.
 
-        The graphs are made at the first call, in some two seconds, and kept for the next predictor of these weights.
+        The graphs are made at the first call, in some two seconds, and kept on disk and for the next predictor of these
+        weights.
         """
         if self.device.type == "cpu":
             key = (self.sha256 or object(), repr(self.record.network))
             if key not in _graphs:
                 _graphs.clear()
-                _graphs[key] = self._networks.as_graphs()
+                _graphs[key] = self._networks.as_graphs(self.sha256 and " ".join(map(str, key)))
             self._networks = _graphs[key]
         return self
 

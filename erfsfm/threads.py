@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 import cv2
 import numpy as np
+import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 _LINEAR_ALGEBRA_BYTES = 192 * 2**20
@@ -29,7 +30,8 @@ def single_threaded_opencv() -> Iterator[None]:
 
 
 def take_working_memory() -> None:
-    """Let OpenCV's linear algebra take its memory now: later, where none is left, it would end the process.
+    """Let linear algebra take its memory now: later, where none is left, OpenCV would end the process, and OpenBLAS,
+    of which NumPy and SciPy have one each, would wait for ever.
 
     Raises:
         MemoryError: there is not enough.
@@ -38,7 +40,10 @@ def take_working_memory() -> None:
         mmap.mmap(-1, _LINEAR_ALGEBRA_BYTES).close()
     except OSError as error:
         raise MemoryError from error
-    cv2.SVDecomp(np.random.default_rng(0).normal(size=(_LARGE_MATRIX, _LARGE_MATRIX)))
+    matrix = np.random.default_rng(0).normal(size=(_LARGE_MATRIX, _LARGE_MATRIX))
+    cv2.SVDecomp(matrix)
+    np.linalg.svd(matrix @ matrix)
+    scipy.linalg.svd(matrix)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
 from erfsfm.readers.camera_file import CAMERA_FILE, read_camera_file
 from erfsfm.readers.folder import image_folder, recording_name
-from erfsfm.readers.images import image_size, list_images
+from erfsfm.readers.images import first_size, list_images
 from erfsfm.readers.kitti_calibration import ODOMETRY_CALIBRATION, CalibrationFile
 from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_drives, find_odometry_root
 from erfsfm.readers.numbering import by_name, by_number
@@ -71,7 +71,7 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
         if not images:
             raise DataError(f"{folder} holds no png or jpg; download or extract the images")
         files = by_number(images)
-        height, width = image_size(files.paths[0])
+        height, width = first_size(files.paths)
         calibration, row = CalibrationFile(sequence / ODOMETRY_CALIBRATION), f"P{camera}"
         pinhole = calibration.pinhole(row, width, height)
         tx, ty, tz = (float(value) for value in calibration.T_camera_cam0(row)[:3, 3])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.images import image_size, list_images
+from erfsfm.readers.images import first_size, list_images
 from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CalibrationFile
 from erfsfm.readers.kitti_drives import RAW_CAMERAS, drive_name
 from erfsfm.readers.numbering import by_number
@@ -30,7 +30,7 @@ def open_drive(drive: Path) -> list[Recording]:
     recordings = []
     for camera in [camera for camera in present if camera in _COLOUR] or present[:1]:
         files = by_number(images[camera])
-        height, width = image_size(files.paths[0])
+        height, width = first_size(files.paths)
         calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
         whole = Recording(
             f"kitti_raw/{drive_name(drive.name)}",

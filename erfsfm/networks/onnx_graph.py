@@ -13,6 +13,7 @@ from onnxruntime import InferenceSession
 from torch import Tensor, nn
 
 from erfsfm.networks.deformable import has_large_sampling
+from erfsfm.networks.graph_folder import kept_graph
 from erfsfm.onnx_session import open_session
 
 OPSET = 17
@@ -26,10 +27,17 @@ class OnnxGraph:
     minutes to make, and the compiled path of `erfsfm.networks.deformable` is faster.
     """
 
-    def __init__(self, network: nn.Module, threads: int) -> None:
-        """A network in evaluation mode with one output; all inputs will have the shapes of the first."""
+    def __init__(self, network: nn.Module, threads: int, identity: str = "") -> None:
+        """Prepare.
+
+        Args:
+            network: in evaluation mode with one output; all inputs will have the shapes of the first.
+            threads: to run on.
+            identity: of the network with its weights, by which the graph is kept on disk; empty: it is not.
+        """
         self._network = network
         self._threads = threads
+        self._identity = identity
         self._infer: Callable[..., Tensor] | None = None
 
     def __call__(self, *inputs: Tensor | list[Tensor]) -> Tensor:
@@ -41,13 +49,19 @@ class OnnxGraph:
     def _chosen(self, *inputs: Tensor | list[Tensor]) -> Callable[..., Tensor]:
         if has_large_sampling(self._network, *inputs):
             return self._network
-        return partial(_run, open_session(exported(self._network, inputs), self._threads))
+        export = partial(exported, self._network, inputs)
+        shapes = [tuple(tensor.shape) for tensor in _flat(inputs)]
+        graph = kept_graph(f"{self._identity} {shapes}", export) if self._identity else export()
+        return partial(_run, open_session(graph, self._threads))
+
+
+def _flat(inputs: Sequence[Tensor | list[Tensor]]) -> list[Tensor]:
+    return [tensor for given in inputs for tensor in ([given] if isinstance(given, Tensor) else given)]
 
 
 def _run(session: InferenceSession, *inputs: Tensor | list[Tensor]) -> Tensor:
-    tensors = [tensor for given in inputs for tensor in ([given] if isinstance(given, Tensor) else given)]
     names = [entry.name for entry in session.get_inputs()]
-    (output,) = session.run(None, {name: tensor.numpy() for name, tensor in zip(names, tensors, strict=True)})
+    (output,) = session.run(None, {name: tensor.numpy() for name, tensor in zip(names, _flat(inputs), strict=True)})
     return torch.from_numpy(output)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,16 @@ def image_size(path: Path) -> tuple[int, int]:
     """Height and width of an image file; raises as `read_image`."""
     height, width = read_image(path).shape[:2]
     return height, width
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Height and width of the first image that can be read; where none can, raises as `read_image` of the first."""
+    for file in files:
+        try:
+            return image_size(file)
+        except DataError:
+            continue
+    return image_size(files[0])
 
 
 def resize_image(image: Image, height: int, width: int) -> Image:

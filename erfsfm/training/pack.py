@@ -26,6 +26,7 @@ from erfsfm.data.pack_index import (
     poses_file,
     write_index,
 )
+from erfsfm.data.readable import readable_parts
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import ValidationSnippets, split_recordings, usable
 from erfsfm.errors import ConfigError, DataError
@@ -104,7 +105,7 @@ def pack(
     """
     require_room(config, output)
     training, validation = split_recordings(config.data)
-    training = usable(training, config.network.sources + 1)
+    training = readable_parts(usable(training, config.network.sources + 1), config.network)
     teacher = measured_views(training, config, output / TEACHER_FOLDER, quiet)
     drives = []
     with stage_bars(quiet) as show:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import signal
 import sys
 import warnings
@@ -71,6 +72,7 @@ def train(
     Raises:
         ConfigError, DataError, TrainingError: configuration, data or output folder cannot be used; one line.
     """
+    _require_devices(config.training.devices, device)
     folder = OutputFolder(output)
     rank = rank_of(config.training)
     done_steps = 0
@@ -100,6 +102,16 @@ def train(
         sys.exit()
     keeper.save(module, trainer.global_step)
     return output
+
+
+def _require_devices(wanted: int, device: str) -> None:
+    on_cpu = choose_device(device).type == "cpu"
+    there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
+    if wanted > there:
+        raise ConfigError(
+            f"training.devices is {wanted} on a machine with {there} {'cores' if on_cpu else 'GPUs'}: "
+            f"set training.devices={there} or fewer"
+        )
 
 
 def _timer(minutes: float) -> Timer:

@@ -16,6 +16,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.compact_label import encode
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.pack_index import PackedCamera, PackIndex, ShardedRecording, write_index
+from erfsfm.data.readable import readable_parts
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shards import (
     CLIPS_FILE,
@@ -79,7 +80,7 @@ def pack_shards(
     require_room(config, output)
     webdataset("writer", "TarWriter")
     training, validation = split_recordings(config.data)
-    training = usable(training, config.network.sources + 1)
+    training = readable_parts(usable(training, config.network.sources + 1), config.network)
     teacher = measured_views(training, config, output / TEACHER_FOLDER, quiet)
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
     try:

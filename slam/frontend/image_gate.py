@@ -1,4 +1,4 @@
-"""Rejection of unusable images before they are measured: blank, noise, upside down, frozen."""
+"""Rejection of unusable images before they are measured: blank, noise, upside down, mirrored, frozen."""
 
 from __future__ import annotations
 
@@ -22,9 +22,21 @@ _MOVING = 3.0
 _COPY_OVER_MOTION = 0.25
 _LARGEST_COPY = 2.0
 _LEAST_FLIPPED_CORRELATION = 0.3
+# of the median grey level from an image to the next, in logarithms
+_EXPOSURE_STEP = 0.1
+# corners followed from the last image to a flipped one: a least share, and so many times those without flipping
+_WIDTH_OF_TRACKING = 208
+_CORNERS = 100
+_LEAST_TRACKED = 0.25
+_TRACKED_OVER_UNFLIPPED = 2.0
+_FLIPS = {
+    "upside down": (slice(None, None, -1), slice(None, None, -1)),
+    "mirrored": (slice(None), slice(None, None, -1)),
+}
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
 _Layer = NDArray[np.float32]
+_Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -32,7 +44,9 @@ class GateState:
     """State of the gate: what the next image is compared with.
 
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
-    from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length.
+    from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length; ``tracked``, the image of
+    ``usable`` at a smaller size, turned the right way; ``flip``, how the image before was flipped;
+    of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
     """
 
     last: Frame | None = None
@@ -41,6 +55,10 @@ class GateState:
     difference: float = 0.0
     usable: _Layer | None = None
     doubtful: _Layer | None = None
+    tracked: _Grey | None = None
+    flip: str | None = None
+    compared: int = 0
+    exposed: int = 0
 
 
 class ImageGate:
@@ -53,6 +71,11 @@ class ImageGate:
     def state(self) -> GateState:
         """The state to resume from."""
         return self._state
+
+    @property
+    def was_moving(self) -> bool:
+        """Whether the camera moved between the last two new images."""
+        return self._state.difference > _MOVING * self._config.repeat_difference
 
     def check(self, frame: Frame) -> Verdict:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
@@ -68,7 +91,7 @@ class ImageGate:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < self._config.blank_contrast:
             # images after a dark one are not compared with those before it
-            self._state = GateState()
+            self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
@@ -76,24 +99,49 @@ class ImageGate:
         if length / np.sqrt(thumbnail.size) < self._config.noise_contrast * contrast:
             return MeasurementFailure("the image is noise")
         thumbnail /= np.float32(length)
-        failure = self._scene_failure(thumbnail)
+        small = _reduced(frame.grey)
+        failure = self._scene_failure(thumbnail, small)
         if failure is not None:
             return failure
-        self._state = replace(self._state, usable=thumbnail, doubtful=None)
+        self._count_exposure(small)
+        self._state = replace(self._state, usable=thumbnail, doubtful=None, tracked=small, flip=None)
         return "repeated" if self._is_copy(frame) else "new"
 
-    def _scene_failure(self, thumbnail: _Layer) -> MeasurementFailure | None:
-        usable, doubtful = self._state.usable, self._state.doubtful
-        if usable is not None:
-            flipped = float((thumbnail[::-1, ::-1] * usable).sum())
-            if flipped > max(_LEAST_FLIPPED_CORRELATION, float((thumbnail * usable).sum())):
-                self._state = replace(self._state, usable=np.ascontiguousarray(thumbnail[::-1, ::-1]))
-                return MeasurementFailure("the image is upside down")
-        # two consecutive images that correlate with each other are a new scene, not damage
-        known = [each for each in (usable, doubtful) if each is not None]
-        if known and max(float((thumbnail * each).sum()) for each in known) < self._config.min_correlation:
-            self._state = replace(self._state, doubtful=thumbnail)
+    def _count_exposure(self, small: _Grey) -> None:
+        state = self._state
+        if state.tracked is not None:
+            before, now = np.median(state.tracked), np.median(small)
+            exposed = abs(float(np.log((now + 1.0) / (before + 1.0)))) > _EXPOSURE_STEP
+            self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + exposed)
+
+    def _scene_failure(self, thumbnail: _Layer, small: _Grey) -> MeasurementFailure | None:
+        state, flip = self._state, self._flip_of(thumbnail, small)
+        if flip is not None:
+            turned, tracked = np.ascontiguousarray(thumbnail[_FLIPS[flip]]), np.ascontiguousarray(small[_FLIPS[flip]])
+            self._state = replace(state, usable=turned, doubtful=None, tracked=tracked, flip=flip)
+            return MeasurementFailure(f"the image is {flip}")
+        known = [each for each in (state.usable, state.doubtful) if each is not None]
+        doubt = bool(known) and max(float((thumbnail * each).sum()) for each in known) < self._config.min_correlation
+        # after flipped images correlation is not enough; two such images in a row are a new scene, not damage
+        if doubt or (state.flip and state.doubtful is None and _tracked_share(state.tracked, small) < _LEAST_TRACKED):
+            self._state = replace(state, doubtful=thumbnail)
             return MeasurementFailure("the image does not correlate with those before it")
+        return None
+
+    def _flip_of(self, thumbnail: _Layer, small: _Grey) -> str | None:
+        """How the image is flipped, or None: corners of the last image are found once it is flipped back.
+
+        Correlation alone is not enough: in a street or a turn the flipped image may correlate better than the true one.
+        """
+        usable, before = self._state.usable, self._state.tracked
+        if usable is None:
+            return None
+        for name, flip in _FLIPS.items():
+            if float((thumbnail[flip] * usable).sum()) < _LEAST_FLIPPED_CORRELATION:
+                continue
+            tracked = _tracked_share(before, np.ascontiguousarray(small[flip]))
+            if tracked > max(_LEAST_TRACKED, _TRACKED_OVER_UNFLIPPED * _tracked_share(before, small)):
+                return name
         return None
 
     def _is_copy(self, frame: Frame) -> bool:
@@ -109,10 +157,30 @@ class ImageGate:
             return False
         difference = _difference(before, shrunk)
         largest = min(max(limit, _COPY_OVER_MOTION * motion), _LARGEST_COPY * limit)
-        if difference < largest and motion > _MOVING * limit:
+        if difference < largest and self.was_moving:
             return True
         self._state = replace(self._state, shrunk=shrunk, difference=difference)
         return False
+
+
+def _reduced(grey: _Grey) -> _Grey:
+    height, width = grey.shape
+    scale = min(_WIDTH_OF_TRACKING / width, 1.0)
+    size = max(round(scale * width), 1), max(round(scale * height), 1)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _tracked_share(before: _Grey | None, now: _Grey) -> float:
+    """Share of corners that are followed to the other image and back to where they were."""
+    if before is None or before.shape != now.shape:
+        return 0.0
+    corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 5)
+    if corners is None:
+        return 0.0
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(9, 9))
+    back, found_again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, winSize=(9, 9))
+    returned = np.linalg.norm(back - corners, axis=-1) < 0.5
+    return float((returned & (found == 1) & (found_again == 1)).mean())
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

@@ -71,12 +71,12 @@ def localise(
     Raises:
         SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
     """
+    take_working_memory()
     paths = image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
     own_camera = _camera_file(camera, paths)
-    take_working_memory()
     localiser = Localiser(
         places,
         load_stored(run.path / "config.yaml", "loops").loops,

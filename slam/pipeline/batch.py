@@ -36,8 +36,9 @@ from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.map_closure import close_maps
 from slam.pipeline.measurements import Measurements
 from slam.pipeline.observations import ClosedObservations
-from slam.pipeline.observer import Observer, ObserverState, read_frame
+from slam.pipeline.observer import Observer, ObserverState
 from slam.pipeline.positioning import Location, Positioning
+from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
 from slam.pipeline.solution import Solution
 from slam.pose_graph import PoseGraph
@@ -258,8 +259,7 @@ class SlamPipeline:
         self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
     ) -> tuple[ClosedObservations, ObserverState]:
         """One pass over the frames, or over those that follow a checkpoint."""
-        checkpoint, total = self._checkpoint, len(self._sequence)
-        first = self.first
+        checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
         if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
             logger.warning(

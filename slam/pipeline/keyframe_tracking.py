@@ -66,10 +66,14 @@ class KeyframeTracking:
             self._odometry.follow(frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned depth ``(H, W)`` of that frame; a lost camera is looked for."""
+        """Learned depth ``(H, W)`` of one of the last two frames."""
+        if self._odometry is not None:
+            self._odometry.learn(frame, depth)
+
+    def look_for_lost(self, frame: Frame, depth: DepthMap) -> None:
+        """Look for a lost camera in the last frame, of which depth ``(H, W)`` is known."""
         if self._odometry is None:
             return
-        self._odometry.learn(frame, depth)
         lost = self._odometry.lost_map()
         if lost is None:
             self._places = None
@@ -108,6 +112,17 @@ class KeyframeTracking:
         if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
             return False
         return self._odometry.locates(index - 1, index)
+
+    def measure_alone(self, seen: Observations, index: int) -> bool:
+        """Whether keyframes locate one of the last frames and no step was measured to it."""
+        if self._odometry is None or not self._is_carried:
+            return False
+        has_step = any(motion.ends[1] == index for motion in seen.motions[-_FRAMES:])
+        return not has_step and self._odometry.has_located(index)
+
+    def is_keyframe(self, index: int) -> bool:
+        """Whether the last frame is a keyframe."""
+        return self._odometry is not None and self._odometry.is_keyframe(index)
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""

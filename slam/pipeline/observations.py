@@ -62,7 +62,8 @@ class Observations:
 
     ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
     ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
-    ``unusable`` are frames without a measurement, with the reason, ``repeated`` those with the image of the one before.
+    ``unusable`` are frames without a measurement, with the reason, ``repeated`` those with the image of the one before,
+    ``moving`` those of them just before which the camera moved.
     """
 
     snippets: list[SnippetPoses] = field(default_factory=list)
@@ -76,6 +77,13 @@ class Observations:
     examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
     unusable: dict[int, str] = field(default_factory=dict)
     repeated: list[int] = field(default_factory=list)
+    moving: list[int] = field(default_factory=list)
+
+    def repeat(self, index: int, moving: bool) -> None:
+        """Add a frame with the image of the one before."""
+        self.repeated.append(index)
+        if moving:
+            self.moving.append(index)
 
 
 @dataclass(frozen=True)

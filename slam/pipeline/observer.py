@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 
 from slam.config import SlamConfig
 from slam.errors import MissingFrameError, SequenceError
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
-from slam.frames import Sequence as FrameSequence
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import interpolate_gaps
 from slam.frontend.image_gate import GateState, ImageGate
@@ -27,6 +27,8 @@ from slam.frontend.window.odometry import WindowState
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
+from slam.pipeline.pending import PendingFrame, PendingTask
+from slam.runtime.memory import return_freed_memory
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray, chain
 from slam.storage.cache import GetOrCompute, without_cache
@@ -35,22 +37,12 @@ from slam.storage.spill import SpillFile
 logger = logging.getLogger(__name__)
 
 
-def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
-    """A frame, or why its image cannot be read."""
-    try:
-        frame = sequence.frame(index)
-        frame.image.setflags(write=False)
-        return frame
-    except SequenceError as error:
-        return error
-
-
 @dataclass(frozen=True)
 class RecentFrame:
-    """A frame to measure steps from, with its depth ``(H, W)`` and camera height, both unscaled."""
+    """A frame to measure steps from, its depth ``(H, W)``, None until that is needed, and camera height, unscaled."""
 
     frame: Frame
-    depth: DepthMap
+    depth: DepthMap | None
     height: float | None
 
 
@@ -68,30 +60,15 @@ class ObserverState:
     unread: int
 
 
-@dataclass(frozen=True)
-class PendingFrame:
-    """A frame submitted to the networks, whose other measurements are pending."""
-
-    frame: Frame
-    depth: Future[DepthMap]
-    snippet: Future[SnippetPoses] | None
-
-
-@dataclass(frozen=True)
-class PendingTask:
-    """A task of another thread, the stage that waits for it, and what to do with its ``result``."""
-
-    stage: str
-    result: Future[Any]
-    keep: Callable[[Any], None]
-
-
 class Observer:
     """Measures the frames of one sequence in time order; a context that ends its threads.
 
     The networks run in a second thread while corners of the frame before are tracked in the first; road homography,
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
+
+    While keyframes alone measure the camera, depth is predicted for them and for the targets of snippets, and snippets
+    only touch: each step is measured by one.
     """
 
     def __init__(
@@ -128,6 +105,7 @@ class Observer:
         )
         keyframes = WindowState() if state is None else state.keyframes
         self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
+        self._keyframes.decide(self._seen)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
@@ -161,6 +139,8 @@ class Observer:
         Raises:
             SequenceError: the frame's own, where too many in a row could not be read.
         """
+        if index % 200 == 0:  # 24 MB
+            return_freed_memory()
         if isinstance(frame, SequenceError):
             self._require_readable(frame)
             self._leave_out(index, str(frame))
@@ -173,7 +153,7 @@ class Observer:
                 self._leave_out(index, verdict.reason)
                 return
             if verdict == "repeated":
-                self._seen.repeated.append(index)
+                self._seen.repeat(index, self._gate.was_moving)
         pending = self._submit_networks(frame)
         try:
             self._process_pending()
@@ -183,7 +163,8 @@ class Observer:
     def flush(self) -> None:
         """Finish every frame so far."""
         self._process_pending()
-        self._finish_tasks()
+        while self._tasks:
+            self._finish_tasks()
 
     def state(self) -> ObserverState:
         """The state from which another observer continues as without an interruption."""
@@ -236,12 +217,15 @@ class Observer:
             self._window = ()
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
-        length = self._predictor.sources + 1
-        self._window = (*self._window, frame)[-length:]
-        depth = self._networks.submit(self._predictor.depth, frame)
-        if len(self._window) < length:
-            return PendingFrame(frame, depth, None)
-        return PendingFrame(frame, depth, self._networks.submit(self._predictor.snippet, list(self._window)))
+        sources, index = self._predictor.sources, frame.index
+        self._window = (*self._window, frame)[-sources - 1 :]
+        is_sparse = self._keyframes.measure_alone(self._seen, index - 2)  # finished, whatever else is
+        depth = snippet = None
+        if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
+            depth = self._networks.submit(self._predictor.depth, frame)
+        if len(self._window) > sources and (not is_sparse or index % sources == 0):
+            snippet = self._networks.submit(self._predictor.snippet, list(self._window))
+        return PendingFrame(frame, depth, snippet)
 
     def _process_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
@@ -273,18 +257,36 @@ class Observer:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
         if self._config.road.enabled:
             self._tasks += [self._road_task(previous, frame, motion) for previous, motion in steps]
-        with self._stopwatch.stage("depth network"):
-            depth = pending.depth.result()
+        self._seen.roads.append(MeasurementFailure("its depth was not predicted"))
+        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._frames_kept :]
+        if pending.depth is not None:
+            with self._stopwatch.stage("depth network"):
+                depth = pending.depth.result()
+            self._learn(frame, depth)
+            self._keyframes.look_for_lost(frame, depth)
+        elif self._keyframes.is_keyframe(frame.index):
+            late = self._networks.submit(self._predictor.depth, frame)
+            self._tasks.append(PendingTask("depth network", late, partial(self._learn, frame)))
+
+    def _learn(self, frame: Frame, depth: DepthMap) -> None:
+        """Everything that the depth ``(H, W)`` of a frame gives."""
         with self._stopwatch.stage("road"):
-            road = self._plane.fit(depth)
-        self._seen.roads.append(road)
-        self._keyframes.learn(frame, depth)
+            self._seen.roads[frame.index] = road = self._plane.fit(depth)
         height = road.height_unscaled if isinstance(road, GroundPlane) else None
-        self._recent = (*self._recent, RecentFrame(frame, depth, height))[-self._frames_kept :]
+        self._keyframes.learn(frame, depth)
+        self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
             with self._stopwatch.stage("loops"):
                 self._seen.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
+
+    def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
+        """Depth and camera height, predicted late where nobody asked for them before."""
+        if recent.depth is not None:
+            return recent.depth, recent.height
+        depth = self._networks.submit(self._predictor.depth, recent.frame).result()
+        road = self._plane.fit(depth)
+        return depth, road.height_unscaled if isinstance(road, GroundPlane) else None
 
     def _measure_steps(self, current: Frame) -> list[tuple[Frame, Motion]]:
         """Measure steps from earlier frames; returns those with triangulated points, with their first frames."""
@@ -293,7 +295,8 @@ class Observer:
             if len(self._recent) < back:
                 continue
             recent = self._recent[-back]
-            measured = self._odometry.measure(recent.frame, current, recent.depth, recent.height)
+            depth, height = self._known(recent)
+            measured = self._odometry.measure(recent.frame, current, depth, height)
             if isinstance(measured, MeasurementFailure):
                 self._seen.failures.append((recent.frame.index, current.index, measured.reason))
                 logger.info("geometry %d -> %d failed: %s", recent.frame.index, current.index, measured.reason)
@@ -314,7 +317,7 @@ class Observer:
         if path is None or len(path) != baseline:
             return None
         T_first_current = chain(np.array([motions[ends].relative_pose.T_from_to for ends in path]))[-1]
-        return self._odometry.relative_rotation(first.frame, current, first.depth, T_first_current)
+        return self._odometry.relative_rotation(first.frame, current, self._known(first)[0], T_first_current)
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:

@@ -20,6 +20,7 @@ from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.pipeline.batch import SlamResult
+from slam.pipeline.doubts import DOUBLED, doubled_frames
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.summary import (
@@ -73,6 +74,7 @@ def estimate_metrics(
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
+            | {"doubled": describe_frames(dict.fromkeys(_doubled(result, len(sequence)), DOUBLED))}
             | {"unreadable_scans": describe_frames(_unreadable_scans(result))}
             | {"continued_at": result.first}
             | {"segments": [asdict(segment) for segment in result.observations.segments]},
@@ -88,6 +90,10 @@ def estimate_metrics(
         }
     )
     return metrics
+
+
+def _doubled(result: SlamResult, frames: int) -> list[int]:
+    return doubled_frames(frames, result.observations, result.state)
 
 
 def _unreadable_scans(result: SlamResult) -> Mapping[int, str]:

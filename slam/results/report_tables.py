@@ -98,6 +98,7 @@ def what_ran(metrics: Metrics) -> Table:
     rows = [
         ("Sequence", f"{text('sequence', 'name')}, {text('sequence', 'frames')} frames"),
         ("Interpolated frames", _frames(metrics, "bridged") or "none"),
+        *([("Doubled frames", doubled)] if (doubled := _frames(metrics, "doubled")) else []),
         *([("LiDAR scans left out", left_out)] if (left_out := _frames(metrics, "unreadable_scans")) else []),
         ("True length", text("sequence", "length_m", unit=" m")),
         ("Frame rate", text("sequence", "fps", unit=" frames/s")),

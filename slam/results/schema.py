@@ -56,6 +56,7 @@ class SequenceRecord(_Part):
     fps: float | None = None
     bridged_frames: Count | None = None
     bridged: list[Gap] | None = None
+    doubled: list[Gap] | None = None
     unreadable_scans: list[Gap] | None = None
     continued_at: Count | None = None
     segments: list[Gap] | None = None

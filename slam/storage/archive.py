@@ -32,6 +32,8 @@ def reading_archive(path: Path) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise RunError(f"{path} is missing: run the sequence again") from error
+    except MemoryError as error:
+        raise RunError(f"{path} needs more memory than there is, or is damaged: free some, or run again") from error
     # Damaged bytes raise almost anything in zipfile, zlib, json, tokenize and NumPy: no list of types is complete.
     except Exception as error:
         reason = " ".join(str(error).split())[:120]

@@ -80,7 +80,7 @@ def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot
     image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
     wanted = f"000002{suffix} is truncated at {image.stat().st_size} bytes: copy it again"
     assert wanted in refusal(*TRAIN, *SMALL, "--dataset", root, "--output", tmp_path / "run")
-    assert wanted in refusal("predict", image.parent, "--weights", weights, "--output", tmp_path / "depth")
+    assert wanted in refusal("predict", image, "--weights", weights, "--output", tmp_path / "depth")
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
 
 

@@ -251,6 +251,30 @@ def test_predict(run: Run, tmp_path: Path, weights: Path, folder: bool) -> None:
     assert np.load(tmp_path / "depth" / "a.npy").shape == (20, 30)
 
 
+def test_predict_leaves_out_what_it_cannot_read(
+    run: Run, tmp_path: Path, weights: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    images, depth = tmp_path / "images", tmp_path / "depth"
+    images.mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        cv2.imwrite(str(images / name), np.full((20, 30, 3), 99, np.uint8))
+    (images / "b.png").write_bytes((images / "b.png").read_bytes()[:60])
+    given = ["predict", images, "--weights", weights, "--output", depth]
+    code, out, _ = run(*given)
+    assert code == 0 and f"depth of 2 images in {depth}" in out
+    assert "1 of 3 images are left out" in caplog.text and "b.png is truncated" in caplog.text
+    assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
+    (depth / "b.npy").touch()  # depth of the image as it was
+    code, _, err = run(*given)
+    assert code == 1 and "b.png is truncated" in err and "b.npy is of an earlier image: remove it" in err
+
+
+def test_predict_of_nothing_readable(run: Run, tmp_path: Path, weights: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no image")
+    code, _, err = run("predict", tmp_path, "--weights", weights, "--output", tmp_path / "depth")
+    assert code == 1 and "a.png" in err and not (tmp_path / "depth").exists()
+
+
 def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 30, 3), 99, np.uint8))
     before = (tmp_path / "a.png").read_bytes()

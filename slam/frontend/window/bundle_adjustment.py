@@ -12,13 +12,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.window.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.frontend.window.projection import pixel_jacobian
-from slam.se3 import FloatArray, make
+from slam.se3 import FloatArray, apply, make
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
@@ -82,8 +81,7 @@ class BundleAdjustment:
         self._column = np.where(free, np.cumsum(free) - 1, -1)
         self._free = free
         self._points = int(sightings.point.max()) + 1 if len(sightings) else 0
-        self._of_camera = _summing(self._column[sightings.camera], int(free.sum()))
-        self._of_point = _summing(sightings.point, self._points)
+        self._rows = [np.flatnonzero(sightings.camera == camera) for camera in range(len(free))]
         self._blocks = self._eliminated_together()
 
     def solve(
@@ -122,14 +120,19 @@ class BundleAdjustment:
         return np.asarray((X[:, :2] / z - self._rays) * self._focal / self._noise.pixel)
 
     def jacobians(self, T_camera_world: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the residuals by their camera's perturbation ``(S, 2, 6)`` and their point ``(S, 2, 3)``."""
+        """Derivatives of the residuals by their camera's perturbation ``(6, 2, S)`` and their point ``(3, 2, S)``."""
         X = self._in_cameras(T_camera_world, points)
         by_camera = pixel_jacobian(X, self._focal / self._noise.pixel)
-        return by_camera, by_camera[:, :, 3:] @ T_camera_world[self._seen.camera, :3, :3]
+        by_point = np.empty((3, 2, len(X)))
+        for T, rows in zip(T_camera_world, self._rows, strict=True):
+            by_point[..., rows] = np.tensordot(T[:3, :3].T, by_camera[3:, :, rows], 1)
+        return by_camera, by_point
 
     def _in_cameras(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
-        T = T_camera_world[self._seen.camera]
-        return np.asarray(np.einsum("sij,sj->si", T[:, :3, :3], points[self._seen.point]) + T[:, :3, 3])
+        X = np.empty((len(self._seen), 3))
+        for T, rows in zip(T_camera_world, self._rows, strict=True):
+            X[rows] = apply(T, points[self._seen.point[rows]])
+        return X
 
     def _depths(self, T_camera_world: FloatArray, points: FloatArray) -> FloatArray:
         return self._in_cameras(T_camera_world, points)[:, 2]
@@ -186,6 +189,12 @@ class _Block:
     points: NDArray[np.int64]
     local_point: NDArray[np.int64]
 
+    def dense(self, coupling: FloatArray) -> FloatArray:
+        """The matrix of all its cameras and points from what couples those of each sighting ``(6, 3, s)``."""
+        matrix = np.zeros((len(self.cameras), 6, len(self.points), 3))
+        matrix[self.local_camera, :, self.local_point, :] = coupling.transpose(2, 0, 1)
+        return matrix.reshape(6 * len(self.cameras), 3 * len(self.points))
+
 
 @dataclass(frozen=True)
 class _System:
@@ -194,26 +203,30 @@ class _System:
     blocks: list[_Block]
     U: FloatArray
     V: FloatArray
-    W: FloatArray  # (S, 6, 3)
+    W: FloatArray  # (6, 3, S)
     camera_side: FloatArray
     point_side: FloatArray
 
     @classmethod
     def of(cls, problem: BundleAdjustment, T: FloatArray, X: FloatArray, residuals: FloatArray) -> _System:
         root = problem.weights(residuals)
-        A, B = (root[:, :, None] * J for J in problem.jacobians(T, X))
-        r = (root * residuals)[:, :, None]
-        At, Bt = A.transpose(0, 2, 1), B.transpose(0, 2, 1)
-        cameras, points = problem._of_camera, problem._of_point
-        count = len(residuals)
-        return cls(
-            problem._blocks,
-            (cameras @ (At @ A).reshape(count, 36)).reshape(-1, 6, 6),
-            (points @ (Bt @ B).reshape(count, 9)).reshape(-1, 3, 3),
-            At @ B,
-            -(cameras @ (At @ r).reshape(count, 6)),
-            -(points @ (Bt @ r).reshape(count, 3)),
-        )
+        A, B = (root[:, 0] * J for J in problem.jacobians(T, X))
+        r = (root * residuals).T
+        of_cameras = [
+            (A[..., rows].reshape(6, -1), r[:, rows].ravel())
+            for rows, is_free in zip(problem._rows, problem._free, strict=True)
+            if is_free
+        ]
+        point, points = problem._seen.point, problem._points
+        V, point_side = np.empty((points, 3, 3)), np.empty((points, 3))
+        for i in range(3):
+            point_side[:, i] = -np.bincount(point, (B[i] * r).sum(axis=0), points)
+            for j in range(i + 1):
+                V[:, i, j] = V[:, j, i] = np.bincount(point, (B[i] * B[j]).sum(axis=0), points)
+        W = A[:, None, 0] * B[:, 0] + A[:, None, 1] * B[:, 1]
+        U = np.array([J @ J.T for J, _ in of_cameras])
+        camera_side = np.array([-J @ residual for J, residual in of_cameras])
+        return cls(problem._blocks, U, V, W, camera_side, point_side)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)``; None where the system is singular."""
@@ -237,11 +250,10 @@ class _System:
         S[range(F), :, range(F), :] = _damped(self.U, damping)
         coupled = []
         for block in self.blocks:
-            W = np.zeros((len(block.cameras), 6, len(block.points), 3))
-            W[block.local_camera, :, block.local_point, :] = self.W[block.sightings]
-            WV = np.einsum("kapi,pij->kapj", W, V_inverse[block.points], optimize=True)
-            flat = 6 * len(block.cameras), 3 * len(block.points)
-            W, WV = W.reshape(flat), WV.reshape(flat)
+            coupling = self.W[..., block.sightings]
+            inverse = np.ascontiguousarray(V_inverse[block.points[block.local_point]].transpose(1, 2, 0))
+            # row by row: products of small matrices one by one take ten times as long
+            W, WV = (block.dense(part) for part in (coupling, sum(coupling[:, i, None] * inverse[i] for i in range(3))))
             shape = len(block.cameras), 6, len(block.cameras), 6
             # cameras of a block are few, so that the product is small
             S[np.ix_(block.cameras, _SIX, block.cameras, _SIX)] -= (WV @ W.T).reshape(shape)
@@ -254,9 +266,3 @@ def _damped(blocks: FloatArray, damping: float) -> FloatArray:
     diagonal = np.einsum("kii->ki", blocks)
     added = damping * np.maximum(diagonal, 1e-6) + 1e-12
     return np.asarray(blocks + added[:, :, None] * np.eye(blocks.shape[1]))
-
-
-def _summing(group: NDArray[np.int64], groups: int) -> csr_array:
-    """The matrix ``(groups, S)`` that sums rows by their group; rows of group -1 are left out."""
-    rows = np.flatnonzero(group >= 0)
-    return csr_array((np.ones(len(rows)), (group[rows], rows)), shape=(groups, len(group)))

@@ -17,7 +17,8 @@ from slam.se3 import FloatArray, apply, from_rotation_vector, make
 MIN_POINTS = 20  # least number of points that give a camera its pose
 INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels
 _ITERATIONS = 12
-_CONVERGED = 1e-7
+# radians, and units of the map: hundredths of a pixel
+_CONVERGED = 1e-5
 _LEAST_PIXEL_SIGMA = 0.1
 # below this inlier ratio the pose may be one that some wrong tracks agree on
 _DOUBTFUL_RATIO = 0.75
@@ -44,12 +45,12 @@ def resect(
     inlier_px: float,
     seed: int = 0,
 ) -> CameraPose:
-    """The pose with most inliers among those found from guesses ``T_camera_world``, and by consensus if in doubt.
+    """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
 
     Two guesses matter: from the prediction by the last motion alone, a wrong pose predicts the next wrong pose.
 
     Args:
-        guesses: start poses, at least one.
+        guesses: start poses, at least one; if few points fit by the first, the next ones and consensus are tried.
         points: in the world ``(M, 3)``, at least 6.
         pixels: of the points ``(M, 2)``.
         intrinsics: of the camera.
@@ -60,7 +61,11 @@ def resect(
     def support(pose: CameraPose) -> int:
         return int((pose.residual_px < inlier_px).sum())
 
-    best = max((_refined(guess, points, pixels, intrinsics, inlier_px) for guess in guesses), key=support)
+    best = _refined(guesses[0], points, pixels, intrinsics, inlier_px)
+    for guess in guesses[1:]:
+        if support(best) >= _DOUBTFUL_RATIO * len(points):
+            break
+        best = max(best, _refined(guess, points, pixels, intrinsics, inlier_px), key=support)
     if support(best) < _DOUBTFUL_RATIO * len(points):
         found = consensus(points, pixels, intrinsics.K, _SAMPLES, inlier_px, seed)
         if found is not None:
@@ -78,13 +83,13 @@ def _refined(
     rays = intrinsics.rays(pixels)[:, :2]
     residual, X = _residual(T, points, rays, focal)
     for _ in range(_ITERATIONS):
-        norm = np.linalg.norm(residual, axis=1)
+        norm = np.hypot(*residual)
         scale = max(0.5 * inlier_px, float(np.median(norm)))
         weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
         J = pixel_jacobian(X, focal)
-        JtW = (weight[:, None, None] * J).reshape(-1, 6).T
-        information = JtW @ J.reshape(-1, 6) + 1e-9 * np.eye(6)
-        step = np.asarray(np.linalg.solve(information, -JtW @ residual.ravel()), np.float64)
+        weighted = (weight * J).reshape(6, -1)
+        information = weighted @ J.reshape(6, -1).T + 1e-9 * np.eye(6)
+        step = np.asarray(np.linalg.solve(information, -weighted @ residual.ravel()), np.float64)
         T = from_rotation_vector(step[:3], step[3:]) @ T
         residual, X = _residual(T, points, rays, focal)
         if np.abs(step).max() < _CONVERGED:
@@ -92,12 +97,13 @@ def _refined(
     in_front = X[:, 2] > LEAST_DEPTH
     sigma = max(mad_sigma(residual), _LEAST_PIXEL_SIGMA)
     sigmas = sigma * np.sqrt(np.diag(np.linalg.inv(information)))
-    return CameraPose(T, np.where(in_front, np.linalg.norm(residual, axis=1), np.inf), sigmas)
+    return CameraPose(T, np.where(in_front, np.hypot(*residual), np.inf), sigmas)
 
 
 def _residual(
     T_camera_world: FloatArray, points: FloatArray, rays: FloatArray, focal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    """Of both pixel coordinates ``(2, M)``, and the points in the camera ``(M, 3)``."""
     X = apply(T_camera_world, points)
     z = np.maximum(X[:, 2], LEAST_DEPTH)
-    return (X[:, :2] / z[:, None] - rays) * focal, X
+    return ((X[:, :2] / z[:, None] - rays) * focal).T, X

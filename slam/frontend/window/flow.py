@@ -12,11 +12,9 @@ from slam.frames import Grey
 
 Pixels = NDArray[np.float32]
 
-_SETTINGS: dict[str, Any] = {
-    "criteria": (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-}
-_BACKWARD_LEVELS = 1
+_LIMITS = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT
+_FORWARD: dict[str, Any] = {"criteria": (_LIMITS, 15, 0.02), "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+_BACKWARD: dict[str, Any] = {"criteria": (_LIMITS, 10, 0.05), "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "maxLevel": 1}
 
 
 def flow(
@@ -27,11 +25,9 @@ def flow(
         return pixels, np.zeros(0, np.bool_)
     window = window_px, window_px
     found, forward, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, pixels, guesses.copy(), winSize=window, maxLevel=levels, **_SETTINGS
+        first, second, pixels, guesses.copy(), winSize=window, maxLevel=levels, **_FORWARD
     )
-    back, backward, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, found, pixels.copy(), winSize=window, maxLevel=_BACKWARD_LEVELS, **_SETTINGS
-    )
+    back, backward, _ = cv2.calcOpticalFlowPyrLK(second, first, found, pixels.copy(), winSize=window, **_BACKWARD)
     height, width = second.shape
     inside = (found >= 0).all(axis=1) & (found[:, 0] <= width - 1) & (found[:, 1] <= height - 1)
     kept = inside & (forward.ravel() > 0) & (backward.ravel() > 0)

@@ -30,8 +30,11 @@ _NEAR_COSINE = 0.7
 _ALIGNED_PX = 2.0
 _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
+# a point that two keyframes do not find is hidden
+_ATTEMPTS = 2
 _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
+_TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 CORNER_QUALITY = 0.002  # least corner strength over that of the strongest corner
 WINDOW_PX = 15  # side of the Lucas-Kanade window, pixels
 FORWARD_BACKWARD_PX = 0.7  # largest forward-backward tracking error, pixels
@@ -146,7 +149,7 @@ class LocalMap:
         noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
-        solved = problem.solve(poses, self.points[track_ids], _ITERATIONS)
+        solved = problem.solve(poses, self.points[track_ids], _ITERATIONS, _TOLERANCE)
         self.points[track_ids] = solved.points
         bad = solved.residual_px > OUTLIER_PX
         for row, k in enumerate(chosen):
@@ -202,11 +205,11 @@ class LocalMap:
         self, grey: Grey, T_camera_world: FloatArray, track_ids: TrackIds, intrinsics: Intrinsics
     ) -> tuple[TrackIds, Pixels]:
         """Known points that are not among the tracks of a new keyframe, found near their projections."""
-        missing = np.isfinite(self.points[:, 0])
-        missing[track_ids] = False
+        attempts = np.where(np.isfinite(self.points[:, 0]), _ATTEMPTS, 0)
+        attempts[track_ids] = 0
         tracks, places = [], []
         for keyframe in self._near(T_camera_world, track_ids):
-            rows = np.flatnonzero(missing[keyframe.track_ids])
+            rows = np.flatnonzero(attempts[keyframe.track_ids])
             X = apply(T_camera_world, self.points[keyframe.track_ids[rows]])
             z = np.where(X[:, 2] > 0, X[:, 2], 1.0)
             focal, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
@@ -220,7 +223,8 @@ class LocalMap:
             kept &= np.linalg.norm(found - projected, axis=1) < _PROJECTED_PX
             tracks.append(keyframe.track_ids[rows[kept]])
             places.append(found[kept])
-            missing[tracks[-1]] = False
+            attempts[keyframe.track_ids[rows]] -= 1
+            attempts[tracks[-1]] = 0
         if not tracks:
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         return np.concatenate(tracks), np.concatenate(places)

@@ -151,10 +151,20 @@ class WindowOdometry:
             self._start(segment, frame, track_ids, pixels)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
-        """Learned z-depth ``(H, W)`` of the last frame, for the unit of the map where it is a keyframe."""
-        newest = self._state.segments[-1].map
-        if newest.keyframes[-1].index == frame.index:
-            newest.keyframes[-1] = newest.keyframes[-1].with_depth(depth)
+        """Learned z-depth ``(H, W)`` of one of the last two frames, for the unit of the map where it is a keyframe."""
+        keyframes = self._state.segments[-1].map.keyframes
+        for row, keyframe in list(enumerate(keyframes))[-2:]:
+            if keyframe.index == frame.index:
+                keyframes[row] = keyframe.with_depth(depth)
+
+    def is_keyframe(self, index: int) -> bool:
+        """Whether that frame is the last keyframe."""
+        return self._state.segments[-1].map.keyframes[-1].index == index
+
+    def has_located(self, index: int) -> bool:
+        """Whether one of the last frames has a pose in the newest map."""
+        last = [frame for segment in self._state.segments[-1:] for frame in segment.frames[-3:]]
+        return any(frame.index == index and frame.T_camera_world is not None for frame in last)
 
     def locates(self, first: int, last: int) -> bool:
         """Whether the last two frames are these, both with a pose in the newest map."""

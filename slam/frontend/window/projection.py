@@ -10,10 +10,11 @@ LEAST_DEPTH = 1e-6
 
 
 def pixel_jacobian(X: FloatArray, focal: FloatArray) -> FloatArray:
-    """Derivatives ``(M, 2, 6)`` of pixels by the camera's perturbation, at points ``(M, 3)`` in the camera."""
-    x, y, z = X[:, 0], X[:, 1], np.maximum(X[:, 2], LEAST_DEPTH)
-    by_place = np.zeros((len(X), 2, 3))
-    by_place[:, 0, 0], by_place[:, 0, 2] = focal[0] / z, -focal[0] * x / z**2
-    by_place[:, 1, 1], by_place[:, 1, 2] = focal[1] / z, -focal[1] * y / z**2
-    by_rotation = np.cross(X[:, None, :], by_place)  # a row j of by_place gives j (w x X) = w (X x j)
-    return np.concatenate([by_rotation, by_place], axis=2)
+    """Derivatives ``(6, 2, M)`` of pixels by the camera's perturbation, at points ``(M, 3)`` in the camera."""
+    x, y, inverse = X[:, 0], X[:, 1], 1.0 / np.maximum(X[:, 2], LEAST_DEPTH)
+    u, v = x * inverse, y * inverse
+    J = np.zeros((6, 2, len(X)))  # points last: arithmetic on long rows
+    J[0, 0], J[1, 0], J[2, 0], J[3, 0], J[5, 0] = -u * v, 1.0 + u * u, -v, inverse, -u * inverse
+    J[0, 1], J[1, 1], J[2, 1], J[4, 1], J[5, 1] = -1.0 - v * v, u * v, u, inverse, -v * inverse
+    J *= focal[:, None]
+    return J

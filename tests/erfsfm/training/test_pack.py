@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from erfsfm.checkpoint import load_model
-from erfsfm.config import ExperimentConfig
+from erfsfm.config import ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
@@ -117,6 +117,26 @@ def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentC
         assert one.keys() == other.keys() >= {"depth", "T_source_target"}
         torch.testing.assert_close(other["T_source_target"], one["T_source_target"])
         assert torch.equal(other["depth"], one["depth"])
+
+
+def test_images_that_cannot_be_read_are_left_out(
+    config: ExperimentConfig, roots: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for frame in (5, 8):
+        (roots[0] / f"sequences/00/image_2/{frame:06d}.png").write_bytes(b"no image")
+    config = config.model_copy(update={"teacher": TeacherConfig()})
+    done = pack(config, tmp_path / "pack", megabytes=5)
+    assert (done.real_frames, done.simulated_frames) == (3, 45)  # 2 to 4; 6 and 7, 9 and 10 are no snippet
+    assert "2 of 54 images cannot be read; 6 are left out" in caplog.text and "000005.png" in caplog.text
+    packed = split_recordings(on_pack(config, tmp_path / "pack").data)[0]
+    assert trained_on(packed) == ["simulated/0-2", "kitti_odometry/00[2:5]"]
+    for image in sorted(roots[0].rglob("image_2/*.png"))[:-1]:
+        image.write_bytes(b"no image")
+    data = config.data.model_copy(update={"roots": roots[:1], "validation": []})
+    config = config.model_copy(update={"data": data})
+    with pytest.raises(DataError, match=r"no 3 consecutive images can be read: image .*000002\.png"):
+        pack(config, tmp_path / "nothing", megabytes=5)
+    assert not (tmp_path / "nothing").exists()
 
 
 def test_simulated_drives_are_shortened_until_all_fits(config: ExperimentConfig, tmp_path: Path) -> None:

@@ -355,6 +355,13 @@ def test_a_time_limit_ends_a_run_with_its_schedule_also_after_a_resume(
     assert load_model(tmp_path / "cut" / "last").record.step == 6, "no time is left"
 
 
+def test_more_devices_than_there_are_is_one_line(small: Small, world: Path, tmp_path: Path) -> None:
+    config = configure(small, [world], training={"devices": 10_000})
+    with pytest.raises(ConfigError, match=r"training\.devices is 10000 on a machine with \d+ cores: set training"):
+        train(config, tmp_path / "run", device="cpu")
+    assert not (tmp_path / "run").exists()
+
+
 def test_several_devices_have_no_common_clock(small: Small, world: Path) -> None:
     with pytest.raises(ValueError, match=r"training\.minutes needs training\.devices: 1"):
         configure(small, [world], training={"minutes": 1, "devices": 2})

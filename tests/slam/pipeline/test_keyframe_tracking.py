@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
-from slam.frames import Frame, RelativePose
+from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
@@ -44,16 +44,18 @@ def test_a_known_camera_height_decides() -> None:
     assert decided(always, 1.65).window.use == "always"
 
 
+KEYFRAMES_ALONE = SlamConfig(
+    window=WindowConfig(use="always", max_corners=200),
+    loops=LoopsConfig(enabled=False),
+    mapping=MappingConfig(enabled=False),
+)
+
+
 def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
     """Before their map begins, and over a gap."""
     truth, blank = room.walk(40), (24, 25)
-    config = SlamConfig(
-        window=WindowConfig(use="always", max_corners=200),
-        loops=LoopsConfig(enabled=False),
-        mapping=MappingConfig(enabled=False),
-    )
     oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
-    with Observer(oracle, room.INTRINSICS, config, Stopwatch()) as observer:
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
             observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
@@ -63,3 +65,29 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
     late = [ends for ends in closed.steps.motions if ends[0] > 19]
     assert late == [(23, 26)]
     assert set(closed.interpolated) == set(blank)
+
+
+@pytest.mark.parametrize("interrupted", [(), (19,), (20,), (21,), (22,)])
+def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: tuple[int, ...]) -> None:
+    """The same ones where the state is asked for in between."""
+    truth = room.walk(40)
+    predicted: list[int] = []
+
+    def depth(k: int) -> DepthMap:
+        predicted.append(k)
+        return room.depth_map(truth[k])
+
+    oracle = OraclePredictor(truth, depth)
+    with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
+        for k, T in enumerate(truth):
+            observer.add(k, room.frame(k, T))
+            if k in interrupted:
+                observer.state()
+        state, closed = observer.state(), observer.closed()
+    assert state.keyframes is not None
+    keyframes = state.keyframes.segments[-1].map.keyframes
+    assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
+    late = {k for k in predicted if k >= 20}
+    assert late == {22, 26, 30, 34, 38} | {keyframe.index for keyframe in keyframes if keyframe.index >= 20}
+    assert [snippet.target for snippet in closed.gaps.trusted if snippet.target > 18] == [22, 26, 30, 34]
+    assert len(closed.gaps.trusted[0].sources) == 4 and not closed.interpolated

@@ -92,6 +92,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
         frame = room.frame(k, T, seeds[k])
         tracking.follow(frame)
         tracking.learn(frame, room.depth_map(T))
+        tracking.look_for_lost(frame, room.depth_map(T))
     state = tracking.state()
     assert state is not None
     _, lost, found = state.events

@@ -7,7 +7,8 @@ import logging
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,9 @@ from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.pipeline.batch import SlamPipeline, SlamResult
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.observer import Observer, ObserverState, read_frame
+from slam.pipeline.doubts import doubled_frames
+from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.reading import read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray
@@ -104,9 +107,9 @@ def street() -> SimulatedSequence:
     return sequence
 
 
-def oracle_of(sequence: Damaged) -> OraclePredictor:
+def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OraclePredictor:
     def depth_of(index: int) -> np.ndarray:
-        depth = street().street.render(index).depth
+        depth = street().street.render(rows[index]).depth
         return np.where(depth > 0, depth, 200.0)
 
     return OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.1), 0.03, seed=2), FACTOR)
@@ -169,8 +172,38 @@ def test_frozen_and_flipped_frames_cost_no_more_than_black_ones(damage: Damage) 
     assert ate(run_on(damage)[0]) < 2 * ate(run_on(black)[0])
 
 
+def test_doubled_frames_are_counted_and_cost_nothing() -> None:
+    """Two frames come twice; the drive goes on where it was."""
+    rows = sorted([*range(FRAMES - 2), 20, 40])
+
+    class Doubled(Damaged):
+        def frame(self, index: int) -> Frame:
+            return replace(street().frame(rows[index]), index=index, stamp=float(street().stamps[index]))
+
+    sequence = Doubled(street(), black, range(0))
+    sequence.reference = street().reference[rows]
+    result = SlamPipeline(sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")).run()
+    assert doubled_frames(FRAMES, result.observations, result.state) == [21, 42]
+    assert result.observations.interpolated == {} and ate(result) < 0.6
+
+
+def rolling_exposure(sequence: SimulatedSequence, index: int) -> Frame:
+    frame = sequence.frame(index)
+    image = np.clip(frame.image * (1.0 + 0.6 * np.sin(0.4 * index)), 0, 255).astype(np.uint8)
+    return replace(frame, image=image)
+
+
+def test_rolling_exposure_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    run(rolling_exposure, range(FRAMES), "mapping.enabled=false")
+    assert "the exposure rolls: " in caplog.text
+    caplog.clear()
+    run(rolling_exposure, range(0), "mapping.enabled=false")
+    assert "exposure" not in caplog.text
+
+
 def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
-    assert run(bad=range(0)).observations.interpolated == {}
+    assert (result := run(bad=range(0))).observations.interpolated == {}
+    assert doubled_frames(FRAMES, result.observations, result.state) == []
 
 
 def observe(frames: int, state: ObserverState | None, damage: Damage, bad: range, *overrides: str) -> ObserverState:

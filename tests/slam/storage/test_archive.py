@@ -56,11 +56,16 @@ def test_no_damage_escapes_as_another_error(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     "failure",
-    [zlib.error("Error -3"), NotImplementedError("compression"), MemoryError(), KeyError("a"), OSError(5, "IO")],
+    [zlib.error("Error -3"), NotImplementedError("compression"), KeyError("a"), OSError(5, "IO")],
 )
 def test_every_failure_is_one_line_about_the_file(tmp_path: Path, failure: Exception) -> None:
     with pytest.raises(RunError, match=r"x\.npz is damaged \(\w+"), reading_archive(tmp_path / "x.npz"):
         raise failure
+
+
+def test_missing_memory_is_not_called_damage(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"x\.npz needs more memory than there is"), reading_archive(tmp_path / "x.npz"):
+        raise MemoryError
 
 
 def test_our_own_errors_and_interruptions_pass(tmp_path: Path) -> None:

@@ -40,12 +40,12 @@ def test_jacobians_are_the_derivatives_of_the_residuals() -> None:
         step[axis] = 1e-6
         ahead, behind = (from_rotation_vector(s * step[:3], s * step[3:]) @ T for s in (1.0, -1.0))
         numeric = (problem.residuals(ahead, X) - problem.residuals(behind, X)) / 2e-6
-        np.testing.assert_allclose(by_camera[:, :, axis], numeric, atol=1e-4)
+        np.testing.assert_allclose(by_camera[axis].T, numeric, atol=1e-4)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-6
         numeric = (problem.residuals(T, X + step) - problem.residuals(T, X - step)) / 2e-6
-        np.testing.assert_allclose(by_point[:, :, axis], numeric, atol=1e-4)
+        np.testing.assert_allclose(by_point[axis].T, numeric, atol=1e-4)
 
 
 def test_finds_cameras_and_points_again() -> None:
@@ -67,10 +67,10 @@ def test_is_the_least_squares_solution_and_leaves_fixed_cameras() -> None:
     residual = problem.residuals(solved.T_camera_world, solved.points)
     by_camera, by_point = problem.jacobians(solved.T_camera_world, solved.points)
     gradient = np.zeros((len(X), 3))
-    np.add.at(gradient, sightings.point, np.einsum("sij,si->sj", by_point, residual))
+    np.add.at(gradient, sightings.point, np.einsum("jis,si->sj", by_point, residual))
     assert np.abs(gradient).max() < 1e-3
     gradient_of_camera = np.zeros((len(T), 6))
-    np.add.at(gradient_of_camera, sightings.camera, np.einsum("sij,si->sj", by_camera, residual))
+    np.add.at(gradient_of_camera, sightings.camera, np.einsum("jis,si->sj", by_camera, residual))
     assert np.abs(gradient_of_camera[free]).max() < 1e-2
     np.testing.assert_array_equal(solved.T_camera_world[~free], T[~free])
 

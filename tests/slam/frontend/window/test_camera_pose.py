@@ -23,7 +23,7 @@ def test_jacobian_is_the_derivative_of_the_pixels() -> None:
         step[axis] = 1e-6
         ahead, behind = (apply(from_rotation_vector(s * step[:3], s * step[3:]), X) for s in (1.0, -1.0))
         numeric = (ahead[:, :2] / ahead[:, 2:] - behind[:, :2] / behind[:, 2:]) * focal / 2e-6
-        np.testing.assert_allclose(pixel_jacobian(X, focal)[:, :, axis], numeric, atol=1e-4)
+        np.testing.assert_allclose(pixel_jacobian(X, focal)[axis].T, numeric, atol=1e-4)
 
 
 def test_finds_the_pose_from_a_far_guess() -> None:

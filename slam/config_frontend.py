@@ -31,11 +31,6 @@ class FrontendConfig(Section):
         le=10,
         description="least translation sigma over the median one-frame step, without noise.yaml",
     )
-    noise_steps: int = Field(
-        default=20,
-        ge=1,
-        description="steps also measured by image geometry, from which on the noise is estimated on this sequence",
-    )
     student_t_dof: float = Field(
         default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
     )
@@ -47,20 +42,12 @@ class GeometryConfig(Section):
     enabled: bool = Field(default=True, description="measure relative poses by image geometry, beside the pose network")
     steps: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1, description="frame distances to measure")
     max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
-    corner_quality: float = Field(
-        default=0.003, gt=0, lt=1, description="least corner strength over that of the strongest corner"
-    )
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
-    window_px: int = Field(default=11, ge=5, le=63, description="side of the Lucas-Kanade window, pixels")
-    wide_window_px: int = Field(
-        default=31, ge=5, le=63, description="side of the window after most tracks were lost, pixels"
-    )
     few_corners: int = Field(
         default=60,
         ge=0,
         description="number of tracks below which tracking is repeated with the wide window and equalised exposure",
     )
-    pyramid_levels: int = Field(default=4, ge=0, le=8, description="image pyramid levels above the full image")
     predicted_flow: bool = Field(
         default=True,
         description="start tracking at the optical flow predicted from learned depth and the previous motion",
@@ -76,15 +63,7 @@ class GeometryConfig(Section):
         ge=0,
         description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
     )
-    forward_backward_px: float = Field(default=0.5, gt=0, description="largest forward-backward tracking error, pixels")
     inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier, pixels")
-    reprojection_px: float = Field(default=2.0, gt=0, description="largest reprojection error of a PnP inlier, pixels")
-    along_px: float = Field(
-        default=0.4, gt=0, description="corner noise along the epipolar line, pixels, besides that of learned depth"
-    )
-    early_exit_inlier_ratio: float = Field(
-        default=0.75, ge=0, le=1, description="inlier ratio at which RANSAC stops early"
-    )
     depth_relative_sigma: float = Field(
         default=0.2, gt=0, description="least relative sigma of learned depth along an epipolar line"
     )
@@ -93,20 +72,6 @@ class GeometryConfig(Section):
     )
     heading_prior_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the heading prior, degrees")
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
-    still_flow_px: float = Field(
-        default=0.3, ge=0, description="median optical flow below which the camera stands still, pixels"
-    )
-    min_parallax_px: float = Field(
-        default=0.8, gt=0, description="least median optical flow that remains after rotation is removed, pixels"
-    )
-    min_point_parallax_px: float = Field(
-        default=2.0, gt=0, description="least parallax of a point used for step lengths, pixels"
-    )
-    max_depth_heights: float = Field(default=30.0, gt=0, description="largest depth used, in camera heights")
-    rotation_floor_deg: float = Field(default=0.002, gt=0, description="least rotation sigma, degrees")
-    direction_floor_deg: float = Field(
-        default=0.045, gt=0, description="least sigma of the translation direction, degrees"
-    )
     jitter_rotation_ratio: float = Field(
         default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
     )
@@ -178,12 +143,6 @@ class GapsConfig(Section):
     )
     max_unread_frames: int = Field(
         default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
-    )
-    rotation_sigma_deg: float = Field(
-        default=2.0, gt=0, le=90, description="rotation sigma of an interpolated step, degrees"
-    )
-    translation_relative_sigma: float = Field(
-        default=0.5, gt=0, le=10, description="translation sigma over the length of an interpolated step"
     )
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.config import GapsConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses, runs
 from slam.frontend.step_table import StepTable
@@ -22,6 +21,8 @@ _LONGEST_START = 2.0
 # frames that the gate may refuse after a frozen video, whose first new image is of another place
 _LONGEST_DOUBT = 2
 _SIGMA_FLOOR = 1e-6
+_ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
+_TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,6 @@ def interpolate_gaps(
     steps: StepTable,
     unusable: Mapping[int, str],
     repeated: Collection[int],
-    config: GapsConfig,
     cuts: Collection[int] = (),
 ) -> InterpolatedGaps:
     """Interpolate the gaps of a run.
@@ -59,7 +59,6 @@ def interpolate_gaps(
         steps: measured between usable frames; over a gap, between its two ends.
         unusable: frames without a measurement, and why.
         repeated: frames whose image repeats that of the frame before.
-        config: noise of an interpolated step.
         cuts: frames that show another place than the one before: no snippet measures across them.
 
     Raises:
@@ -83,7 +82,7 @@ def interpolate_gaps(
     motion = _completed(known, loose)
     motion |= _equal_steps(steps.relative_poses, set(loose))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
-    interpolated = [_interpolated_step(step, motion[step], typical, config) for step in loose]
+    interpolated = [_interpolated_step(step, motion[step], typical) for step in loose]
     return InterpolatedGaps(filled, trusted, steps, interpolated, dict(sorted(frames.items())))
 
 
@@ -190,9 +189,9 @@ def _between(steps: Mapping[int, FloatArray], a: int, b: int) -> FloatArray:
     return T_a_b
 
 
-def _interpolated_step(step: int, T_from_to: FloatArray, typical: float, config: GapsConfig) -> RelativePose:
+def _interpolated_step(step: int, T_from_to: FloatArray, typical: float) -> RelativePose:
     length = max(float(np.linalg.norm(T_from_to[:3, 3])), typical, _SIGMA_FLOOR)
-    rotation, translation = np.deg2rad(config.rotation_sigma_deg), config.translation_relative_sigma * length
+    rotation, translation = np.deg2rad(_ROTATION_SIGMA_DEG), _TRANSLATION_RELATIVE_SIGMA * length
     return RelativePose(step, step + 1, T_from_to, np.repeat([rotation, translation], 3), INTERPOLATED_SOURCE)
 
 

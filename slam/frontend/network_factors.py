@@ -37,6 +37,7 @@ _LEAST_SCALING = 0.3
 _STRETCHES = 4
 
 logger = logging.getLogger(__name__)
+_NOISE_STEPS = 20  # steps also measured by image geometry, from which on the noise is estimated on this sequence
 
 
 def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
@@ -64,18 +65,18 @@ def calibrated_factors(
         snippets: measured by the network.
         geometric: measured by image geometry, unscaled, with its full noise.
         noise: of this network.
-        config: the noise is scaled from ``noise_steps`` common steps on.
+        config: the noise is scaled from 20 common steps on.
     """
     pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
     if not pairs:
         return []
     law = np.stack([noise.sigmas(pair) for pair in pairs])
     steps = {pose.ends: pose for pose in geometric}
-    student_t_dof = config.student_t_dof if len(steps) >= config.noise_steps else math.inf
+    student_t_dof = config.student_t_dof if len(steps) >= _NOISE_STEPS else math.inf
     from_geometry = _from_geometry(pairs, steps)
-    scaling = _scaling(pairs, from_geometry / law, config.noise_steps)
+    scaling = _scaling(pairs, from_geometry / law, _NOISE_STEPS)
     sigmas = np.hypot(scaling * law, _noise_of_geometry(pairs, steps))
-    correlated_sigmas = _persistence(pairs, from_geometry / sigmas, config.noise_steps) * sigmas
+    correlated_sigmas = _persistence(pairs, from_geometry / sigmas, _NOISE_STEPS) * sigmas
     return [
         RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, student_t_dof)
         for pair, own, chained in zip(pairs, sigmas, correlated_sigmas, strict=True)
@@ -181,7 +182,7 @@ def measured_noise(
     """The noise of this network on this drive, by comparison with image geometry.
 
     Sigmas are 1.48 times the median absolute difference of one-frame steps, at least the configured ones;
-    with fewer than ``noise_steps`` common steps the configured ones are used.
+    with fewer than 20 common steps the configured ones are used.
     """
     by_pair = {(g.from_index, g.to_index): g.T_from_to for g in geometric}
     rotations, shifts = [], []
@@ -194,7 +195,7 @@ def measured_noise(
             error = invert(T_geometric) @ T_source_target
             rotations.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
             shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
-    if len(rotations) < config.noise_steps:
+    if len(rotations) < _NOISE_STEPS:
         return config
     rotation, shift = (mad_sigma(np.concatenate(e)) for e in (rotations, shifts))
     return config.model_copy(

@@ -193,11 +193,11 @@ class Observer:
             SlamError: no snippet of usable frames.
         """
         self.flush()
-        seen, sources, config = self._seen, self._predictor.sources, self._config.gaps
+        seen, sources = self._seen, self._predictor.sources
         steps, count, maps = StepTable.of(seen.motions), len(seen.roads), self._keyframes.maps(seen)
         window = self._keyframes.poses(maps)
         cuts = find_cuts(seen.failures, {*steps.motions, *window.steps}, {*seen.unusable, *seen.repeated})
-        gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, config, cuts)
+        gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, cuts)
         return ClosedObservations.of(seen, gaps, cuts, window, maps)
 
     def _require_readable(self, error: SequenceError) -> None:

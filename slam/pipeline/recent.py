@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import TypeVar
 
-from slam.config import GapsConfig
 from slam.frontend.gap_interpolation import interpolate_gaps
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
@@ -48,10 +47,10 @@ def recent(seen: Observations, first: int) -> Observations:
     )
 
 
-def closed(seen: Observations, sources: int, config: GapsConfig) -> ClosedObservations:
+def closed(seen: Observations, sources: int) -> ClosedObservations:
     """Observations with their gaps interpolated; ``sources`` are those of a snippet."""
     steps = StepTable.of(seen.motions)
-    gaps = interpolate_gaps(len(seen.roads), sources, seen.snippets, steps, seen.unusable, seen.repeated, config)
+    gaps = interpolate_gaps(len(seen.roads), sources, seen.snippets, steps, seen.unusable, seen.repeated)
     return ClosedObservations.of(seen, gaps)
 
 

@@ -47,7 +47,7 @@ class Tracker:
         update: int = 10,
     ) -> None:
         """Prepare for the first frame."""
-        self._sources, self._gaps = predictor.sources, config.gaps
+        self._sources = predictor.sources
         self._recent = GrowingSequence(intrinsics, camera_height_m)
         self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
         self._window, self._update = window, update
@@ -115,7 +115,7 @@ class Tracker:
         if not window.snippets:
             return
         self._recent.stamps = np.arange(count - first, dtype=np.float64)
-        measured = self._pipeline.measure(self._mode, closed(window, self._sources, self._gaps))
+        measured = self._pipeline.measure(self._mode, closed(window, self._sources))
         if observer.keyframe_step(count - 1) is not None:
             self._unit = float(np.median(measured.scale.per_frame))
             return

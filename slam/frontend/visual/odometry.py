@@ -44,6 +44,13 @@ _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
+_REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
+_MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
+_STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
+_MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
+_MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
+_ROTATION_FLOOR_DEG = 0.002  # least rotation sigma, degrees
+_DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degrees
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,7 @@ class VisualOdometry:
 
     def _trusted(self, depth: FloatArray, height_unscaled: float | None) -> FloatArray:
         """Depths ``(M,)`` with NaN where not trusted."""
-        farthest = np.inf if height_unscaled is None else self._config.max_depth_heights * height_unscaled
+        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
         return np.where(depth < farthest, depth, np.nan)
 
     def _matches(self, tracks: Tracks, learned: FloatArray, mask: DynamicMask) -> Matches:
@@ -174,7 +181,7 @@ class VisualOdometry:
 
     def _still(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | None:
         flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
-        if flow >= self._config.still_flow_px or not np.isfinite(depth).any():
+        if flow >= _STILL_FLOW_PX or not np.isfinite(depth).any():
             return None
         # a forward step of t moves a point at depth z and r pixels from the centre by r t / z
         typical_radius_px = 0.25 * self._intrinsics.width
@@ -191,7 +198,7 @@ class VisualOdometry:
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
-        if np.median(unexplained) < self._config.min_parallax_px:
+        if np.median(unexplained) < _MIN_PARALLAX_PX:
             return None
         estimated = self._two_views.estimate(matches, self._state.history)
         if estimated is None or estimated[0].inliers.sum() < self._config.min_inliers:
@@ -211,7 +218,7 @@ class VisualOdometry:
         unit_pose = two_view.unit_pose
         parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
         depth_previous = triangulated_depth(rays_previous, rays_current, unit_pose)
-        solid = two_view.inliers & (depth_previous > 0) & (parallax > self._config.min_point_parallax_px)
+        solid = two_view.inliers & (depth_previous > 0) & (parallax > _MIN_POINT_PARALLAX_PX)
         measures = solid & np.isfinite(depth)
         if measures.sum() < _MIN_RATIOS:
             return None
@@ -230,8 +237,8 @@ class VisualOdometry:
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
         own = np.sqrt(np.diag(two_view.covariance))
-        rotation = np.hypot(own[:3], np.deg2rad(self._config.rotation_floor_deg))
-        floor = np.deg2rad(self._config.direction_floor_deg)
+        rotation = np.hypot(own[:3], np.deg2rad(_ROTATION_FLOOR_DEG))
+        floor = np.deg2rad(_DIRECTION_FLOOR_DEG)
         return rotation, np.hypot(own[3:], floor * np.sqrt(np.maximum(1.0 - two_view.unit_pose.direction**2, 0.0)))
 
     def _by_points(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | MeasurementFailure:
@@ -241,7 +248,7 @@ class VisualOdometry:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
         points_previous = self._intrinsics.rays(tracks.previous[known]) * depth[known, None]
         pixels, K = tracks.current[known], self._intrinsics.K
-        found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, self._config.reprojection_px, self._seed)
+        found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
         count = 0 if found is None else len(found[2])
         if found is None or count < self._config.min_inliers:
             return MeasurementFailure(f"little parallax, and only {count} corners agree with the learned depth")

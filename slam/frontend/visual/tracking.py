@@ -22,6 +22,11 @@ from slam.storage.cache import Answer, GetOrCompute, without_cache
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+_CORNER_QUALITY = 0.003  # least corner strength over that of the strongest corner
+_WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
+_PYRAMID_LEVELS = 4  # image pyramid levels above the full image
+_FORWARD_BACKWARD_PX = 0.5  # largest forward-backward tracking error, pixels
+_WINDOW_PX = 11  # side of the Lucas-Kanade window, pixels
 
 
 @dataclass(frozen=True)
@@ -97,12 +102,12 @@ class CornerTracker:
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
         def flow() -> Answer:
-            target = _warped(current.grey, self._config.window_px, predicted_flow)
+            target = _warped(current.grey, _WINDOW_PX, predicted_flow)
             found = self._first_flow(previous.grey, current.grey, points, [target])
             return found.pixels, found.kept
 
         def find() -> Tracks:
-            settings = repr((self._config.window_px, self._config.forward_backward_px))
+            settings = repr((_WINDOW_PX, _FORWARD_BACKWARD_PX))
             given = previous, current, points, settings, *predicted_flow.given
             pixels, kept = self._get_or_compute("flow across a baseline", given, flow)
             return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), track_ids[kept])
@@ -116,15 +121,15 @@ class CornerTracker:
         config = self._config
 
         def flow() -> Answer:
-            found = self._flow(first.grey, second.grey, points, config.window_px, predicted_flow)
+            found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
             if found.kept.sum() < config.few_corners:
                 exposed = _histogram_matched(second.grey, first.grey)
-                wider = self._flow(first.grey, exposed, points, config.wide_window_px, predicted_flow)
+                wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
                 found = max(found, wider, key=lambda tracked: tracked.kept.sum())
             return found.pixels, found.kept
 
-        windows = config.window_px, config.wide_window_px, config.few_corners
-        settings = repr((*windows, config.pyramid_levels, config.forward_backward_px))
+        windows = _WINDOW_PX, _WIDE_WINDOW_PX, config.few_corners
+        settings = repr((*windows, _PYRAMID_LEVELS, _FORWARD_BACKWARD_PX))
         predicted = () if predicted_flow is None else predicted_flow.given
         given = (first, second, points, settings, *predicted)
         pixels, kept = self._get_or_compute("optical flow", given, flow)
@@ -136,7 +141,7 @@ class CornerTracker:
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
-            settings = repr((room, config.corner_quality, config.corner_spacing_px))
+            settings = repr((room, _CORNER_QUALITY, config.corner_spacing_px))
             (fresh,) = self._get_or_compute(
                 "new corners", (frame, pixels, settings), lambda: (self._detected(frame.grey, pixels, room),)
             )
@@ -153,16 +158,14 @@ class CornerTracker:
         """At most ``room`` corners ``(M, 2)`` away from those tracked."""
         config = self._config
         free = _away_from(pixels, int(config.corner_spacing_px), grey.shape)
-        corners = cv2.goodFeaturesToTrack(
-            grey, room, config.corner_quality, config.corner_spacing_px, mask=free, blockSize=5
-        )
+        corners = cv2.goodFeaturesToTrack(grey, room, _CORNER_QUALITY, config.corner_spacing_px, mask=free, blockSize=5)
         return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
     def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
     ) -> _Tracked:
         """Points ``(M, 2)`` tracked directly or through the predicted flow, and which are reliable."""
-        plain = _Target(second, side, self._config.pyramid_levels)
+        plain = _Target(second, side, _PYRAMID_LEVELS)
         targets = [plain] if predicted_flow is None else [_warped(second, side, predicted_flow), plain]
         return self._first_flow(first, second, points, targets)
 
@@ -179,7 +182,7 @@ class CornerTracker:
                 continue
             backward, found_back = _lucas_kanade(target.image, first, forward, target)
             error = np.abs(backward - points[tried]).max(axis=1)
-            returned = found_back & (error < self._config.forward_backward_px)
+            returned = found_back & (error < _FORWARD_BACKWARD_PX)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
         height, width = second.shape
         inside = (pixels >= 0).all(axis=1) & (pixels <= [width - 1, height - 1]).all(axis=1)

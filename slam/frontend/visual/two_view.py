@@ -43,6 +43,8 @@ _OUTLIER_COST = 3.0
 _PATCH_WIDENING = 3.0
 # errors of neighbouring corners are correlated: sigmas of independent ones are widened by this
 CORNER_CORRELATION = 2.0
+_ALONG_PX = 0.4  # corner noise along the epipolar line, pixels, besides that of learned depth
+_EARLY_EXIT_INLIER_RATIO = 0.75  # inlier ratio at which RANSAC stops early
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class TwoViewEstimator:
         proposed = self._by_essential(first, second)
         prior = self._prior(matches, proposed, history)
         candidates = [self._refined(matches, proposed, prior)]
-        if candidates[0] is None or candidates[0].inliers.mean() < self._config.early_exit_inlier_ratio:
+        if candidates[0] is None or candidates[0].inliers.mean() < _EARLY_EXIT_INLIER_RATIO:
             by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
             candidates += [self._refined(matches, other, prior) for other in (by_points, history.last)]
         found = [candidate for candidate in candidates if candidate is not None]
@@ -183,7 +185,7 @@ class TwoViewEstimator:
                 prior.depth_relative_error,
                 prior.axis_sigma,
                 self._config.inlier_px,
-                self._config.along_px,
+                _ALONG_PX,
                 self._focal_px,
             )
         )
@@ -208,7 +210,7 @@ class TwoViewEstimator:
             across, by_motion = residuals.across(unit_pose, tangent)
             along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
             near = np.abs(across) < self._config.inlier_px
-            sigma_along = np.hypot(self._config.along_px, prior.depth_relative_error * shift_px)
+            sigma_along = np.hypot(_ALONG_PX, prior.depth_relative_error * shift_px)
             inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
             if inliers.sum() < _LEAST_POINTS:
                 return None

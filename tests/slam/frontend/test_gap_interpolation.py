@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config import GapsConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, InterpolatedGaps, interpolate_gaps, network_steps
@@ -16,7 +15,6 @@ from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.se3 import FloatArray, chain, from_rotation_vector, invert
 
-CONFIG = GapsConfig()
 COUNT = 40
 STEP = from_rotation_vector(np.array([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 1.0]))
 
@@ -43,12 +41,12 @@ def measured(T_world_camera: FloatArray, first: int, last: int) -> Motion:
 def closed(T_world_camera: FloatArray, unusable: set[int], *steps: Motion) -> InterpolatedGaps:
     snippets = snippets_of(T_world_camera, unusable)
     reasons = dict.fromkeys(unusable, "black")
-    return interpolate_gaps(len(T_world_camera), 4, snippets, StepTable.of(steps), reasons, (), CONFIG)
+    return interpolate_gaps(len(T_world_camera), 4, snippets, StepTable.of(steps), reasons, ())
 
 
 def test_a_drive_without_gaps_stays_as_it_was() -> None:
     snippets, steps = snippets_of(steady(), set()), StepTable.of([measured(steady(), 3, 4)])
-    found = interpolate_gaps(COUNT, 4, snippets, steps, {}, (), CONFIG)
+    found = interpolate_gaps(COUNT, 4, snippets, steps, {}, ())
     assert found.snippets == found.trusted == snippets and found.steps is steps
     assert found.interpolated == [] and found.frames == {}
 
@@ -115,7 +113,7 @@ def repeating(frozen: bool) -> tuple[InterpolatedGaps, FloatArray]:
     seen[15:25] = seen[14]
     steps = StepTable.of(measured(seen, k, k + 1) for k in range(COUNT - 1))
     snippets = snippets_of(seen, set())
-    return interpolate_gaps(COUNT, 4, snippets, steps, {}, range(15, 25), CONFIG), true
+    return interpolate_gaps(COUNT, 4, snippets, steps, {}, range(15, 25)), true
 
 
 def test_repeated_images_of_a_moving_camera_are_interpolated() -> None:
@@ -135,14 +133,14 @@ def test_repeated_images_of_a_standing_camera_are_measurements() -> None:
 
 def test_repetition_to_the_end_is_standing_still() -> None:
     still = np.tile(np.eye(4), (COUNT, 1, 1))
-    found = interpolate_gaps(COUNT, 4, snippets_of(still, set()), StepTable({}), {}, range(1, COUNT), CONFIG)
+    found = interpolate_gaps(COUNT, 4, snippets_of(still, set()), StepTable({}), {}, range(1, COUNT))
     assert found.frames == {} and found.interpolated == []
 
 
 def test_without_any_snippet_there_is_one_error() -> None:
     reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
     with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
-        interpolate_gaps(COUNT, 4, [], StepTable({}), reasons, (), CONFIG)
+        interpolate_gaps(COUNT, 4, [], StepTable({}), reasons, ())
 
 
 def test_steps_are_the_direct_poses_of_the_target() -> None:

@@ -19,11 +19,11 @@ def texture(seed: int) -> np.ndarray:
     return cv2.GaussianBlur(cv2.resize(coarse, None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST), (0, 0), 1.2)
 
 
-def image(T_world_camera: FloatArray, seed: int = 0) -> np.ndarray:
-    """The far wall, and the near one over the left half of it."""
+def image(T_world_camera: FloatArray, seed: int = 0, near: bool = True) -> np.ndarray:
+    """The far wall, and the near one, if it is there, over the left half of it."""
     T = invert(T_world_camera)
     drawn = None
-    for depth, wall in ((FAR, texture(seed)), (NEAR, texture(seed + 1))):
+    for depth, wall in ((FAR, texture(seed)), (NEAR, texture(seed + 1)))[: 2 if near else 1]:
         height, width = wall.shape
         left = -width / _PX_PER_M / 2 if depth == FAR else -width / _PX_PER_M + 0.1
         place = np.array([[1 / _PX_PER_M, 0, left], [0, 1 / _PX_PER_M, -height / _PX_PER_M / 2], [0, 0, depth]])
@@ -52,5 +52,5 @@ def walk(frames: int, step_m: float = 0.03, turn: float = 0.004) -> FloatArray:
     return invert(T[0]) @ T
 
 
-def frame(index: int, T_world_camera: FloatArray, seed: int = 0) -> Frame:
-    return Frame(index, index / 30.0, image(T_world_camera, seed))
+def frame(index: int, T_world_camera: FloatArray, seed: int = 0, near: bool = True) -> Frame:
+    return Frame(index, index / 30.0, image(T_world_camera, seed, near))

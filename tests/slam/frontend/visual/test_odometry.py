@@ -14,6 +14,7 @@ from slam.config import GeometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.step_lengths import length_ratio
+from slam.frontend.visual import odometry
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.step_noise import StepNoise
@@ -148,9 +149,10 @@ def test_failures_carry_a_reason(texture):
     assert isinstance(failure, MeasurementFailure)
 
 
-def test_far_depth_is_not_trusted(texture):
+def test_far_depth_is_not_trusted(texture, monkeypatch):
+    monkeypatch.setattr(odometry, "_MAX_DEPTH_HEIGHTS", 0.5)
     forward = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    failure = measure(forward, texture, config=GeometryConfig(max_depth_heights=0.5))
+    failure = measure(forward, texture)
     assert isinstance(failure, MeasurementFailure)
 
 

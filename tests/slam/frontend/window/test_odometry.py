@@ -60,9 +60,9 @@ def test_a_hand_held_camera_is_followed() -> None:
     assert 0.2 < similarity.scale < 0.55
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, 5])
 def test_a_map_begins_on_a_plane(seed: int) -> None:
-    """A wall faced squarely fits many essential matrices; with seed 1 they gave a camera that turns by 14 degrees."""
+    """A wall faced squarely fits many essential matrices: with seed 5 theirs turned the camera by 90 degrees."""
     truth = room.walk(50)
     odometry = WindowOdometry(CONFIG, room.INTRINSICS, seed)
     for k, T_world_camera in enumerate(truth):

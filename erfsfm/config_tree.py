@@ -88,9 +88,11 @@ def load_config(
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), _read_tree(path)
         if sections is not None:
-            known = set(_known_keys(model))
-            tree = {name: _only(tree[name], name, known) for name in sections if name in tree}
+            tree = {name: tree[name] for name in sections if name in tree}
         old_names.refuse(tree, origin)
+        if sections is not None:
+            known = set(_known_keys(model))
+            tree = {name: _only(section, name, known) for name, section in tree.items()}
     for text in overrides:
         change: dict[str, Any] = {}
         _override(change, text)

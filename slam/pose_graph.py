@@ -26,11 +26,11 @@ from slam.se3 import FloatArray, invert, is_se3
 _ANCHOR_SIGMA = 1e-6
 _LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
 _OUTLYING = 3.0
+_MAX_ITERATIONS = 100  # of Levenberg-Marquardt
+_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
+_RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
 
 logger = logging.getLogger(__name__)
-_MAX_ITERATIONS = 100  # Levenberg-Marquardt iterations of a stage
-_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
-_RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which a stage ends
 
 
 class PoseGraph:

@@ -66,6 +66,7 @@ def estimate_metrics(
         "optimised": trajectory_metrics(result.optimised, reference),
         **_lidar_metrics(result),
     }
+    doubled = dict.fromkeys(doubled_frames(len(sequence), result.observations, result.state), DOUBLED)
     metrics: dict[str, Any] = finite(
         {
             "schema": SCHEMA,
@@ -74,7 +75,7 @@ def estimate_metrics(
             "provenance": asdict(provenance),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
-            | {"doubled": describe_frames(dict.fromkeys(_doubled(result, len(sequence)), DOUBLED))}
+            | {"doubled": describe_frames(doubled)}
             | {"unreadable_scans": describe_frames(_unreadable_scans(result))}
             | {"continued_at": result.first}
             | {"segments": [asdict(segment) for segment in result.observations.segments]},
@@ -90,10 +91,6 @@ def estimate_metrics(
         }
     )
     return metrics
-
-
-def _doubled(result: SlamResult, frames: int) -> list[int]:
-    return doubled_frames(frames, result.observations, result.state)
 
 
 def _unreadable_scans(result: SlamResult) -> Mapping[int, str]:

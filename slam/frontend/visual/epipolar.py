@@ -82,7 +82,7 @@ def unit_poses_by_homography(
 ) -> list[UnitRelativePose]:
     """The motions, at most two, by which a plane explains the matched rays ``(M, 3)`` with z = 1, within ``tolerance``.
 
-    The plane must lie in front of both cameras where its inliers see it.
+    The plane must lie in front of the previous camera where its inliers see it.
     """
     order = ransac_order(len(rays_previous), seed)
     rays_previous, rays_current = rays_previous[order], rays_current[order]

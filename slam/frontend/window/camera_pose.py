@@ -42,7 +42,6 @@ def resect(
     points: FloatArray,
     pixels: FloatArray,
     intrinsics: Intrinsics,
-    inlier_px: float,
     seed: int = 0,
 ) -> CameraPose:
     """The pose found from the first guess ``T_camera_world``; in doubt that with most inliers, from others too.
@@ -54,29 +53,26 @@ def resect(
         points: in the world ``(M, 3)``, at least 6.
         pixels: of the points ``(M, 2)``.
         intrinsics: of the camera.
-        inlier_px: largest residual of an inlier.
         seed: of RANSAC.
     """
 
     def support(pose: CameraPose) -> int:
-        return int((pose.residual_px < inlier_px).sum())
+        return int((pose.residual_px < INLIER_PX).sum())
 
-    best = _refined(guesses[0], points, pixels, intrinsics, inlier_px)
+    best = _refined(guesses[0], points, pixels, intrinsics)
     for guess in guesses[1:]:
         if support(best) >= _DOUBTFUL_RATIO * len(points):
             break
-        best = max(best, _refined(guess, points, pixels, intrinsics, inlier_px), key=support)
+        best = max(best, _refined(guess, points, pixels, intrinsics), key=support)
     if support(best) < _DOUBTFUL_RATIO * len(points):
-        found = consensus(points, pixels, intrinsics.K, _SAMPLES, inlier_px, seed)
+        found = consensus(points, pixels, intrinsics.K, _SAMPLES, INLIER_PX, seed)
         if found is not None:
             start = make(cv2.Rodrigues(found[0])[0], found[1])
-            best = max(best, _refined(start, points, pixels, intrinsics, inlier_px), key=support)
+            best = max(best, _refined(start, points, pixels, intrinsics), key=support)
     return best
 
 
-def _refined(
-    T_camera_world: FloatArray, points: FloatArray, pixels: FloatArray, intrinsics: Intrinsics, inlier_px: float
-) -> CameraPose:
+def _refined(T_camera_world: FloatArray, points: FloatArray, pixels: FloatArray, intrinsics: Intrinsics) -> CameraPose:
     """Cauchy weights of half an inlier; far from the solution, where all residuals are large, of their median."""
     T = T_camera_world.copy()
     focal = np.array([intrinsics.fx, intrinsics.fy])
@@ -84,7 +80,7 @@ def _refined(
     residual, X = _residual(T, points, rays, focal)
     for _ in range(_ITERATIONS):
         norm = np.hypot(*residual)
-        scale = max(0.5 * inlier_px, float(np.median(norm)))
+        scale = max(0.5 * INLIER_PX, float(np.median(norm)))
         weight = np.where(X[:, 2] > LEAST_DEPTH, 1.0 / (1.0 + (norm / scale) ** 2), 0.0)
         J = pixel_jacobian(X, focal)
         weighted = (weight * J).reshape(6, -1)

@@ -24,7 +24,7 @@ from slam.frontend.visual.epipolar import (
 )
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.window.flow import Pixels
-from slam.se3 import FloatArray, make
+from slam.se3 import FloatArray, make, rotation_angle
 
 _LEAST_POINTS = 40
 _LEAST_RATIO = 0.5
@@ -106,14 +106,13 @@ def _cost(found: FirstPoints, views: Iterable[View], intrinsics: Intrinsics, see
         if known.sum() < MIN_POINTS:
             continue
         guesses = found.T_current_first, np.eye(4)
-        pose = resect(guesses, found.points[rows[known]], pixels[known].astype(np.float64), intrinsics, INLIER_PX, seed)
+        pose = resect(guesses, found.points[rows[known]], pixels[known].astype(np.float64), intrinsics, seed)
         outside = np.full(int((~known).sum()), INLIER_PX)
         costs.append(np.square(np.minimum(np.concatenate([pose.residual_px, outside]), INLIER_PX)).mean())
     return max(float(np.mean(costs)), _LEAST_COST) if costs else float("inf")
 
 
 def _alike(one: UnitRelativePose, other: UnitRelativePose) -> bool:
-    difference = one.R_current_previous @ other.R_current_previous.T
-    turned = np.arccos(np.clip(0.5 * (np.trace(difference) - 1.0), -1.0, 1.0))
+    turned = rotation_angle(one.R_current_previous @ other.R_current_previous.T)
     apart = np.arccos(np.clip(one.direction @ other.direction, -1.0, 1.0))
     return bool(turned < _SAME_MOTION and apart < 4.0 * _SAME_MOTION)

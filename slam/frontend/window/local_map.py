@@ -35,9 +35,6 @@ _ATTEMPTS = 2
 _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
-CORNER_QUALITY = 0.002  # least corner strength over that of the strongest corner
-WINDOW_PX = 15  # side of the Lucas-Kanade window, pixels
-FORWARD_BACKWARD_PX = 0.7  # largest forward-backward tracking error, pixels
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 
 
@@ -82,7 +79,7 @@ class WindowKeyframe:
 def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
     """Corners ``(M, 2)`` of an image without tracks."""
     none = np.zeros((0, 2), np.float32)
-    return new_corners(grey, none, config.max_corners, config.corner_spacing_px, CORNER_QUALITY)
+    return new_corners(grey, none, config.max_corners, config.corner_spacing_px)
 
 
 @dataclass
@@ -262,4 +259,4 @@ def _matched(
     turned = np.asarray(cv2.warpPerspective(keyframe.grey, H, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     moved = np.column_stack([keyframe.pixels[rows], np.ones(len(rows))]) @ H.T
     pixels = (moved[:, :2] / moved[:, 2:]).astype(np.float32)
-    return flow(turned, grey, pixels, guesses, WINDOW_PX, _MATCHED_LEVELS, FORWARD_BACKWARD_PX)
+    return flow(turned, grey, pixels, guesses, _MATCHED_LEVELS)

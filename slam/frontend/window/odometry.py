@@ -21,9 +21,6 @@ from slam.frontend.window.descriptors import describe
 from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.initialisation import View, first_points
 from slam.frontend.window.local_map import (
-    CORNER_QUALITY,
-    FORWARD_BACKWARD_PX,
-    WINDOW_PX,
     LocalMap,
     TrackIds,
     WindowKeyframe,
@@ -187,9 +184,7 @@ class WindowOdometry:
             frame.grey,
             keyframe.pixels[rows].astype(np.float32),
             guesses,
-            WINDOW_PX,
             _PYRAMID_LEVELS,
-            FORWARD_BACKWARD_PX,
         )
         shift = np.median(found[kept] - guesses[kept], axis=0) if kept.any() else np.zeros(2, np.float32)
         state.places[rows] = np.where(kept[:, None], found, guesses + shift)
@@ -244,9 +239,9 @@ class WindowOdometry:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points, inlier_px = segment.map.points[track_ids], INLIER_PX
-        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, inlier_px, self._seed)
-        return pose if (pose.residual_px < inlier_px).sum() >= MIN_POINTS else None
+        points = segment.map.points[track_ids]
+        pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed)
+        return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
     def _wants_keyframe(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> bool:
         keyframe, config = segment.map.keyframes[-1], self._config
@@ -268,9 +263,7 @@ class WindowOdometry:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
-        fresh = new_corners(
-            frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px, CORNER_QUALITY
-        )
+        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px)
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)
@@ -293,7 +286,7 @@ class WindowOdometry:
             if known.sum() < MIN_POINTS:
                 continue
             points, pixels = segment.map.points[frame.track_ids[known]], frame.pixels[known].astype(np.float64)
-            pose = resect((np.eye(4),), points, pixels, self._intrinsics, INLIER_PX, self._seed)
+            pose = resect((np.eye(4),), points, pixels, self._intrinsics, self._seed)
             unknown = np.full(len(frame.track_ids), np.nan)
             places = frame.pixels.astype(np.float64)
             first = segment.map.keyframes[0]

@@ -137,7 +137,7 @@ def _seen_from(
     known = local.known(track_ids)
     if known.sum() < MIN_POINTS:
         return None
-    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, INLIER_PX, seed)
+    pose = resect((T_guess,), local.points[track_ids[known]], pixels[known], intrinsics, seed)
     if (pose.residual_px < INLIER_PX).sum() < MIN_POINTS:
         return None
     return pose.T_camera_world, CORNER_CORRELATION * pose.sigmas

@@ -28,7 +28,7 @@ def test_jacobian_is_the_derivative_of_the_pixels() -> None:
 
 def test_finds_the_pose_from_a_far_guess() -> None:
     points, pixels = seen()
-    pose = resect((np.eye(4),), points, pixels, INTRINSICS, 3.0)
+    pose = resect((np.eye(4),), points, pixels, INTRINSICS)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-6)
     assert pose.residual_px.max() < 1e-3
 
@@ -38,7 +38,7 @@ def test_a_wrong_prediction_does_not_outweigh_the_last_pose() -> None:
     pixels[:20] += 25.0
     wrong = from_rotation_vector(np.array([0.0, 0.8, 0.0]), np.array([1.0, 0.0, 0.0])) @ T_TRUE
     near = from_rotation_vector(np.array([0.0, 0.01, 0.0]), np.array([0.01, 0.0, 0.0])) @ T_TRUE
-    pose = resect((near, wrong), points, pixels, INTRINSICS, 3.0)
+    pose = resect((near, wrong), points, pixels, INTRINSICS)
     np.testing.assert_allclose(pose.T_camera_world, T_TRUE, atol=1e-2)
     assert (pose.residual_px[20:] < 3.0).all()
     assert (pose.residual_px[:20] > 3.0).all()
@@ -49,7 +49,7 @@ def test_sigmas_are_of_the_size_of_the_errors() -> None:
     rng = np.random.default_rng(3)
     errors, sigmas = [], []
     for _ in range(40):
-        pose = resect((T_TRUE,), points, pixels + rng.normal(0.0, 0.5, pixels.shape), INTRINSICS, 3.0)
+        pose = resect((T_TRUE,), points, pixels + rng.normal(0.0, 0.5, pixels.shape), INTRINSICS)
         difference = pose.T_camera_world @ np.linalg.inv(T_TRUE)
         errors.append([rotation_angle(difference[:3, :3]), np.linalg.norm(difference[:3, 3])])
         sigmas.append([np.linalg.norm(pose.sigmas[:3]), np.linalg.norm(pose.sigmas[3:])])

@@ -70,16 +70,12 @@ class GeometryConfig(Section):
     direction_prior_sigma_deg: float = Field(
         default=8.0, gt=0, description="least sigma of the motion prior on the translation direction, degrees"
     )
-    heading_prior_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the heading prior, degrees")
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
     jitter_rotation_ratio: float = Field(
         default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
     )
     jitter_direction_ratio: float = Field(
         default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
-    )
-    turn_rotation_ratio: float = Field(
-        default=0.015, ge=0, description="rotation sigma over the rotation angle of the step"
     )
     neighbour_rotation_ratio: float = Field(
         default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
@@ -103,7 +99,6 @@ class RoadConfig(Section):
         gt=0,
         description="farthest ground of the short strip, used behind a vehicle ahead, in camera heights",
     )
-    tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma of a length per radian of estimated tilt")
 
 
 class LengthConfig(Section):

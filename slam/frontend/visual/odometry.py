@@ -23,7 +23,6 @@ from slam.frontend.visual.epipolar import (
     rotation_between,
     triangulated_depth,
 )
-from slam.frontend.visual.heading_prior import HeadingPrior
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory, usual_error
 from slam.frontend.visual.predicted_flow import PredictedFlow
@@ -84,7 +83,7 @@ class VisualOdometry:
         self._state = state or OdometryState(
             self._tracker.state(),
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
-            MotionHistory(HeadingPrior(float(np.deg2rad(config.heading_prior_sigma_deg)))),
+            MotionHistory(),
         )
 
     def state(self) -> OdometryState:

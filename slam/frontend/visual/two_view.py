@@ -102,11 +102,8 @@ class TwoViewEstimator:
         if not found:
             return None
         best = max(found, key=lambda candidate: _support(candidate, prior))
-        widened = CORNER_CORRELATION**2 * best.covariance
-        fused, covariance = history.heading_prior.fuse(best.unit_pose, widened)
         error = self._depth_relative_error(matches, best.unit_pose)
-        estimate = TwoViewEstimate(fused, covariance / CORNER_CORRELATION**2, best.inliers)
-        return estimate, history.with_step(best.unit_pose, widened, fused, error)
+        return best, history.with_step(best.unit_pose, error)
 
     def refined(self, matches: Matches, start: UnitRelativePose, depth_relative_error: float) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.

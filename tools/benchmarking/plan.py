@@ -54,7 +54,6 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no lengths from learned depth": (f"lengths.learned_sigma={_UNINFORMATIVE}",),
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
     "no short strip of road": ("road.near_heights=1e-3",),
-    "no length contradicted by learned depth": (f"lengths.max_contradiction={_NEVER}",),
     "no sigma by jitter": ("geometry.jitter_rotation_ratio=0", "geometry.jitter_direction_ratio=0"),
     "no sigma by neighbouring steps": ("geometry.neighbour_rotation_ratio=0", "geometry.neighbour_direction_ratio=0"),
     "no inflation of step sigmas": (

@@ -15,7 +15,7 @@ from slam.frontend.visual.epipolar import UnitRelativePose, unit_pose_by_essenti
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.frontend.visual.two_view import Matches, TwoViewEstimate, TwoViewEstimator
+from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 CONFIG = GeometryConfig()
@@ -60,7 +60,7 @@ def test_a_car_that_turns_with_the_camera_is_no_part_of_the_static_scene():
     by_essential, errors_deg, of_car, of_scene = [], [], [], []
     for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
-        unit_pose = unit_pose_by_essential(matches.rays_previous, matches.rays_current, CONFIG.inlier_px / FOCAL_PX)
+        unit_pose = unit_pose_by_essential(matches.rays_previous, matches.rays_current, INLIER_PX / FOCAL_PX)
         two_view = estimated(matches)
         assert unit_pose is not None
         by_essential.append(angle_deg(unit_pose.R_current_previous, T_current_previous[:3, :3]))
@@ -100,7 +100,7 @@ def test_a_known_motion_is_refined():
     direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
     off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
     start = UnitRelativePose(off @ T_current_previous[:3, :3], direction)
-    refined = TwoViewEstimator(CONFIG, FOCAL_PX).refined(matches, start, CONFIG.depth_relative_sigma)
+    refined = TwoViewEstimator(CONFIG, FOCAL_PX).refined(matches, start, DEPTH_RELATIVE_SIGMA)
     assert refined is not None
     assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
 

@@ -129,9 +129,6 @@ class MappingConfig(Section):
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
     keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance moved after which a frame is fused")
-    keyframe_rotation_deg: float = Field(
-        default=3.0, ge=0, description="or rotation after which a frame is fused, degrees"
-    )
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
     truncation_voxels: float = Field(

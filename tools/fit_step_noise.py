@@ -126,7 +126,7 @@ def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> Driv
     steps = smooth_rotations(found.observations.steps, found.observations.relative_rotations)
     T_true = np.array(recording.reference)
     T_true[:, :3, 3] *= umeyama(found.optimised.positions, T_true[:, :3, 3], with_scale=True).scale
-    return DriveSteps.of(recording.name, steps, found.scale, T_true)
+    return DriveSteps.of(Path(root).name + (sequence and f" {sequence}"), steps, found.scale, T_true)
 
 
 def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[RelativePose]:

@@ -72,11 +72,11 @@ def test_sigmas_are_ratios_of_jitter_and_rotation():
 
 def test_sharp_turns_and_jumps_widen_their_own_steps():
     smooth = np.zeros((60, 3))
-    smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
+    smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 25.0) ** 2
     jumping = smooth.copy()
     jumping[30, 0] += np.deg2rad(1.0)
     before, after = (inflate_step_sigmas(steps(drive), own(60), CONFIG) for drive in (smooth, jumping))
-    assert before[16].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[16, 1], rel=0.1)
+    assert before[39].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[39, 1], rel=0.1)
     assert after[30].rotation[0] == pytest.approx(CONFIG.neighbour_rotation_ratio * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
 

@@ -19,6 +19,12 @@ from erfsfm.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 _LOADING_BYTES = 256 * 2**20  # of NumPy and SciPy: OpenBLAS waits for ever for memory that it cannot have
+# what they would say of a file is said in our own line; twice the pixels of the largest camera that is read
+_OPENCV = {
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27),
+}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
@@ -33,8 +39,8 @@ _MEMORY = re.compile(
 def run(app: Callable[..., object], name: str) -> None:
     """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
-        os.environ.setdefault(name_of_level, quiet)  # what they would say of a file is said in our own line
+    for variable, value in _OPENCV.items():
+        os.environ.setdefault(variable, value)
     try:
         require_memory(_LOADING_BYTES)
         app(args=_checked(sys.argv[1:], name), prog_name=name)

@@ -15,7 +15,7 @@ from pathlib import Path
 MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
 MAX_IMAGE_BYTES = 2**30
 _BLOCK_BYTES = 2**20
-_WAIT_FOR_PIPE_S = 10.0
+WAIT_FOR_PIPE_S = 10.0
 _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
 
@@ -54,7 +54,7 @@ def read_bytes(path: Path, most: int) -> bytes:
     Raises:
         OSError: it cannot be read, or is larger.
     """
-    with open(path, "rb", opener=_opened) as file:
+    with open(path, "rb", opener=lambda name, _: open_written(name, WAIT_FOR_PIPE_S)) as file:
         size = os.fstat(file.fileno()).st_size  # 0 of a pipe, which is read in blocks
         parts = [file.read(min(size, most))]
         while sum(map(len, parts)) <= most and (block := file.read(_BLOCK_BYTES)):
@@ -65,13 +65,17 @@ def read_bytes(path: Path, most: int) -> bytes:
     return content
 
 
-def _opened(path: str, flags: int) -> int:
-    """Open without waiting for ever for somebody who writes to a pipe."""
-    descriptor = os.open(path, flags | os.O_NONBLOCK)
+def open_written(path: str, wait_s: float) -> int:
+    """A file descriptor for reading; of a pipe, once something was written to it.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe that nothing was written to for ``wait_s``.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     is_pipe = stat.S_ISFIFO(os.fstat(descriptor).st_mode)
-    if is_pipe and not select.select([descriptor], [], [], _WAIT_FOR_PIPE_S)[0]:
+    if is_pipe and not select.select([descriptor], [], [], wait_s)[0]:
         os.close(descriptor)
-        raise OSError(errno.ETIMEDOUT, f"a pipe that nothing was written to for {_WAIT_FOR_PIPE_S:g} s", path)
+        raise OSError(errno.ETIMEDOUT, f"a pipe that nothing was written to for {wait_s:g} s", path)
     os.set_blocking(descriptor, True)
     return descriptor
 

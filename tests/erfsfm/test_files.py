@@ -43,6 +43,6 @@ def test_a_pipe_is_read_if_something_is_written_to_it(tmp_path: Path, monkeypatc
     writer.start()
     assert read_text(pipe) == "a\nb"
     writer.join()
-    monkeypatch.setattr(files, "_WAIT_FOR_PIPE_S", 0.01)
+    monkeypatch.setattr(files, "WAIT_FOR_PIPE_S", 0.01)
     with pytest.raises(OSError, match="a pipe that nothing was written to"):
         read_text(pipe)

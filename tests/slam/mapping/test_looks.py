@@ -75,3 +75,10 @@ def test_each_filter_counts_what_it_took():
     assert shares["sky"] == pytest.approx((14 * 10 + 5 * 10) / 5000)
     assert shares["range"] == pytest.approx(0.1 * 0.6) and shares["sigma"] == pytest.approx(0.1 * 0.6)
     assert 1 - sum(shares.values()) == pytest.approx((kept > 0).mean())
+
+
+def test_a_camera_that_looks_down_sees_no_sky():
+    filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
+    bright = np.full((50, 100, 3), 250, np.uint8)
+    filters.kept(DepthView(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
+    assert filters.shares()["sky"] == 0

@@ -15,7 +15,7 @@ _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, 
 
 
 class DepthErrors:
-    """Collects the pixels with truth between 1 and 80 m of many frames; evenly spread ones where there are very many."""
+    """Collects the pixels with truth between 1 and 80 m of many frames, of very many evenly spread ones."""
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []

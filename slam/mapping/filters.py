@@ -103,6 +103,8 @@ class DepthFilters:
         """
         config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
         sky = np.zeros(image.shape[:2], dtype=bool)
+        if not horizon:
+            return sky
         red, green, blue = (each.astype(np.int16) for each in cv2.split(image[:horizon]))
         is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
         sky[:horizon] = (cv2.min(cv2.min(red, green), blue) >= config.sky_brightness) | is_blue

@@ -55,10 +55,12 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no robust lengths": (f"lengths.outlier_sigmas={_NEVER}",),
     "no short strip of road": ("road.near_heights=1e-3",),
     "no sigma by jitter": ("geometry.jitter_rotation_ratio=0", "geometry.jitter_direction_ratio=0"),
+    "no sigma by turns": ("geometry.turn_rotation_ratio=0",),
     "no sigma by neighbouring steps": ("geometry.neighbour_rotation_ratio=0", "geometry.neighbour_direction_ratio=0"),
     "no inflation of step sigmas": (
         "geometry.jitter_rotation_ratio=0",
         "geometry.jitter_direction_ratio=0",
+        "geometry.turn_rotation_ratio=0",
         "geometry.neighbour_rotation_ratio=0",
         "geometry.neighbour_direction_ratio=0",
     ),

@@ -77,6 +77,13 @@ def test_each_filter_counts_what_it_took():
     assert 1 - sum(shares.values()) == pytest.approx((kept > 0).mean())
 
 
+def test_a_camera_that_looks_down_sees_no_sky():
+    filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
+    bright = np.full((50, 100, 3), 250, np.uint8)
+    filters.kept(DepthView(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
+    assert filters.shares()["sky"] == 0
+
+
 def test_how_far_depth_is_fused_depends_on_its_sigma():
     camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
     depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)

@@ -99,20 +99,11 @@ class LoopsConfig(Section):
 
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
-    max_features: int = Field(default=500, ge=50, le=5000, description="largest number of corners kept of a frame")
-    words: int = Field(default=1000, ge=10, le=20000, description="size of the binary vocabulary learned on the run")
     min_gap_frames: int = Field(default=30, ge=1, description="least distance of the two frames of a loop, frames")
     min_path_m: float = Field(
         default=15.0, ge=0, description="least distance of the two frames of a loop along the path"
     )
-    max_hamming: int = Field(
-        default=64, ge=1, le=256, description="largest Hamming distance of matching descriptors, bits"
-    )
-    reprojection_px: float = Field(default=3.0, gt=0, description="largest reprojection error of an inlier, pixels")
     min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
-    min_inlier_ratio: float = Field(
-        default=0.4, gt=0, le=1, description="least inlier ratio among the matches with depth"
-    )
     agreement_deg: float = Field(
         default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"
     )
@@ -121,17 +112,7 @@ class LoopsConfig(Section):
         gt=0,
         description="largest difference of the translations measured in both directions, over the depth",
     )
-    max_drift_ratio: float = Field(
-        default=0.3, gt=0, description="largest correction over the path between the two frames"
-    )
-    support_frames: int = Field(
-        default=20, ge=1, description="distance of both ends within which loops must agree, frames"
-    )
     min_support: int = Field(default=2, ge=0, description="least number of images with loops that support a loop")
-    alone_inliers: int = Field(default=120, ge=6, description="number of inliers from which on a loop needs no support")
-    support_drift_deg: float = Field(
-        default=0.1, ge=0, description="rotation drift of the odometry between supporting loops, degrees a frame"
-    )
 
 
 class PoseGraphConfig(Section):
@@ -148,9 +129,6 @@ class MappingConfig(Section):
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
     keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance moved after which a frame is fused")
-    keyframe_rotation_deg: float = Field(
-        default=3.0, ge=0, description="or rotation after which a frame is fused, degrees"
-    )
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
     truncation_voxels: float = Field(

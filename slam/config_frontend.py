@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Literal, Self
 
-from pydantic import Field, PositiveInt, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from erfsfm.config_tree import Section
 
@@ -19,28 +19,12 @@ class FrontendConfig(Section):
         default="calibrated",
         description="gaps: only where image geometry fails; calibrated: always with a noise.yaml, else gaps",
     )
-    rotation_sigma_deg: float = Field(
-        default=0.3, gt=0, le=90, description="rotation sigma of a one-frame step, degrees, without noise.yaml"
-    )
-    translation_relative_sigma: float = Field(
-        default=0.1, gt=0, le=10, description="translation sigma over the length of the step, without noise.yaml"
-    )
-    translation_floor_ratio: float = Field(
-        default=0.05,
-        gt=0,
-        le=10,
-        description="least translation sigma over the median one-frame step, without noise.yaml",
-    )
-    student_t_dof: float = Field(
-        default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
-    )
 
 
 class GeometryConfig(Section):
     """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
 
     enabled: bool = Field(default=True, description="measure relative poses by image geometry, beside the pose network")
-    steps: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1, description="frame distances to measure")
     max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
     few_corners: int = Field(
@@ -63,14 +47,6 @@ class GeometryConfig(Section):
         ge=0,
         description="exponent on the local inlier ratio that weighs corners down on dynamic objects; 0: off",
     )
-    inlier_px: float = Field(default=0.6, gt=0, description="largest epipolar distance of an inlier, pixels")
-    depth_relative_sigma: float = Field(
-        default=0.2, gt=0, description="least relative sigma of learned depth along an epipolar line"
-    )
-    direction_prior_sigma_deg: float = Field(
-        default=8.0, gt=0, description="least sigma of the motion prior on the translation direction, degrees"
-    )
-    heading_prior_sigma_deg: float = Field(default=0.35, gt=0, description="least sigma of the heading prior, degrees")
     min_inliers: int = Field(default=20, ge=8, description="least number of inliers of a measurement")
     jitter_rotation_ratio: float = Field(
         default=0.33, ge=0, description="rotation sigma over the rotation jitter of the camera"
@@ -78,17 +54,11 @@ class GeometryConfig(Section):
     jitter_direction_ratio: float = Field(
         default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
     )
-    turn_rotation_ratio: float = Field(
-        default=0.015, ge=0, description="rotation sigma over the rotation angle of the step"
-    )
     neighbour_rotation_ratio: float = Field(
         default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
     )
     neighbour_direction_ratio: float = Field(
         default=1.0, ge=0, description="sigma of the translation direction over the difference to neighbouring steps"
-    )
-    student_t_dof: float = Field(
-        default=12.0, gt=2, description="degrees of freedom of the Student's t distribution of the errors"
     )
 
 
@@ -103,7 +73,6 @@ class RoadConfig(Section):
         gt=0,
         description="farthest ground of the short strip, used behind a vehicle ahead, in camera heights",
     )
-    tilt_gain: float = Field(default=2.0, ge=0, description="relative sigma of a length per radian of estimated tilt")
 
 
 class LengthConfig(Section):
@@ -111,9 +80,6 @@ class LengthConfig(Section):
 
     ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of the ratio of two consecutive steps")
     learned_sigma: float = Field(default=0.1, gt=0, description="sigma of a length by learned depth")
-    max_contradiction: float = Field(
-        default=2.5, gt=1, description="largest factor between a measured length and that by learned depth"
-    )
     outlier_sigmas: float = Field(
         default=2.0, gt=0, description="residual at which the robust weight of a measurement is one half, sigmas"
     )
@@ -126,21 +92,6 @@ class GapsConfig(Section):
         default=True,
         description="interpolate over unusable frames; false: they are measured as usable ones and may end a run",
     )
-    blank_contrast: float = Field(
-        default=3.0, ge=0, description="standard deviation of grey levels below which a frame is blank"
-    )
-    noise_contrast: float = Field(
-        default=0.3,
-        ge=0,
-        lt=1,
-        description="contrast after blurring over contrast before, below which a frame is noise",
-    )
-    min_correlation: float = Field(default=0.2, ge=-1, le=1, description="least correlation with the frames before")
-    repeat_difference: float = Field(
-        default=0.1,
-        ge=0,
-        description="largest difference of a re-encoded copy to its image, over the mean image gradient",
-    )
     max_unread_frames: int = Field(
         default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
     )
@@ -152,8 +103,6 @@ class LidarConfig(Section):
     factors: bool = Field(
         default=False, description="add kiss-icp's odometry to the pose graph; scale.mode lidar fits the scale to it"
     )
-    rotation_sigma_deg: float = Field(default=0.1, gt=0, description="rotation sigma of a step, degrees")
-    translation_sigma_m: float = Field(default=0.03, gt=0, description="translation sigma of a step, metres")
 
 
 class GpsConfig(Section):

@@ -12,6 +12,7 @@ from slam.config import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
+    STUDENT_T_DOF,
     calibrated_factors,
     measured_noise,
     network_factors,
@@ -55,9 +56,9 @@ def make_factors(
     """
     geometric = _geometric(measured.steps, scale, geometry)
     if noise is None:
-        networks = network_factors(measured.snippets, measured_noise(measured.snippets, geometric, frontend))
+        networks = network_factors(measured.snippets, measured_noise(measured.snippets, geometric))
     else:
-        networks = calibrated_factors(measured.snippets, geometric, noise, frontend)
+        networks = calibrated_factors(measured.snippets, geometric, noise)
     if frontend.use == "gaps" or (frontend.use == "calibrated" and noise is None):
         networks = without_measured(networks, geometric)
 
@@ -122,7 +123,7 @@ def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[R
             factors.append(motion.relative_pose)
             continue
         pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])
-        factors.append(replace(pose, student_t_dof=config.student_t_dof))
+        factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))
     return factors
 
 

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import GapsConfig
 from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
 
@@ -37,6 +36,10 @@ _FLIPS = {
 Verdict = Literal["new", "repeated"] | MeasurementFailure
 _Layer = NDArray[np.float32]
 _Grey = NDArray[np.uint8]
+_BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
+_NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
+_MIN_CORRELATION = 0.2  # least correlation with the frames before
+_REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,7 @@ class GateState:
 class ImageGate:
     """Classifies the images of one sequence in time order."""
 
-    def __init__(self, config: GapsConfig, state: GateState | None = None) -> None:
-        self._config = config
+    def __init__(self, state: GateState | None = None) -> None:
         self._state = state or GateState()
 
     def state(self) -> GateState:
@@ -75,7 +77,7 @@ class ImageGate:
     @property
     def was_moving(self) -> bool:
         """Whether the camera moved between the last two new images."""
-        return self._state.difference > _MOVING * self._config.repeat_difference
+        return self._state.difference > _MOVING * _REPEAT_DIFFERENCE
 
     def check(self, frame: Frame) -> Verdict:
         """Whether an image shows something new, repeats the one before (also after compression), or is unusable."""
@@ -89,14 +91,14 @@ class ImageGate:
 
     def _classify(self, frame: Frame) -> Verdict:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
-        if contrast < self._config.blank_contrast:
+        if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
             self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
         length = float(np.linalg.norm(thumbnail))
-        if length / np.sqrt(thumbnail.size) < self._config.noise_contrast * contrast:
+        if length / np.sqrt(thumbnail.size) < _NOISE_CONTRAST * contrast:
             return MeasurementFailure("the image is noise")
         thumbnail /= np.float32(length)
         small = _reduced(frame.grey)
@@ -121,7 +123,7 @@ class ImageGate:
             self._state = replace(state, usable=turned, doubtful=None, tracked=tracked, flip=flip)
             return MeasurementFailure(f"the image is {flip}")
         known = [each for each in (state.usable, state.doubtful) if each is not None]
-        doubt = bool(known) and max(float((thumbnail * each).sum()) for each in known) < self._config.min_correlation
+        doubt = bool(known) and max(float((thumbnail * each).sum()) for each in known) < _MIN_CORRELATION
         # after flipped images correlation is not enough; two such images in a row are a new scene, not damage
         if doubt or (state.flip and state.doubtful is None and _tracked_share(state.tracked, small) < _LEAST_TRACKED):
             self._state = replace(state, doubtful=thumbnail)
@@ -151,7 +153,7 @@ class ImageGate:
         """
         height, width = (max(side // _SHRINKING, 1) for side in frame.grey.shape)
         shrunk = cv2.resize(frame.grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        before, limit, motion = self._state.shrunk, self._config.repeat_difference, self._state.difference
+        before, limit, motion = self._state.shrunk, _REPEAT_DIFFERENCE, self._state.difference
         if before is None or before.shape != shrunk.shape:
             self._state = replace(self._state, shrunk=shrunk, difference=0.0)
             return False

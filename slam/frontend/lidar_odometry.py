@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import ErfsfmError
-from slam.config import LidarConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, Sequence
 from slam.frontend.failure import MeasurementFailure
@@ -21,6 +20,8 @@ logger = logging.getLogger(__name__)
 
 LEAST_SCANS = 2
 LIDAR_SOURCE = "lidar"
+_ROTATION_SIGMA_DEG = 0.1  # rotation sigma of a step, degrees
+_TRANSLATION_SIGMA_M = 0.03  # translation sigma of a step, metres
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ def lidar_path(sequence: Sequence) -> LidarPath | MeasurementFailure | None:
     return LidarPath(np.array(frames, dtype=np.int64), invert(T_world_camera[0]) @ T_world_camera, unreadable)
 
 
-def lidar_steps(path: LidarPath, config: LidarConfig) -> list[RelativePose]:
+def lidar_steps(path: LidarPath) -> list[RelativePose]:
     """Relative poses of neighbouring frames that both have a scan."""
-    rotation = np.deg2rad(config.rotation_sigma_deg)
-    sigmas = np.repeat([rotation, config.translation_sigma_m], 3)
+    rotation = np.deg2rad(_ROTATION_SIGMA_DEG)
+    sigmas = np.repeat([rotation, _TRANSLATION_SIGMA_M], 3)
     T_previous_current = invert(path.T_world_camera[:-1]) @ path.T_world_camera[1:]
     return [
         RelativePose(int(first), int(second), T, sigmas, LIDAR_SOURCE)

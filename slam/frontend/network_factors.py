@@ -18,13 +18,13 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
-from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.step_table import path_between, shortest_by_start
@@ -32,47 +32,61 @@ from slam.robust import mad_sigma, mad_sigmas
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 NETWORK_SOURCE = "network"
+STUDENT_T_DOF = 12.0  # of the errors of measured steps and pairs: degrees of freedom of Student's t
 # image geometry has errors too: sigmas are not scaled below this factor
 _LEAST_SCALING = 0.3
 _STRETCHES = 4
 
 logger = logging.getLogger(__name__)
 _NOISE_STEPS = 20  # steps also measured by image geometry, from which on the noise is estimated on this sequence
+_TRANSLATION_FLOOR_RATIO = 0.05  # least translation sigma over the median one-frame step, without noise.yaml
 
 
-def network_factors(snippets: Sequence[SnippetPoses], config: FrontendConfig) -> list[RelativePose]:
+@dataclass(frozen=True)
+class UncalibratedNoise:
+    """Noise of a pose network without ``noise.yaml``.
+
+    Attributes:
+        rotation_sigma_deg: of a step between neighbouring frames, degrees.
+        translation_relative_sigma: over the length of the step.
+    """
+
+    rotation_sigma_deg: float = 0.3
+    translation_relative_sigma: float = 0.1
+
+
+def network_factors(snippets: Sequence[SnippetPoses], noise: UncalibratedNoise) -> list[RelativePose]:
     """Every direct pose of every snippet as ``T_source_target``, unscaled, with its noise."""
     multiplicity = Counter(_pair(source, s.target) for s in snippets for source in s.sources)
-    floor = max(config.translation_floor_ratio * _median_step(snippets), 1e-9)
+    floor = max(_TRANSLATION_FLOOR_RATIO * _median_step(snippets), 1e-9)
     factors = []
     for snippet in snippets:
         for source, T_source_target in zip(snippet.sources, snippet.T_source_target, strict=True):
             repeated = np.sqrt(multiplicity[_pair(source, snippet.target)])
-            rotation = np.deg2rad(config.rotation_sigma_deg) * np.sqrt(abs(snippet.target - source))
+            rotation = np.deg2rad(noise.rotation_sigma_deg) * np.sqrt(abs(snippet.target - source))
             length = float(np.linalg.norm(T_source_target[:3, 3]))
-            translation = config.translation_relative_sigma * length + floor
+            translation = noise.translation_relative_sigma * length + floor
             sigmas = repeated * np.repeat([rotation, translation], 3)
             factors.append(RelativePose(source, snippet.target, T_source_target, sigmas, NETWORK_SOURCE))
     return factors
 
 
 def calibrated_factors(
-    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], noise: PoseNoise, config: FrontendConfig
+    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], noise: PoseNoise
 ) -> list[RelativePose]:
     """One factor for every pair of frames that snippets measured, ``T_first_last``, unscaled, with calibrated noise.
 
     Args:
         snippets: measured by the network.
         geometric: measured by image geometry, unscaled, with its full noise.
-        noise: of this network.
-        config: the noise is scaled from 20 common steps on.
+        noise: of this network; scaled from 20 common steps on.
     """
     pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
     if not pairs:
         return []
     law = np.stack([noise.sigmas(pair) for pair in pairs])
     steps = {pose.ends: pose for pose in geometric}
-    student_t_dof = config.student_t_dof if len(steps) >= _NOISE_STEPS else math.inf
+    student_t_dof = STUDENT_T_DOF if len(steps) >= _NOISE_STEPS else math.inf
     from_geometry = _from_geometry(pairs, steps)
     scaling = _scaling(pairs, from_geometry / law, _NOISE_STEPS)
     sigmas = np.hypot(scaling * law, _noise_of_geometry(pairs, steps))
@@ -176,13 +190,11 @@ def without_measured(factors: Sequence[RelativePose], geometric: Sequence[Relati
     return [factor for factor in factors if path_between(by_start, *sorted(factor.ends)) is None]
 
 
-def measured_noise(
-    snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose], config: FrontendConfig
-) -> FrontendConfig:
+def measured_noise(snippets: Sequence[SnippetPoses], geometric: Sequence[RelativePose]) -> UncalibratedNoise:
     """The noise of this network on this drive, by comparison with image geometry.
 
-    Sigmas are 1.48 times the median absolute difference of one-frame steps, at least the configured ones;
-    with fewer than 20 common steps the configured ones are used.
+    Sigmas are 1.48 times the median absolute difference of one-frame steps, at least the usual ones;
+    with fewer than 20 common steps the usual ones are used.
     """
     by_pair = {(g.from_index, g.to_index): g.T_from_to for g in geometric}
     rotations, shifts = [], []
@@ -195,14 +207,12 @@ def measured_noise(
             error = invert(T_geometric) @ T_source_target
             rotations.append(Rotation.from_matrix(nearest_rotation(error[:3, :3])).as_rotvec())
             shifts.append((T_source_target[:3, 3] - T_geometric[:3, 3]) / length)
+    usual = UncalibratedNoise()
     if len(rotations) < _NOISE_STEPS:
-        return config
+        return usual
     rotation, shift = (mad_sigma(np.concatenate(e)) for e in (rotations, shifts))
-    return config.model_copy(
-        update={
-            "rotation_sigma_deg": max(config.rotation_sigma_deg, float(np.rad2deg(rotation))),
-            "translation_relative_sigma": max(config.translation_relative_sigma, shift),
-        }
+    return UncalibratedNoise(
+        max(usual.rotation_sigma_deg, float(np.rad2deg(rotation))), max(usual.translation_relative_sigma, shift)
     )
 
 

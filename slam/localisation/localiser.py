@@ -22,6 +22,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.loops.descriptors import FeatureExtractor, View
 from slam.loops.places import PLACES, Places
 from slam.loops.retrieval import PlaceIndex
+from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, apply, invert
@@ -114,12 +115,12 @@ class Localiser:
             intrinsics: of the new images; None for those of the run, with images resized to it.
         """
         self._places = places
-        self._config = config
+        self._thresholds = LoopThresholds.of_frames(config)
         self._resizes = intrinsics is None
         self._intrinsics = intrinsics or places.intrinsics
-        self._features = FeatureExtractor(config, self._intrinsics)
-        self._verifier = LoopVerifier(config, self._intrinsics)
-        self._index = PlaceIndex(places.views, config)
+        self._features = FeatureExtractor(self._intrinsics)
+        self._verifier = LoopVerifier(self._thresholds, self._intrinsics)
+        self._index = PlaceIndex(places.views)
 
     def locate(self, name: str, image: Image) -> Localisation:
         """Localise an image ``(H, W, 3)`` uint8 RGB: by the points of all similar places of a street together.
@@ -155,7 +156,7 @@ class Localiser:
 
     def _matched(self, row: int, view: View) -> _Matches:
         place, T_world_place = self._places.views[row], self._places.T_world_camera[row]
-        rows_place, rows_view = matches(place, view, self._config)
+        rows_place, rows_view = matches(place, view, self._thresholds)
         points = place.points[rows_place].astype(np.float64)
         known = np.isfinite(points).all(axis=1)
         return _Matches(place.index, T_world_place, apply(T_world_place, points[known]), rows_view[known])
@@ -189,9 +190,9 @@ class Localiser:
         if isinstance(found, str):
             return found
         owner = np.repeat(np.arange(len(around)), [len(other.rows_view) for other in around])
-        supporting = np.bincount(owner[found.resection.inliers]) >= self._config.min_inliers / 2
+        supporting = np.bincount(owner[found.resection.inliers]) >= self._thresholds.min_inliers / 2
         inliers = len(np.unique(rows_view[found.resection.inliers]))  # a corner may match at several places
-        if supporting.sum() < 2 and inliers < self._config.alone_inliers:
+        if supporting.sum() < 2 and inliers < self._thresholds.alone_inliers:
             return f"no second place supports the pose ({inliers} inliers)"
         return _Pose(place.T_world_camera @ invert(found.T_image_points), inliers)
 

@@ -14,6 +14,7 @@ from slam.frames import Intrinsics, RelativePose
 from slam.loops.consistency import agreeing
 from slam.loops.descriptors import View
 from slam.loops.retrieval import find_candidates
+from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
@@ -112,11 +113,12 @@ def close_loops(
     candidates = find_candidates(
         views, path[np.array([view.index for view in views], dtype=int)], config, get_or_compute
     )
-    verifier = LoopVerifier(config, intrinsics, get_or_compute, seed)
+    thresholds = LoopThresholds.of_frames(config)
+    verifier = LoopVerifier(thresholds, intrinsics, get_or_compute, seed)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
-    accepted, lonely = agreeing(verified, T_world_camera, config)
+    accepted, lonely = agreeing(verified, T_world_camera, thresholds)
     logger.info("loops: %d candidates, %d verified, %d accepted", len(candidates), len(verified), len(accepted))
     refused.sort(key=lambda loop: (-loop.inliers, -loop.score, loop.to_index, loop.from_index))
     return LoopClosures(len(candidates), len(verified), tuple(accepted), tuple(lonely + refused))

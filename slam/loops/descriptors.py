@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import LoopsConfig
 from slam.frames import DepthMap, Frame, Grey, Intrinsics
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
@@ -19,6 +18,7 @@ _DETECTED_PER_KEPT = 4
 _EDGE_PX = 16
 _CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
 _MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
+_MAX_FEATURES = 500  # largest number of corners kept of a frame
 
 
 @dataclass(frozen=True)
@@ -45,14 +45,11 @@ class View:
 class FeatureExtractor:
     """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
-    def __init__(
-        self, config: LoopsConfig, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache
-    ) -> None:
-        self._config = config
+    def __init__(self, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache) -> None:
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
         self._orb = cv2.ORB.create(
-            nfeatures=_DETECTED_PER_KEPT * config.max_features,
+            nfeatures=_DETECTED_PER_KEPT * _MAX_FEATURES,
             nlevels=6,
             edgeThreshold=_EDGE_PX,
             fastThreshold=_CORNER_CONTRAST,
@@ -67,7 +64,7 @@ class FeatureExtractor:
             height_unscaled: camera height in the same unit; where known, depths farther than
                 ``max_depth_heights`` of it are not trusted.
         """
-        settings = (self._config.max_features, _CORNER_CONTRAST)
+        settings = (_MAX_FEATURES, _CORNER_CONTRAST)
         pixels, descriptors = self._get_or_compute(
             "features", (frame, repr(settings)), lambda: self._features(frame.grey)
         )
@@ -77,7 +74,7 @@ class FeatureExtractor:
     def _features(self, grey: Grey) -> Answer:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         found = self._orb.detect(grey, None)
-        strongest = _strongest_per_cell(found, grey.shape, self._config.max_features)
+        strongest = _strongest_per_cell(found, grey.shape, _MAX_FEATURES)
         chosen, descriptors = self._orb.compute(grey, [found[k] for k in strongest])
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)

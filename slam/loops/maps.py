@@ -12,31 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, RelativeSimilarity
 from slam.loops.consistency import agreeing
 from slam.loops.descriptors import View
 from slam.loops.retrieval import similar_views
+from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop, Sighting, matches
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray, apply, invert, rotation_angle
 
 logger = logging.getLogger(__name__)
 
-# those of support count keyframes in place of frames
-THRESHOLDS = {
-    "max_hamming": 100,
-    "min_inliers": 15,
-    "min_inlier_ratio": 0.3,
-    "reprojection_px": 4.0,
-    "support_frames": 4,
-    "min_support": 1,
-    "alone_inliers": 40,
-    "support_drift_deg": 0.5,
-}
 _CANDIDATES = 12
-_AGREEMENT_DEG = 4.0
-_AGREEMENT_RATIO = 0.15
 _LEAST_SCALES = 8
 _SIGMAS = np.concatenate([np.full(3, np.deg2rad(0.5)), np.full(3, 0.02), [0.05]])
 
@@ -75,7 +62,6 @@ def find_map_loops(
     maps: NDArray[np.intp],
     apart: NDArray[np.bool_],
     intrinsics: Intrinsics,
-    config: LoopsConfig,
     seed: int = 0,
 ) -> MapLoops:
     """Loops among keyframes, each supported by another one nearby or by very many inliers.
@@ -86,19 +72,17 @@ def find_map_loops(
         maps: the map of each keyframe ``(V,)``.
         apart: ``(V, V)``, whether two keyframes may make a loop: they share no points yet.
         intrinsics: of all images.
-        config: size of the vocabulary, RANSAC, spread of inliers, drift.
         seed: of RANSAC.
     """
-    own = config.model_copy(update=THRESHOLDS)
-    candidates = similar_views(views, apart, _CANDIDATES, own.words)
-    verifier = LoopVerifier(own, intrinsics, seed=seed)
-    verdicts = side_by_side(lambda c: _verified(c.earlier, c.later, c.score, views, verifier, own), candidates)
+    candidates = similar_views(views, apart, _CANDIDATES)
+    verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
+    verdicts = side_by_side(lambda c: _verified(c.earlier, c.later, c.score, views, verifier), candidates)
     measured = [verdict for verdict in verdicts if isinstance(verdict, MapLoop)]
     rejected = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]
     found: list[MapLoop] = []
     for pair in sorted({tuple(maps[list(loop.rows)].tolist()) for loop in measured}):
         between = [loop for loop in measured if tuple(maps[list(loop.rows)].tolist()) == pair]
-        kept, lonely = _supported(between, T_map_camera, maps, own)
+        kept, lonely = _supported(between, T_map_camera, maps)
         found += kept
         rejected += [replace(r, from_index=views[r.from_index].index, to_index=views[r.to_index].index) for r in lonely]
     found.sort(key=lambda loop: (loop.rows[1], loop.rows[0]))
@@ -107,32 +91,32 @@ def find_map_loops(
 
 
 def _supported(
-    loops: Sequence[MapLoop], T_map_camera: FloatArray, maps: NDArray[np.intp], config: LoopsConfig
+    loops: Sequence[MapLoop], T_map_camera: FloatArray, maps: NDArray[np.intp]
 ) -> tuple[list[MapLoop], list[RejectedLoop]]:
     """Loops between two maps, or within one, that agree with others and with the poses between their ends."""
     first, second = maps[list(loops[0].rows)]
-    T = T_map_camera.copy()
+    T, thresholds = T_map_camera.copy(), OF_KEYFRAMES
     if first != second:
         T[maps == second, :3, 3] *= np.median([loop.similarity.scale for loop in loops])
-        config = config.model_copy(update={"max_drift_ratio": np.inf})
+        thresholds = replace(thresholds, max_drift_ratio=np.inf)
     as_poses = [
         Loop(RelativePose(*loop.rows, one.T_from_to, one.sigmas[:6], LOOP_SOURCE), loop.inliers, loop.score)
         for loop, one in ((loop, loop.similarity) for loop in loops)
     ]
-    kept, lonely = agreeing(as_poses, T, config)
+    kept, lonely = agreeing(as_poses, T, thresholds)
     ends = {loop.ends for loop in kept}
     return [loop for loop in loops if loop.rows in ends], lonely
 
 
 def _verified(
-    earlier: int, later: int, score: float, views: Sequence[View], verifier: LoopVerifier, config: LoopsConfig
+    earlier: int, later: int, score: float, views: Sequence[View], verifier: LoopVerifier
 ) -> MapLoop | RejectedLoop:
     first, second = views[earlier], views[later]
 
     def refused(reason: str, inliers: int = 0) -> RejectedLoop:
         return RejectedLoop(first.index, second.index, reason, score, inliers)
 
-    rows = np.column_stack(matches(first, second, config))
+    rows = np.column_stack(matches(first, second, OF_KEYFRAMES))
     forward = _resected(first, second, rows, verifier)
     if isinstance(forward, str):
         return refused(forward)
@@ -149,7 +133,7 @@ def _verified(
     difference = invert(T_first_second) @ T_again
     rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
     ratio = float(np.linalg.norm(difference[:3, 3])) / forward.depth
-    if rotation_deg > _AGREEMENT_DEG or ratio > _AGREEMENT_RATIO:
+    if rotation_deg > OF_KEYFRAMES.agreement_deg or ratio > OF_KEYFRAMES.agreement_ratio:
         reason = f"both directions differ by {rotation_deg:.1f} degrees and {ratio:.0%} of the depth"
         return refused(reason, inliers)
     units = np.concatenate([np.ones(3), np.full(3, forward.depth), np.ones(1)])

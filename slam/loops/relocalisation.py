@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import LoopsConfig
 from slam.frames import Intrinsics
 from slam.loops.descriptors import View
-from slam.loops.maps import THRESHOLDS
 from slam.loops.retrieval import PlaceIndex
+from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import LoopVerifier, Sighting, matches
 from slam.se3 import FloatArray, apply
 
@@ -47,7 +46,6 @@ class Relocaliser:
         views: Sequence[View],
         T_map_camera: FloatArray,
         intrinsics: Intrinsics,
-        config: LoopsConfig,
         seed: int = 0,
     ) -> None:
         """Index the keyframes.
@@ -56,13 +54,11 @@ class Relocaliser:
             views: of the keyframes, at least one, with points in the unit of the map.
             T_map_camera: of the keyframes ``(V, 4, 4)``.
             intrinsics: of all images.
-            config: size of the vocabulary, RANSAC, spread of inliers.
             seed: of RANSAC.
         """
-        self._config = config.model_copy(update=THRESHOLDS)
         self._views, self._T_map_camera, self._intrinsics = views, T_map_camera, intrinsics
-        self._index = PlaceIndex(views, self._config)
-        self._verifier = LoopVerifier(self._config, intrinsics, seed=seed)
+        self._index = PlaceIndex(views)
+        self._verifier = LoopVerifier(OF_KEYFRAMES, intrinsics, seed=seed)
 
     def locate(self, image: View) -> Relocalised | None:
         """The pose with most inliers at one of the similar keyframes, and all points that confirm it; None with few."""
@@ -79,7 +75,7 @@ class Relocaliser:
         ahead = X[:, 2] > 0
         X[~ahead, 2] = 1.0
         residual = np.linalg.norm(self._intrinsics.project(X) - image.pixels[rows[:, 1]], axis=1)
-        kept = np.flatnonzero(ahead & (residual < self._config.reprojection_px))
+        kept = np.flatnonzero(ahead & (residual < OF_KEYFRAMES.reprojection_px))
         _, first = np.unique(rows[kept, 1], return_index=True)
         kept = kept[first]
         if len(kept) < _LEAST_POINTS:
@@ -91,7 +87,7 @@ class Relocaliser:
         keyframes, rows, points = [np.zeros(0, np.intp)], [np.zeros((0, 2), np.intp)], [np.zeros((0, 3))]
         for keyframe in self._index.nearest(image, _PLACES_TRIED):
             view = self._views[keyframe]
-            pairs = np.column_stack(matches(view, image, self._config))
+            pairs = np.column_stack(matches(view, image, OF_KEYFRAMES))
             pairs = pairs[np.isfinite(view.points[pairs[:, 0]]).all(axis=1)]
             keyframes.append(np.full(len(pairs), keyframe))
             rows.append(pairs)

@@ -26,6 +26,7 @@ _BLOCK_DESCRIPTORS = 200  # fit the processor's cache
 _CANDIDATES_PER_FRAME = 2  # largest number of places verified for a frame
 _PEAK_FRAMES = 10  # least distance between candidate places, frames
 _MIN_SCORE = 0.2  # least retrieval score, relative to that of neighbouring frames
+_WORDS = 1000  # size of the binary vocabulary learned on the run
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def find_candidates(
     Args:
         views: in time order.
         path_m: distance driven up to each view ``(V,)``, in the unit of the trajectory.
-        config: number of candidates, least distance in time and path.
+        config: least distance in time and path.
         get_or_compute: cache of the words.
     """
     everything = _all_descriptors(views)
@@ -53,10 +54,10 @@ def find_candidates(
         return []
 
     def learn() -> Answer:
-        return (nearest_words(everything, train_vocabulary(everything, config.words)),)
+        return (nearest_words(everything, train_vocabulary(everything, _WORDS)),)
 
-    (word,) = get_or_compute("words of a drive", (everything, repr(config.words)), learn)
-    counts = _word_counts(views, word, config.words)
+    (word,) = get_or_compute("words of a drive", (everything, repr(_WORDS)), learn)
+    counts = _word_counts(views, word, _WORDS)
     weighted = _weighted(counts, _inverse_frequency(counts))
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
@@ -74,19 +75,18 @@ def find_candidates(
     return found
 
 
-def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int, words: int) -> list[Candidate]:
+def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int) -> list[Candidate]:
     """For each view at most ``count`` earlier ones that share words with it, the most similar first.
 
     Args:
         views: in time order.
         allowed: ``(V, V)``, which pairs may be candidates.
         count: of candidates.
-        words: size of the vocabulary.
     """
     everything = _all_descriptors(views)
     if len(views) < 2 or len(everything) == 0:
         return []
-    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, words)), words)
+    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, _WORDS)), _WORDS)
     weighted = _weighted(counts, _inverse_frequency(counts))
     found = []
     for later in range(1, len(views)):
@@ -100,11 +100,11 @@ def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int,
 class PlaceIndex:
     """Finds the views of a drive that are similar to a new one."""
 
-    def __init__(self, views: Sequence[View], config: LoopsConfig) -> None:
+    def __init__(self, views: Sequence[View]) -> None:
         """Train the vocabulary on the drive's views, at least one."""
         everything = _all_descriptors(views)
-        self._words = train_vocabulary(everything, config.words)
-        counts = _word_counts(views, nearest_words(everything, self._words), config.words)
+        self._words = train_vocabulary(everything, _WORDS)
+        counts = _word_counts(views, nearest_words(everything, self._words), _WORDS)
         self._inverse_frequency = _inverse_frequency(counts)
         self._weights = _weighted(counts, self._inverse_frequency)
 

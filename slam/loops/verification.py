@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
 from slam.loops.descriptors import View, hamming
+from slam.loops.thresholds import LoopThresholds
 from slam.resection import Resection, consensus, refine
 from slam.se3 import FloatArray, invert, make, rotation_angle
 from slam.storage.cache import GetOrCompute, without_cache
@@ -62,27 +62,27 @@ class LoopVerifier:
 
     def __init__(
         self,
-        config: LoopsConfig,
+        thresholds: LoopThresholds,
         intrinsics: Intrinsics,
         get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
     ) -> None:
-        self._config = config
+        self._thresholds = thresholds
         self._intrinsics = intrinsics
         self._get_or_compute = get_or_compute
         self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
-        given = (earlier.descriptors, later.descriptors, repr((self._config.max_hamming, _RATIO)))
+        given = (earlier.descriptors, later.descriptors, repr((self._thresholds.max_hamming, _RATIO)))
         rows_earlier, rows_later = self._get_or_compute(
-            "loop matches", given, lambda: matches(earlier, later, self._config)
+            "loop matches", given, lambda: matches(earlier, later, self._thresholds)
         )
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
             return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)
 
-        if len(rows_earlier) < self._config.min_inliers:
+        if len(rows_earlier) < self._thresholds.min_inliers:
             return refused(f"only {len(rows_earlier)} matches")
         forward = self.resect(earlier.points[rows_earlier], later.pixels[rows_later])
         if isinstance(forward, str):
@@ -96,7 +96,7 @@ class LoopVerifier:
         rotation_deg = float(np.rad2deg(rotation_angle(difference[:3, :3])))
         depth = min(forward.depth, backward.depth)
         translation_ratio = float(np.linalg.norm(difference[:3, 3])) / depth
-        if rotation_deg > self._config.agreement_deg or translation_ratio > self._config.agreement_ratio:
+        if rotation_deg > self._thresholds.agreement_deg or translation_ratio > self._thresholds.agreement_ratio:
             reason = f"both directions differ by {rotation_deg:.1f} degrees and {translation_ratio:.0%} of the depth"
             return refused(reason, inliers, T_earlier_later)
         T_middle = _halfway(T_earlier_later, backward.T_image_points)
@@ -109,19 +109,19 @@ class LoopVerifier:
     ) -> Sighting | str:
         """The camera pose from ``points`` ``(M, 3)`` at ``pixels`` ``(M, 2)``, or the reason for none.
 
-        Points with NaN are left out. ``min_inlier_ratio`` is that of the configuration by default.
+        Points with NaN are left out. ``min_inlier_ratio`` is that of the thresholds by default.
         """
-        config = self._config
+        thresholds = self._thresholds
         known = np.isfinite(points).all(axis=1)
         points_known, pixels_known = points[known].astype(np.float64), pixels[known].astype(np.float64)
-        if len(points_known) < config.min_inliers:
+        if len(points_known) < thresholds.min_inliers:
             return f"only {len(points_known)} matches have a trusted depth"
         K = self._intrinsics.K
         if min_inlier_ratio is None:
-            min_inlier_ratio = config.min_inlier_ratio
-        found = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, config.reprojection_px, self._seed)
+            min_inlier_ratio = thresholds.min_inlier_ratio
+        found = consensus(points_known, pixels_known, K, _RANSAC_ITERATIONS, thresholds.reprojection_px, self._seed)
         count = 0 if found is None else len(found[2])
-        if found is None or count < config.min_inliers or count < min_inlier_ratio * len(points_known):
+        if found is None or count < thresholds.min_inliers or count < min_inlier_ratio * len(points_known):
             return f"only {count} of {len(points_known)} matches are inliers"
         extent = pixels_known[found[2]].std(axis=0) / [self._intrinsics.width, self._intrinsics.height]
         if extent[0] < _MIN_SPREAD_RATIO or extent[1] < _MIN_SPREAD_RATIO / 2:
@@ -163,14 +163,14 @@ class Sighting:
         return len(self.resection.inliers)
 
 
-def matches(first: View, second: View, config: LoopsConfig) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def matches(first: View, second: View, thresholds: LoopThresholds) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of mutual nearest neighbours by Hamming distance that pass Lowe's ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     distance = hamming(first.descriptors, second.descriptors)
     rows, nearest = np.arange(len(first)), distance.argmin(axis=1)
     best = distance[rows, nearest]
-    kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= config.max_hamming)
+    kept = (distance.argmin(axis=0)[nearest] == rows) & (best <= thresholds.max_hamming)
     distance[rows, nearest] = np.inf
     kept &= best < _RATIO * distance.min(axis=1)
     return rows[kept], nearest[kept]

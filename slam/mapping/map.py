@@ -22,6 +22,7 @@ from slam.se3 import FloatArray, invert, rotation_angle
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
+_KEYFRAME_ROTATION_DEG = 3.0  # rotation after which a frame is fused, degrees
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ class TsdfMap:
         moved = float(np.linalg.norm(T_previous_camera[:3, 3]))
         turned = float(rotation_angle(T_previous_camera[:3, :3]))
         config = self._config
-        return moved >= config.keyframe_distance_m or turned >= np.deg2rad(config.keyframe_rotation_deg)
+        return moved >= config.keyframe_distance_m or turned >= np.deg2rad(_KEYFRAME_ROTATION_DEG)
 
     def _fuse(self, view: DepthView, other: DepthView | None) -> None:
         """Filter and fuse a view, and begin a new submap where this one is long or large enough."""

@@ -186,7 +186,7 @@ class SlamPipeline:
         steps = smooth_rotations(seen.steps, seen.relative_rotations)
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
-        by_lidar = lidar_steps(lidar, self._config.lidar) if isinstance(lidar, LidarPath) else []
+        by_lidar = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
         scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
         factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])
@@ -304,7 +304,7 @@ class SlamPipeline:
         config, sequence = self._config, self._sequence
         measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
         with self._watch.stage("scale"):
-            scale = find_scale(mode, sequence.camera_height_m, measured, config.lengths, config.lidar)
+            scale = find_scale(mode, sequence.camera_height_m, measured, config.lengths)
             if mode not in ("reference", "known", "gps"):
                 return scale
             T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)

@@ -23,7 +23,6 @@ from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import TriangulatedPoints, UnitRelativePose
-from slam.frontend.visual.heading_prior import HeadingPrior
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
@@ -115,7 +114,7 @@ class SessionCheckpoint:
 
 SERIALISER = Serialiser(
     *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
-    *(Corners, DynamicMask, HeadingPrior, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
+    *(Corners, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
     *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
 )

@@ -84,8 +84,8 @@ class KeyframeTracking:
         """Look for the camera among all keyframes of the map in which it was lost."""
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
-            self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._loops, self._seed)
-        corners = corners_of(frame.grey, self._config)
+            self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._seed)
+        corners = corners_of(frame.grey)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
         if found is None:

@@ -67,7 +67,7 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     rows = _Rows(maps)
     if not maps:
         return MapClosure(WindowPoses())
-    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, config.loops, seed)
+    found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
     loops, rejected = list(found.found), list(found.rejected)
     while True:
         closed, wrong = _closed(rows, loops, intrinsics)

@@ -99,7 +99,7 @@ class Observer:
         self._stopwatch = stopwatch
         self._examples = frozenset(examples)
         self._seen = Observations() if state is None else state.seen
-        self._gate = ImageGate(config.gaps, None if state is None else state.gate)
+        self._gate = ImageGate(None if state is None else state.gate)
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
@@ -110,9 +110,7 @@ class Observer:
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
-        self._features = FeatureExtractor(config.loops, intrinsics, get_or_compute)
-        self._steps = config.geometry.steps if config.geometry.enabled else ()
-        self._frames_kept = max((*self._steps, config.geometry.rotation_baseline_steps))
+        self._features = FeatureExtractor(intrinsics, get_or_compute)
         self._window: tuple[Frame, ...] = () if state is None else state.window
         self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
         self._unread = 0 if state is None else state.unread
@@ -247,7 +245,8 @@ class Observer:
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            steps = [] if self._keyframes.measures(self._seen, frame.index) else self._measure_steps(frame)
+            measure = self._config.geometry.enabled and not self._keyframes.measures(self._seen, frame.index)
+            step = self._measure_step(self._recent[-1], frame) if measure and self._recent else None
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
         self._keyframes.decide(self._seen)
@@ -255,10 +254,10 @@ class Observer:
             self._tasks.append(PendingTask("pose network", pending.snippet, self._seen.snippets.append))
         if rotation is not None:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
-        if self._config.road.enabled:
-            self._tasks += [self._road_task(previous, frame, motion) for previous, motion in steps]
+        if self._config.road.enabled and step is not None:
+            self._tasks.append(self._road_task(self._recent[-1].frame, frame, step))
         self._seen.roads.append(MeasurementFailure("its depth was not predicted"))
-        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._frames_kept :]
+        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._config.geometry.rotation_baseline_steps :]
         if pending.depth is not None:
             with self._stopwatch.stage("depth network"):
                 depth = pending.depth.result()
@@ -288,23 +287,16 @@ class Observer:
         road = self._plane.fit(depth)
         return depth, road.height_unscaled if isinstance(road, GroundPlane) else None
 
-    def _measure_steps(self, current: Frame) -> list[tuple[Frame, Motion]]:
-        """Measure steps from earlier frames; returns those with triangulated points, with their first frames."""
-        triangulated = []
-        for back in self._steps:
-            if len(self._recent) < back:
-                continue
-            recent = self._recent[-back]
-            depth, height = self._known(recent)
-            measured = self._odometry.measure(recent.frame, current, depth, height)
-            if isinstance(measured, MeasurementFailure):
-                self._seen.failures.append((recent.frame.index, current.index, measured.reason))
-                logger.info("geometry %d -> %d failed: %s", recent.frame.index, current.index, measured.reason)
-                continue
-            self._seen.motions.append(measured)
-            if measured.triangulated is not None:
-                triangulated.append((recent.frame, measured))
-        return triangulated
+    def _measure_step(self, previous: RecentFrame, current: Frame) -> Motion | None:
+        """The motion from the frame before; None where it could not be measured or triangulated no point."""
+        depth, height = self._known(previous)
+        measured = self._odometry.measure(previous.frame, current, depth, height)
+        if isinstance(measured, MeasurementFailure):
+            self._seen.failures.append((previous.frame.index, current.index, measured.reason))
+            logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
+            return None
+        self._seen.motions.append(measured)
+        return measured if measured.triangulated is not None else None
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
@@ -312,7 +304,7 @@ class Observer:
         if baseline < 2 or len(self._recent) < baseline:
             return None
         first = self._recent[-baseline]
-        motions = {m.ends: m for m in self._seen.motions[-2 * self._frames_kept * len(self._steps) :] if m.triangulated}
+        motions = {m.ends: m for m in self._seen.motions[-2 * baseline :] if m.triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
         if path is None or len(path) != baseline:
             return None

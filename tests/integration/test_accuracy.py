@@ -32,15 +32,15 @@ class Measured:
         return f"{self.sequence}-{self.weights}"
 
 
-KITTI = (Measured("00", "sim", 0.213, 0.323, 0.947),)
+KITTI = (Measured("00", "sim", 0.207, 0.306, 0.929),)
 MORE_KITTI = (
-    Measured("02", "default", 0.367, 0.836, 0.427),
-    Measured("00", "default", 0.184, 0.208, 0.940),
-    Measured("02", "sim", 0.329, 0.500, 0.373),
-    Measured("05", "sim", 0.208, 0.233, 0.483),
-    Measured("05", "default", 0.344, 0.387, 0.450),
+    Measured("02", "default", 0.364, 0.815, 0.415),
+    Measured("00", "default", 0.183, 0.200, 0.933),
+    Measured("02", "sim", 0.335, 0.525, 0.368),
+    Measured("05", "sim", 0.207, 0.233, 0.507),
+    Measured("05", "default", 0.345, 0.380, 0.431),
 )
-LOOP = (Measured("loop", "sim", 0.139, 0.291, 0.217), Measured("loop", "default", 0.149, 0.338, 0.156))
+LOOP = (Measured("loop", "sim", 0.116, 0.236, 0.105), Measured("loop", "default", 0.137, 0.352, 0.093))
 LOOPS_CLOSED = 43
 
 

@@ -19,9 +19,9 @@ def test_default_file_is_the_defaults_complete_and_explained():
 
 
 def test_dump_reads_back(tmp_path):
-    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "geometry.steps=[1, 2]", "scale.mode=none"])
+    config = load_config(None, ["pose_graph.max_loop_residual=1e-4", "gps.lever_arm_m=[1, 2, 0]", "scale.mode=none"])
     assert config.pose_graph.max_loop_residual == 1e-4
-    assert config.geometry.steps == (1, 2)
+    assert config.gps.lever_arm_m == (1, 2, 0)
     path = tmp_path / "mine.yaml"
     path.write_text(dump_yaml(config))
     assert load_config(path) == config
@@ -59,9 +59,8 @@ def test_sections_are_frozen():
         ("depth.std=[0.2, 0, 0.2]", ["depth.std", "three numbers above 0"]),
         ("depth.mean=0.5", ["depth.mean", "tuple"]),
         ("mapping.depth_min_m=30", ["mapping", "depth_min_m < depth_max_m"]),
-        ("geometry.steps=[0]", ["geometry.steps", "greater than 0"]),
-        ("geometry.steps", ["section.key=value", "geometry.steps"]),
-        ("geometry.steps=[1", ["geometry.steps=[1", "YAML"]),
+        ("gps.lever_arm_m", ["section.key=value", "gps.lever_arm_m"]),
+        ("gps.lever_arm_m=[1", ["gps.lever_arm_m=[1", "YAML"]),
     ],
 )
 def test_wrong_override_is_one_clear_line(override, parts):
@@ -101,7 +100,6 @@ def test_unknown_name_lists_the_known_ones(tmp_path):
     [
         ("geometry.foresight=false", "'geometry.foresight' is now 'geometry.predicted_flow'"),
         ("scale.road_top_share=0.4", "'scale.road_top_share' is now 'scale.road_top_ratio'"),
-        ("bridging.min_likeness=0.1", "'bridging.min_likeness' is now 'gaps.min_correlation'"),
         ("bridging.enabled=false", "'bridging.enabled' is now 'gaps.enabled'"),
         ("frontend.use=bridge", "'frontend.use: bridge' is now 'frontend.use: gaps'"),
     ],

@@ -115,11 +115,11 @@ def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache
     plan: ModuleType, tmp_path: Path
 ) -> None:
     drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
-    jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.words=20"])
+    jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.min_inliers=25"])
     assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
     assert {job.configuration.name for job in jobs[:12]} == {plan.EVERYTHING.name}
     assert len({job.cache for job in jobs}) == 4
-    assert all(job.arguments[-2:] == ["--set", "loops.words=20"] for job in jobs)
+    assert all(job.arguments[-2:] == ["--set", "loops.min_inliers=25"] for job in jobs)
 
 
 def test_every_part_can_be_turned_off(plan: ModuleType) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.config import LengthConfig, LidarConfig, ScaleMode
+from slam.config import LengthConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_homography import RoadStep
@@ -24,6 +24,7 @@ from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
+_MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,6 @@ def find_scale(
     camera_height_m: float | None,
     measured: LengthMeasurements,
     lengths: LengthConfig,
-    lidar: LidarConfig,
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps)."""
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in measured.lidar_steps}
@@ -85,9 +85,8 @@ def find_scale(
     unit = 1.0 if height is None else height
     absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in measured.road_steps.items()}
     if mode == "lidar":
-        absolute |= {
-            ends: (length, lidar.translation_sigma_m / length) for ends, length in metres.items() if length > 0
-        }
+        sigmas = {pose.ends: float(pose.sigmas[3]) for pose in measured.lidar_steps}
+        absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
     by_planes = scale_from_road(measured.planes, height)
     frames = len(measured.planes)
     if isinstance(by_planes, MeasurementFailure):
@@ -101,7 +100,7 @@ def find_scale(
     evidence = gather_evidence(steps, measured.motions, absolute, prior_unit)
     if not isinstance(by_planes, MeasurementFailure):
         # a car ahead taken for the road for seconds would outweigh all other measurements
-        evidence = evidence.without_contradicted(lengths.max_contradiction)
+        evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
     solved = solve_lengths(evidence, lengths)
     row_at = np.searchsorted([first for first, _ in steps], np.arange(frames), side="right") - 1
     per_frame = prior_unit * solved.unit_correction[row_at]

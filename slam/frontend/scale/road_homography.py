@@ -115,7 +115,7 @@ class RoadHomography:
         if 1.0 - correlation > (1.0 - _MIN_GAIN) * (1.0 - standing):
             return MeasurementFailure(f"the image in front of the car stands still (correlation {standing:.2f})")
         length /= _ALIGNED_OVER_TRUE
-        return RoadStep(length, float(np.hypot(strip.shape.relative_sigma, self._config.tilt_gain * deviation)), normal)
+        return RoadStep(length, strip.shape.relative_sigma, normal)
 
     def _aligned(
         self, strip: _Strip, previous: Frame, current: Frame, T_unit: FloatArray, expected: FloatArray

@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.frontend.visual.heading_prior import HeadingPrior
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
 
@@ -35,28 +34,17 @@ def usual_error(depth_relative_errors: Sequence[float], floor: float) -> float:
 class MotionHistory:
     """Directions of the last steps, relative errors of learned depth on them, and the last motion."""
 
-    heading_prior: HeadingPrior
     directions: tuple[FloatArray, ...] = ()
     depth_relative_errors: tuple[float, ...] = ()
     last: UnitRelativePose | None = None
 
-    def with_step(
-        self, measured: UnitRelativePose, covariance: FloatArray, fused: UnitRelativePose, depth_relative_error: float
-    ) -> Self:
-        """The history after one more accepted step.
-
-        Args:
-            measured: by corners alone, with its ``covariance`` ``(6, 6)``.
-            covariance: rotation then direction, radians.
-            fused: the same after fusion with the heading prior.
-            depth_relative_error: of learned depth on this step; NaN where unknown.
-        """
+    def with_step(self, measured: UnitRelativePose, depth_relative_error: float) -> Self:
+        """The history after one more step, and the relative error of learned depth on it, NaN where unknown."""
         return replace(
             self,
-            heading_prior=self.heading_prior.with_step(measured, covariance),
             directions=(*self.directions, measured.direction)[-_STEPS_KEPT:],
             depth_relative_errors=(*self.depth_relative_errors, depth_relative_error)[-_STEPS_KEPT:],
-            last=fused,
+            last=measured,
         )
 
     def prior(self, depth_relative_error: float, least_axis_sigma: float) -> MotionPrior:

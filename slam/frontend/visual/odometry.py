@@ -23,13 +23,19 @@ from slam.frontend.visual.epipolar import (
     rotation_between,
     triangulated_depth,
 )
-from slam.frontend.visual.heading_prior import HeadingPrior
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.motion_history import MotionHistory, usual_error
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.tracking import CornerTracker, TrackerState, Tracks
-from slam.frontend.visual.two_view import CORNER_CORRELATION, Matches, TwoViewEstimate, TwoViewEstimator
+from slam.frontend.visual.two_view import (
+    CORNER_CORRELATION,
+    DEPTH_RELATIVE_SIGMA,
+    INLIER_PX,
+    Matches,
+    TwoViewEstimate,
+    TwoViewEstimator,
+)
 from slam.resection import consensus, refine
 from slam.robust import mad_sigma, weighted_median
 from slam.se3 import FloatArray, invert, make
@@ -84,7 +90,7 @@ class VisualOdometry:
         self._state = state or OdometryState(
             self._tracker.state(),
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
-            MotionHistory(HeadingPrior(float(np.deg2rad(config.heading_prior_sigma_deg)))),
+            MotionHistory(),
         )
 
     def state(self) -> OdometryState:
@@ -145,7 +151,7 @@ class VisualOdometry:
             return lambda: None
         find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
         mask, history = self._state.dynamic_mask, self._state.history
-        depth_error = usual_error(history.depth_relative_errors, self._config.depth_relative_sigma)
+        depth_error = usual_error(history.depth_relative_errors, DEPTH_RELATIVE_SIGMA)
 
         def measure() -> RelativeRotation | None:
             tracks = find()
@@ -222,7 +228,7 @@ class VisualOdometry:
         measures = solid & np.isfinite(depth)
         if measures.sum() < _MIN_RATIOS:
             return None
-        relative_sigma = self._config.inlier_px / np.maximum(parallax, 1e-9)
+        relative_sigma = INLIER_PX / np.maximum(parallax, 1e-9)
         length, spread = _length(depth[measures] / depth_previous[measures], relative_sigma[measures])
         T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
         rotation, direction = self._essential_sigmas(two_view)

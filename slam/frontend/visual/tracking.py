@@ -72,7 +72,7 @@ class CornerTracker:
         self._config = config
         self._get_or_compute = get_or_compute
         self._state = state or TrackerState({})
-        self._frames_kept = max(*config.steps, config.rotation_baseline_steps) + 2
+        self._frames_kept = config.rotation_baseline_steps + 2
 
     def state(self) -> TrackerState:
         """The state to resume from."""

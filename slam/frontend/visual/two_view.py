@@ -45,6 +45,9 @@ _PATCH_WIDENING = 3.0
 CORNER_CORRELATION = 2.0
 _ALONG_PX = 0.4  # corner noise along the epipolar line, pixels, besides that of learned depth
 _EARLY_EXIT_INLIER_RATIO = 0.75  # inlier ratio at which RANSAC stops early
+INLIER_PX = 0.6  # largest epipolar distance of an inlier, pixels
+_DIRECTION_PRIOR_SIGMA_DEG = 8.0  # least sigma of the motion prior on the translation direction, degrees
+DEPTH_RELATIVE_SIGMA = 0.2  # least relative sigma of learned depth along an epipolar line
 
 
 @dataclass(frozen=True)
@@ -102,24 +105,21 @@ class TwoViewEstimator:
         if not found:
             return None
         best = max(found, key=lambda candidate: _support(candidate, prior))
-        widened = CORNER_CORRELATION**2 * best.covariance
-        fused, covariance = history.heading_prior.fuse(best.unit_pose, widened)
         error = self._depth_relative_error(matches, best.unit_pose)
-        estimate = TwoViewEstimate(fused, covariance / CORNER_CORRELATION**2, best.inliers)
-        return estimate, history.with_step(best.unit_pose, widened, fused, error)
+        return best, history.with_step(best.unit_pose, error)
 
     def refined(self, matches: Matches, start: UnitRelativePose, depth_relative_error: float) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.
 
         Learned depth has a small weight: it is needed only to choose between motions.
         """
-        sigma = float(np.deg2rad(self._config.direction_prior_sigma_deg))
+        sigma = float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG))
         return self._refined(
             matches, start, MotionPrior(_PATCH_WIDENING * depth_relative_error, start.direction, sigma)
         )
 
     def _by_essential(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
-        tolerance = self._config.inlier_px / self._focal_px
+        tolerance = INLIER_PX / self._focal_px
         given = first, second, repr((tolerance, self._seed))
         return self._cached_unit_pose(
             "motion by essential matrix", given, lambda: unit_pose_by_essential(first, second, tolerance, self._seed)
@@ -147,8 +147,8 @@ class TwoViewEstimator:
         errors = history.depth_relative_errors
         if not errors and proposed is not None:
             errors = (self._depth_relative_error(matches, proposed),)
-        error = usual_error(errors, self._config.depth_relative_sigma)
-        return history.prior(error, float(np.deg2rad(self._config.direction_prior_sigma_deg)))
+        error = usual_error(errors, DEPTH_RELATIVE_SIGMA)
+        return history.prior(error, float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
 
     def _depth_relative_error(self, matches: Matches, unit_pose: UnitRelativePose) -> float:
         """Relative error of learned depth against triangulated depth of inlier corners, scale aside."""
@@ -163,7 +163,7 @@ class TwoViewEstimator:
         depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
         rotated = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
         shift_px = np.hypot(*(matches.rays_current.T[:2] - rotated)) * self._focal_px
-        usable = (np.abs(distance) < self._config.inlier_px) & (depth > 0) & (shift_px > 1.0)
+        usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
         usable &= np.isfinite(matches.depth_previous)
         return np.asarray(np.log(matches.depth_previous[usable] / depth[usable]))
 
@@ -184,7 +184,7 @@ class TwoViewEstimator:
             (
                 prior.depth_relative_error,
                 prior.axis_sigma,
-                self._config.inlier_px,
+                INLIER_PX,
                 _ALONG_PX,
                 self._focal_px,
             )
@@ -209,12 +209,12 @@ class TwoViewEstimator:
             tangent = tangent_of(unit_pose.direction)
             across, by_motion = residuals.across(unit_pose, tangent)
             along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
-            near = np.abs(across) < self._config.inlier_px
+            near = np.abs(across) < INLIER_PX
             sigma_along = np.hypot(_ALONG_PX, prior.depth_relative_error * shift_px)
             inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
             if inliers.sum() < _LEAST_POINTS:
                 return None
-            sigma = max(mad_sigma(across[near]), 1e-3 * self._config.inlier_px)
+            sigma = max(mad_sigma(across[near]), 1e-3 * INLIER_PX)
             weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
             weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
             weights = weights / sigma**2

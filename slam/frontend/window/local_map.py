@@ -36,6 +36,8 @@ _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
+MAX_CORNERS = 500  # largest number of corners of a keyframe
+CORNER_SPACING_PX = 12.0  # least distance between corners, pixels
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,10 @@ class WindowKeyframe:
         )
 
 
-def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
+def corners_of(grey: Grey) -> Pixels:
     """Corners ``(M, 2)`` of an image without tracks."""
     none = np.zeros((0, 2), np.float32)
-    return new_corners(grey, none, config.max_corners, config.corner_spacing_px)
+    return new_corners(grey, none, MAX_CORNERS, CORNER_SPACING_PX)
 
 
 @dataclass

@@ -21,6 +21,8 @@ from slam.frontend.window.descriptors import describe
 from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.initialisation import View, first_points
 from slam.frontend.window.local_map import (
+    CORNER_SPACING_PX,
+    MAX_CORNERS,
     LocalMap,
     TrackIds,
     WindowKeyframe,
@@ -263,7 +265,7 @@ class WindowOdometry:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
-        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels), config.corner_spacing_px)
+        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels), CORNER_SPACING_PX)
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

@@ -12,7 +12,7 @@ from slam.config import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.factors import Unscaled, chain_odometry, make_factors
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.network_factors import NETWORK_SOURCE
+from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.epipolar import TriangulatedPoints
@@ -95,7 +95,7 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     found = {f.ends: f for f in factors(Unscaled(table(STEPS, wrong), [], []), scale(unscaled))}
     for ends in lengths:
         np.testing.assert_allclose(found[ends].T_from_to, pose(*ends).T_from_to, atol=1e-9)
-        assert found[ends].student_t_dof == GeometryConfig().student_t_dof
+        assert found[ends].student_t_dof == STUDENT_T_DOF
         assert found[ends].correlated_sigmas is not None
         assert found[ends].sigmas[5] == pytest.approx(0.02 * lengths[ends], rel=0.05)
         assert found[ends].graph_sigmas[5] == pytest.approx(0.03 * lengths[ends], rel=0.05)

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config import GapsConfig
 from slam.frames import Frame, Image
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
@@ -36,7 +35,7 @@ def frames_of(images: list[Image]) -> list[Frame]:
 
 
 def verdicts(images: list[Image], gate: ImageGate | None = None) -> list[str]:
-    gate = gate or ImageGate(GapsConfig())
+    gate = gate or ImageGate()
     return [v.reason if isinstance(v, MeasurementFailure) else v for v in map(gate.check, frames_of(images))]
 
 
@@ -161,9 +160,9 @@ def test_a_gate_resumes_from_its_state() -> None:
     whole = verdicts(images)
     assert len(set(whole)) == 3
     for split in range(len(images)):
-        first = ImageGate(GapsConfig())
+        first = ImageGate()
         before = verdicts(images[:split], first)
-        assert before + verdicts(images[split:], ImageGate(GapsConfig(), first.state())) == whole
+        assert before + verdicts(images[split:], ImageGate(first.state())) == whole
 
 
 @pytest.mark.data

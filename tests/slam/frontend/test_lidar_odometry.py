@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from erfsfm.readers.scan import read_velodyne
-from slam.config import LidarConfig
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, has_scans, lidar_path, lidar_steps
 from slam.sequences.catalogue import open_sequence
@@ -59,10 +58,10 @@ def test_without_scans_there_is_no_path(street):
 def test_steps_are_those_between_neighbouring_scanned_frames():
     T_world_camera = np.tile(np.eye(4), (4, 1, 1))
     T_world_camera[:, 2, 3] = [0.0, 1.0, 4.0, 5.5]
-    steps = lidar_steps(LidarPath(np.array([3, 4, 7, 8]), T_world_camera), LidarConfig(translation_sigma_m=0.02))
+    steps = lidar_steps(LidarPath(np.array([3, 4, 7, 8]), T_world_camera))
     assert [(s.from_index, s.to_index, s.source) for s in steps] == [(3, 4, "lidar"), (7, 8, "lidar")]
     assert [s.T_from_to[2, 3] for s in steps] == [1.0, 1.5]
-    np.testing.assert_array_equal(steps[0].sigmas[3:], 0.02)
+    np.testing.assert_array_equal(steps[0].sigmas[3:], 0.03)
 
 
 def test_scans_are_used_where_neighbours_have_them_and_the_extrinsics_are_known():

@@ -9,10 +9,10 @@ import pytest
 
 from erfsfm.pose_noise import PoseNoise
 from slam import se3
-from slam.config import FrontendConfig
 from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.network_factors import (
+    UncalibratedNoise,
     calibrated_factors,
     chain_raw,
     measured_noise,
@@ -20,7 +20,7 @@ from slam.frontend.network_factors import (
     without_measured,
 )
 
-CONFIG = FrontendConfig(rotation_sigma_deg=0.5, translation_relative_sigma=0.1, translation_floor_ratio=0.05)
+USUAL = UncalibratedNoise()
 
 
 def drive(count: int) -> np.ndarray:
@@ -78,7 +78,7 @@ def test_sequences_that_snippets_do_not_cover_are_refused():
 
 def test_every_direct_pose_is_a_factor_in_its_own_direction():
     T = drive(10)
-    factors = network_factors(snippets_of(T), CONFIG)
+    factors = network_factors(snippets_of(T), USUAL)
     assert len(factors) == 4 * 6
     for factor in factors:
         expected = se3.invert(T[factor.from_index]) @ T[factor.to_index]
@@ -89,8 +89,8 @@ def test_every_direct_pose_is_a_factor_in_its_own_direction():
 def test_noise_follows_distance_length_and_repetition():
     T = np.tile(np.eye(4), (10, 1, 1))
     T[:, 2, 3] = 2.0 * np.arange(10)
-    sigmas = {(f.from_index, f.to_index): f.sigmas for f in network_factors(snippets_of(T), CONFIG)}
-    once, twice = np.deg2rad(0.5), np.deg2rad(0.5) * np.sqrt(2)
+    sigmas = {(f.from_index, f.to_index): f.sigmas for f in network_factors(snippets_of(T), USUAL)}
+    once, twice = np.deg2rad(0.3), np.deg2rad(0.3) * np.sqrt(2)
     # pair (0, 2) is measured once, pair (4, 5) by two snippets
     np.testing.assert_allclose(sigmas[0, 2][:3], once * np.sqrt(2))
     np.testing.assert_allclose(sigmas[4, 5][:3], twice)
@@ -100,7 +100,7 @@ def test_noise_follows_distance_length_and_repetition():
 
 
 def test_standing_still_keeps_positive_sigmas():
-    for factor in network_factors(snippets_of(np.tile(np.eye(4), (8, 1, 1))), CONFIG):
+    for factor in network_factors(snippets_of(np.tile(np.eye(4), (8, 1, 1))), USUAL):
         assert (factor.sigmas > 0).all()
 
 
@@ -117,20 +117,20 @@ def test_noise_is_estimated_where_geometry_measured_the_same_steps():
         for pose in snippet.T_source_target:
             turn = np.deg2rad(sigma_deg) * rng.normal(size=3)
             pose[:] = pose @ se3.from_rotation_vector(turn, np.zeros(3))
-    measured = measured_noise(snippets, geometry_of(T), CONFIG)
+    measured = measured_noise(snippets, geometry_of(T))
     assert measured.rotation_sigma_deg == pytest.approx(sigma_deg, rel=0.15)
-    assert measured.translation_relative_sigma == CONFIG.translation_relative_sigma
+    assert measured.translation_relative_sigma == USUAL.translation_relative_sigma
 
 
-def test_noise_stays_as_configured_where_the_network_is_better_or_geometry_measured_little():
+def test_noise_stays_as_usual_where_the_network_is_better_or_geometry_measured_little():
     T = drive(60)
-    assert measured_noise(snippets_of(T), geometry_of(T), CONFIG) == CONFIG
-    assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3], CONFIG) == CONFIG
+    assert measured_noise(snippets_of(T), geometry_of(T)) == USUAL
+    assert measured_noise(snippets_of(T, wrong=5.0), geometry_of(T)[:3]) == USUAL
 
 
 def test_network_factors_are_used_where_geometry_did_not_measure():
     T = drive(20)
-    factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
+    factors, geometric = network_factors(snippets_of(T), USUAL), geometry_of(T)
     assert without_measured(factors, geometric) == []
     assert without_measured(factors, []) == factors
     gap = without_measured(factors, geometric[:9] + geometric[10:])
@@ -140,7 +140,7 @@ def test_network_factors_are_used_where_geometry_did_not_measure():
 def test_a_step_that_skips_frames_replaces_the_network_between_its_frames_alone():
     """Geometry measured from frame 9 to 11 at once, and not the single steps between them."""
     T = drive(20)
-    factors, geometric = network_factors(snippets_of(T), CONFIG), geometry_of(T)
+    factors, geometric = network_factors(snippets_of(T), USUAL), geometry_of(T)
     over_two = RelativePose(9, 11, se3.invert(T[9]) @ T[11], np.ones(6), "essential")
     gap = without_measured(factors, [*geometric[:9], over_two, *geometric[11:]])
     assert pairs_of(gap) == {(9, 10), (8, 10), (10, 11), (10, 12)}
@@ -168,7 +168,7 @@ NOISE = PoseNoise(
 
 def test_calibrated_noise_gives_each_pair_one_factor_with_any_overlap():
     T = drive(10)
-    factors = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets_of(T), [], NOISE, CONFIG)}
+    factors = {(f.from_index, f.to_index): f for f in calibrated_factors(snippets_of(T), [], NOISE)}
     # targets 2 to 7: pairs of neighbours from (1, 2) to (7, 8), pairs over two from (0, 2) to (7, 9)
     assert factors.keys() == {(k, k + 1) for k in range(1, 8)} | {(k, k + 2) for k in range(8)}
     for (first, last), factor in factors.items():
@@ -199,10 +199,10 @@ def exact_geometry(T: np.ndarray) -> list[RelativePose]:
 def test_a_drive_scales_calibrated_noise_up_and_down():
     T = drive(300)
     snippets, promised = wobbling(T, np.full(300, 0.05)), 0.01 * np.sqrt(0.75)
-    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
+    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
     assert scaled[50, 51][0] == pytest.approx(0.05 / np.sqrt(2), rel=0.25)
     assert scaled[50, 51][1] == pytest.approx(0.3 * promised, rel=1e-3)  # the lower limit, however well both agree
-    few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE, CONFIG)
+    few = calibrated_factors(snippets, exact_geometry(T)[:9], NOISE)
     np.testing.assert_allclose(sigmas_of(few)[50, 51], promised, rtol=1e-3)
     assert {f.student_t_dof for f in few} == {np.inf}  # as calibrated
 
@@ -214,10 +214,10 @@ def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
     over_two = [
         RelativePose(k, k + 2, se3.invert(T[k]) @ T[k + 2], np.full(6, 1e-6), "essential") for k in range(0, 298, 2)
     ]
-    scaled = sigmas_of(calibrated_factors(snippets, over_two, NOISE, CONFIG))
+    scaled = sigmas_of(calibrated_factors(snippets, over_two, NOISE))
     promised = 0.01 * np.sqrt(0.75)
     np.testing.assert_allclose(scaled[50, 51], promised, rtol=1e-3)
-    single = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
+    single = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
     for pair in ((50, 52), (51, 53)):  # steps begin at even frames, the scaling is that of the distance
         assert scaled[pair][0] == pytest.approx(single[pair][0], rel=0.25)
         assert scaled[pair][0] > 2 * promised
@@ -229,7 +229,7 @@ def test_turns_are_scaled_apart_from_straights():
     steps = se3.from_rotation_vector(np.column_stack([0 * turns, turns, 0 * turns]), np.tile([0.0, 0.0, 1.0], (299, 1)))
     T = se3.chain(steps)
     snippets = wobbling(T, np.where(np.arange(300) < 150, 0.01, 0.1))
-    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE, CONFIG))
+    scaled = sigmas_of(calibrated_factors(snippets, exact_geometry(T), NOISE))
     straight, turning = ([scaled[k, k + 1][0] for k in r] for r in (range(20, 130), range(170, 280)))
     assert np.median(turning) > 5 * np.median(straight)
 
@@ -237,16 +237,16 @@ def test_turns_are_scaled_apart_from_straights():
 def test_noise_of_geometry_is_added_to_that_of_the_network():
     T = drive(100)
     geometric = [replace(g, sigmas=np.full(6, 0.4)) for g in geometry_of(T)]
-    factors = sigmas_of(calibrated_factors(snippets_of(T), geometric, NOISE, CONFIG))
+    factors = sigmas_of(calibrated_factors(snippets_of(T), geometric, NOISE))
     np.testing.assert_allclose(factors[50, 51], 0.4, rtol=1e-2)
     np.testing.assert_allclose(factors[50, 52], 0.4 * np.sqrt(2), rtol=1e-2)
-    without_one = sigmas_of(calibrated_factors(snippets_of(T), geometric[:50] + geometric[51:], NOISE, CONFIG))
+    without_one = sigmas_of(calibrated_factors(snippets_of(T), geometric[:50] + geometric[51:], NOISE))
     np.testing.assert_allclose(without_one[50, 51], 0.4, rtol=1e-2)
 
 
 def test_equal_turn_rates_have_one_scaling():
     T = se3.chain(se3.from_rotation_vector(np.zeros((99, 3)), np.tile([0.0, 0.0, 1.0], (99, 1))))
-    factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE, CONFIG))
+    factors = sigmas_of(calibrated_factors(wobbling(T, np.zeros(100)), exact_geometry(T), NOISE))
     np.testing.assert_allclose(factors[50, 51], 0.3 * 0.01 * np.sqrt(0.75), rtol=1e-3)
 
 
@@ -257,7 +257,7 @@ def test_correlated_errors_get_larger_sigmas_in_the_graph():
     T, wrong = se3.chain(se3.from_rotation_vector(0 * ahead, ahead)), 0.01 * rng.normal(size=(count - 1, 3))
     wrong[:, 1], wrong[:, 2] = 0.0, 0.01 + 0.1 * wrong[:, 2]
     seen = snippets_of(se3.chain(se3.from_rotation_vector(wrong, ahead)))
-    factors = calibrated_factors(seen, exact_geometry(T), NOISE, CONFIG)
+    factors = calibrated_factors(seen, exact_geometry(T), NOISE)
     longer = {
         distance: np.median(
             [f.graph_sigmas / f.sigmas for f in factors if f.to_index - f.from_index == distance], axis=0
@@ -268,7 +268,7 @@ def test_correlated_errors_get_larger_sigmas_in_the_graph():
     assert longer[1][0] == pytest.approx(np.sqrt(2), rel=0.3)
     assert longer[2][0] == pytest.approx(np.sqrt(2) * np.sqrt(2), rel=0.3)  # neighbours share a step
     assert longer[1][2] > 6 * np.sqrt(2) and longer[2][2] > 6 * np.sqrt(2)
-    few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE, CONFIG)
+    few = calibrated_factors(seen, exact_geometry(T)[:30], NOISE)
     for distance, pairs in ((1, 397), (2, 398)):  # too few to tell: taken to last for a quarter of the drive
         ratios = [f.graph_sigmas / f.sigmas for f in few if f.to_index - f.from_index == distance]
         np.testing.assert_allclose(ratios, np.sqrt(pairs // 4) * np.sqrt(2))

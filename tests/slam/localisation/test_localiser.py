@@ -44,7 +44,7 @@ def reference() -> FloatArray:
 def places() -> Places:
     """Places as a run on every third frame keeps them, with exact depth."""
     sequence = street(630)
-    extractor = FeatureExtractor(CONFIG, sequence.intrinsics)
+    extractor = FeatureExtractor(sequence.intrinsics)
     frames = range(0, 60, 3)
     views = []
     for k in frames:
@@ -219,7 +219,7 @@ def test_the_run_of_an_earlier_release_serves_still(run: RunFolder, album: Path)
         (run.path / "config.yaml")
         .read_text()
         .replace("  memory_mb: 1000", "  max_blocks: 12000")
-        .replace("  words: 1000", "  words: 1000\n  peak_frames: 10")
+        .replace("  min_inliers: 20  # least number of inliers of a loop", "  min_inliers: 20\n  peak_frames: 10")
     )
     assert "max_blocks" in stored and "peak_frames" in stored
     run.write_text("config.yaml", stored)

@@ -7,7 +7,7 @@ from slam.config import LoopsConfig
 from slam.loops.descriptors import View, hamming
 from slam.loops.retrieval import find_candidates, nearest_words, train_vocabulary
 
-CONFIG = LoopsConfig(words=200, min_gap_frames=10, min_path_m=5.0)
+CONFIG = LoopsConfig(min_gap_frames=10, min_path_m=5.0)
 
 
 def place(rng: np.random.Generator) -> np.ndarray:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from slam.config import LoopsConfig
 from slam.frames import LOOP_SOURCE, Intrinsics
 from slam.loops import verification
 from slam.loops.descriptors import View
+from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle
 
@@ -35,8 +38,11 @@ class Scene:
         return self.view(3, self.points_a), self.view(90, self.points_b)
 
 
+THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
+
+
 def verify(earlier: View, later: View, **changes: float) -> Loop | RejectedLoop:
-    return LoopVerifier(LoopsConfig(**changes), CAMERA).verify(earlier, later, 0.7)
+    return LoopVerifier(replace(THRESHOLDS, **changes), CAMERA).verify(earlier, later, 0.7)
 
 
 def error(loop: Loop, T_true: FloatArray) -> tuple[float, float]:
@@ -104,7 +110,7 @@ def test_seeds_draw_other_ransac_samples_and_one_seed_the_same(monkeypatch: pyte
     later.pixels[:80] = np.random.default_rng(1).uniform([0, 0], [415, 127], (80, 2))
     poses = []
     for seed in (0, 0, 1, 2, 3):
-        loop = LoopVerifier(LoopsConfig(), CAMERA, seed=seed).verify(earlier, later, 0.7)
+        loop = LoopVerifier(THRESHOLDS, CAMERA, seed=seed).verify(earlier, later, 0.7)
         assert isinstance(loop, Loop) and error(loop, T_A_B)[0] < 0.5
         poses.append(loop.measured.T_from_to.tobytes())
     assert poses[0] == poses[1] and len(set(poses[1:])) > 1

@@ -133,7 +133,7 @@ def test_graph_mapping_and_output_may_be_changed(go_on: Callable[..., RunFolder]
     "options, message",
     [
         ({"config": "default"}, "leave out --config"),
-        ({"overrides": ["geometry.inlier_px=3"]}, "geometry cannot be changed for .*: leave out --set geometry"),
+        ({"overrides": ["geometry.max_corners=300"]}, "geometry cannot be changed for .*: leave out --set geometry"),
     ],
     ids=["configuration", "geometry"],
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam import se3
-from slam.config import LengthConfig, LidarConfig
+from slam.config import LengthConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
@@ -51,7 +51,7 @@ def measured(
 
 
 def find(mode, measurements: LengthMeasurements, height_m: float | None = HEIGHT_M) -> Scale:
-    return find_scale(mode, height_m, measurements, LengthConfig(), LidarConfig())
+    return find_scale(mode, height_m, measurements, LengthConfig())
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:

@@ -65,7 +65,7 @@ def test_a_car_taken_for_the_road_for_half_the_drive_is_left_out():
     road = noisy(0.03)
     road[: STEPS // 2] += np.log(0.1)
     measured = evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06), learned=noisy(0.1, seed=2), **ratios(0.003))
-    solved = solve_lengths(measured.without_contradicted(CONFIG.max_contradiction), CONFIG)
+    solved = solve_lengths(measured.without_contradicted(2.5), CONFIG)
     np.testing.assert_allclose(solved.length, TRUE, rtol=0.08)
     assert np.isfinite(measured.without_contradicted(20.0).absolute).all()
 

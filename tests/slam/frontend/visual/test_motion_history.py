@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.frontend.visual.heading_prior import HeadingPrior
 from slam.frontend.visual.motion_history import MotionHistory, usual_error
-
-COVARIANCE = 1e-6 * np.eye(6)
 
 
 def heading(aside_deg: float) -> UnitRelativePose:
@@ -18,21 +15,20 @@ def heading(aside_deg: float) -> UnitRelativePose:
 
 
 def history_of(asides_deg: np.ndarray, error: float = 0.1) -> MotionHistory:
-    history = MotionHistory(HeadingPrior(np.deg2rad(0.35)))
+    history = MotionHistory()
     for aside_deg in asides_deg:
-        history = history.with_step(heading(aside_deg), COVARIANCE, heading(0.5 * aside_deg), error)
+        history = history.with_step(heading(aside_deg), error)
     return history
 
 
-def test_a_step_is_kept_as_measured_and_the_last_one_as_fused() -> None:
+def test_a_step_is_kept_as_measured() -> None:
     before = history_of(np.zeros(3))
-    after = before.with_step(heading(4.0), COVARIANCE, heading(2.0), 0.2)
+    after = before.with_step(heading(4.0), 0.2)
     np.testing.assert_array_equal(after.directions[-1], heading(4.0).direction)
-    np.testing.assert_array_equal(after.heading_prior.directions[-1], heading(4.0).direction)
     assert after.last is not None
-    np.testing.assert_array_equal(after.last.direction, heading(2.0).direction)
+    np.testing.assert_array_equal(after.last.direction, heading(4.0).direction)
     assert after.depth_relative_errors == (0.1, 0.1, 0.1, 0.2)
-    assert len(before.directions) == len(before.heading_prior.rotations) == 3  # a history is a value
+    assert len(before.directions) == 3  # a history is a value
 
 
 def test_few_steps_give_no_usual_direction() -> None:

@@ -169,7 +169,7 @@ def weights_sha256(folder: Path) -> str:
     """SHA-256 of both weight files together."""
     digest = hashlib.sha256()
     for path in (folder / name for name in FILES):
-        digest.update(path.read_bytes() if path.exists() else b"")
+        digest.update(path.read_bytes() if path.is_file() else b"")
     return digest.hexdigest()
 
 
@@ -236,10 +236,10 @@ def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path,
 
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing; copy the whole weights folder")
     try:
         tensors: dict[str, torch.Tensor] = load_file(path)
-    except FileNotFoundError as error:
-        raise CheckpointError(f"{path} is missing; copy the whole weights folder") from error
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path} is damaged ({error}); copy it again or train again") from error
     return tensors

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 import re
 import sys
@@ -15,10 +14,17 @@ from typing import NoReturn
 import typer
 
 from erfsfm.errors import OUT_OF_MEMORY, OneLineError, one_line
+from erfsfm.memory import require_memory
 from erfsfm.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
-_LOADING_BYTES = 256 * 2**20
+_LOADING_BYTES = 256 * 2**20  # of NumPy and SciPy: OpenBLAS waits for ever for memory that it cannot have
+# what they would say of a file is said in our own line; twice the pixels of the largest camera that is read
+_OPENCV = {
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27),
+}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
@@ -33,10 +39,10 @@ _MEMORY = re.compile(
 def run(app: Callable[..., object], name: str) -> None:
     """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for name_of_level, quiet in (("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")):
-        os.environ.setdefault(name_of_level, quiet)  # what they would say of a file is said in our own line
+    for variable, value in _OPENCV.items():
+        os.environ.setdefault(variable, value)
     try:
-        _require_memory()
+        require_memory(_LOADING_BYTES)
         app(args=_checked(sys.argv[1:], name), prog_name=name)
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):
@@ -47,14 +53,6 @@ def run(app: Callable[..., object], name: str) -> None:
         if os.environ.get(SHOW_TRACEBACK):
             raise
         _end(f"{name}: {_explained(error)}", 1)
-
-
-def _require_memory() -> None:
-    """Refuse to begin where NumPy and SciPy could not be loaded: OpenBLAS waits for ever for memory it cannot have."""
-    try:
-        mmap.mmap(-1, _LOADING_BYTES).close()
-    except OSError as error:
-        raise MemoryError from error
 
 
 def _checked(words: Sequence[str], name: str) -> list[str]:

@@ -189,21 +189,28 @@ def _one_line(error: ValidationError, model: type[BaseModel], origin: str, overr
     first = error.errors(include_url=False)[0]
     known = list(_known_keys(model))
     place = ".".join(str(part) for part in first["loc"])
-    overridden = {text.partition("=")[0].strip(): f"--set {text}" for text in overrides}
-    origin = overridden.get(place, origin)
+    origin = _origin(place, origin, overrides)
     if first["type"] == "extra_forbidden":
         return f"unknown key '{place}' in {origin}; {_nearest_key(place, known)}"
     # pydantic appends the branch of a union, or the place inside a value; keys end where no such key is known
     key = place
     while key and key not in known:
         key = key.rpartition(".")[0]
-    origin = overridden.get(key, origin)
     if first["type"] == "model_type":
         return f"'{key or 'all of it'}' in {origin} is a section of keys; got {_shown(first['input'])}"
     wanted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     if not key:
         return f"{origin}: {wanted}"
     return f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}"
+
+
+def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
+    """The last override of a key, of the section it is in, or of what is in it; else where the tree came from."""
+    for text in reversed(overrides):
+        key = text.partition("=")[0].strip()
+        if f"{place}.".startswith(f"{key}.") or f"{key}.".startswith(f"{place}."):
+            return f"--set {text}"
+    return origin
 
 
 def _nearest_key(key: str, known: Sequence[str]) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
+import select
+import stat
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +15,7 @@ from pathlib import Path
 MAX_TEXT_BYTES = 256 * 2**20  # a trajectory of a million frames
 MAX_IMAGE_BYTES = 2**30
 _BLOCK_BYTES = 2**20
+WAIT_FOR_PIPE_S = 10.0
 _PARTIAL = re.compile(r"\.\d+\.\d+\.partial\.(?P<name>.+)")
 
 
@@ -46,12 +49,12 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a file that has no more than ``most`` bytes; also of a pipe.
+    """The content of a file that has no more than ``most`` bytes; also of a pipe that something is written to.
 
     Raises:
         OSError: it cannot be read, or is larger.
     """
-    with path.open("rb") as file:
+    with open(path, "rb", opener=lambda name, _: open_written(name, WAIT_FOR_PIPE_S)) as file:
         size = os.fstat(file.fileno()).st_size  # 0 of a pipe, which is read in blocks
         parts = [file.read(min(size, most))]
         while sum(map(len, parts)) <= most and (block := file.read(_BLOCK_BYTES)):
@@ -60,6 +63,21 @@ def read_bytes(path: Path, most: int) -> bytes:
     if len(content) > most:
         raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
     return content
+
+
+def open_written(path: str, wait_s: float) -> int:
+    """A file descriptor for reading; of a pipe, once something was written to it.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe that nothing was written to for ``wait_s``.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    is_pipe = stat.S_ISFIFO(os.fstat(descriptor).st_mode)
+    if is_pipe and not select.select([descriptor], [], [], wait_s)[0]:
+        os.close(descriptor)
+        raise OSError(errno.ETIMEDOUT, f"a pipe that nothing was written to for {wait_s:g} s", path)
+    os.set_blocking(descriptor, True)
+    return descriptor
 
 
 def read_text(path: Path, encoding: str = "utf-8", most: int = MAX_TEXT_BYTES) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,6 +9,8 @@ import cv2
 import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
+
+from erfsfm.memory import require_memory
 
 _LINEAR_ALGEBRA_BYTES = 192 * 2**20
 _LARGE_MATRIX = 64  # rows; smaller ones are decomposed without it
@@ -36,10 +37,7 @@ def take_working_memory() -> None:
     Raises:
         MemoryError: there is not enough.
     """
-    try:
-        mmap.mmap(-1, _LINEAR_ALGEBRA_BYTES).close()
-    except OSError as error:
-        raise MemoryError from error
+    require_memory(_LINEAR_ALGEBRA_BYTES)
     matrix = np.random.default_rng(0).normal(size=(_LARGE_MATRIX, _LARGE_MATRIX))
     cv2.SVDecomp(matrix)
     np.linalg.svd(matrix @ matrix)

@@ -132,7 +132,7 @@ class MappingConfig(Section):
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
     truncation_voxels: float = Field(
-        default=8.0, ge=1, description="truncation distance of the signed distance, voxels"
+        default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
     )
     sky_brightness: int = Field(
         default=245,
@@ -144,7 +144,11 @@ class MappingConfig(Section):
         default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"
     )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth")
-    depth_max_m: float = Field(default=22.0, gt=0, description="largest fused depth")
+    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, whatever its sigma")
+    sure_sigma_m: float = Field(
+        default=1.2, ge=0, description="largest sigma of depth that is fused up to sure_reach times depth_max_m"
+    )
+    sure_reach: float = Field(default=1.4, ge=1, description="for depth as sure as that")
     border: float = Field(
         default=0.02, ge=0, lt=0.5, description="left, right and upper border left out, over the image's width"
     )
@@ -155,7 +159,7 @@ class MappingConfig(Section):
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
     consistency: float = Field(
-        default=0.15, gt=0, description="largest relative depth difference to the previous keyframe"
+        default=0.12, gt=0, description="largest relative depth difference to the previous keyframe"
     )
     max_relative_sigma: float = Field(
         default=0.2, gt=0, description="largest sigma of refined depth that is fused, relative to it"
@@ -169,6 +173,11 @@ class MappingConfig(Section):
     memory_mb: int = Field(
         default=1000, ge=100, description="memory of the map, MiB: a submap ends before submap_m where it would be more"
     )
+
+    @property
+    def reach_m(self) -> float:
+        """Depth up to which anything is fused."""
+        return self.depth_max_m * self.sure_reach
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:

@@ -25,6 +25,7 @@ OLD_NAMES = OldNames(
         "geometry.mover_sharpness": "geometry.dynamic_mask_sharpness",
         "geometry.shake_rotation_share": "geometry.jitter_rotation_ratio",
         "geometry.shake_direction_share": "geometry.jitter_direction_ratio",
+        "geometry.turn_rotation_share": "geometry.turn_rotation_ratio",
         "geometry.jolt_rotation_share": "geometry.neighbour_rotation_ratio",
         "geometry.jolt_direction_share": "geometry.neighbour_direction_ratio",
         "bridging": "gaps",

@@ -54,6 +54,9 @@ class GeometryConfig(Section):
     jitter_direction_ratio: float = Field(
         default=8.5, ge=0, description="sigma of the translation direction over the rotation jitter of the camera"
     )
+    turn_rotation_ratio: float = Field(
+        default=0.007, ge=0, description="rotation sigma over the rotation angle of the step"
+    )
     neighbour_rotation_ratio: float = Field(
         default=0.25, ge=0, description="rotation sigma over the difference to the rotations of neighbouring steps"
     )

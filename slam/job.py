@@ -105,8 +105,9 @@ def _run(job: Job, folder: RunFolder) -> None:
     numbers = write_map(folder, result, job.recording, job.progress)
     depth = quality.summary(job.settings.depth.refine != "none")
     folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
-    views = write_map_views(folder, job.settings.output.viewer_triangles)
-    if job.settings.output.report:
+    output = job.settings.output
+    views = write_map_views(folder, output.viewer_triangles if output.report else 0)
+    if output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, views)
     if job.rerun is not None:

@@ -40,12 +40,13 @@ def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
     if isinstance(truth, str) or sequence.reference is None or not isinstance(sequence, HasTrueDepth):
         raise SlamError(f"true poses and depth maps are wanted: {truth if isinstance(truth, str) else truth.name}")
     intrinsics = sequence.intrinsics
+    exact = np.zeros((intrinsics.height, intrinsics.width), np.float32)
     tsdf_map = TsdfMap(config, intrinsics)
     for frame in map(int, truth.frames):
         size = intrinsics.width, intrinsics.height
         depth = cv2.resize(sequence.true_depth(frame).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)
-        tsdf_map.integrate(depth, image, sequence.reference[frame], frame=frame)
+        tsdf_map.integrate(depth, image, sequence.reference[frame], exact, frame)
     found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points_world})
     numbers = statistics(found.distances["map"])
     score = numbers["f_score"]

@@ -161,6 +161,8 @@ def _decode(where: str, data: bytes, flags: int) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
+        if "MAX_IMAGE_PIXELS" in str(error):
+            raise DataError(f"{where} has more pixels than any camera: resize it, or leave it out") from error
         raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
     if image is None:
         raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
+from erfsfm.files import read_bytes
 
 VELODYNE_COLUMNS = 4
 _FARTHEST_M = 1e4
+_MOST_BYTES = 2**28  # 16 million points of four numbers
 
 
 def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.float64]:
@@ -20,11 +22,12 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
         DataError: it cannot be read, is cut off, or has none of the points of `measured_points`.
     """
     try:
-        values = np.fromfile(path, dtype=np.float32)
+        content = read_bytes(path, _MOST_BYTES)
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror}); restore the scan or remove the folder") from error
+    values = np.frombuffer(content[: len(content) // 4 * 4], dtype=np.float32)
     if len(values) == 0 or len(values) % columns:
-        raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {values.nbytes} bytes")
+        raise DataError(f"{path} is no Velodyne scan: wanted {columns} float32 a point; got {len(content)} bytes")
     return measured_points(values.reshape(-1, columns)[:, :3].astype(np.float64), path)
 
 

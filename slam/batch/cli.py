@@ -43,7 +43,7 @@ def batch(
     from slam.batch.cluster import workers as dask_workers
     from slam.batch.execution import Limits, run_drives
     from slam.batch.manifest import drives_of
-    from slam.batch.summary import CSV, PAGE, failure_table, summary_table, write_summary
+    from slam.batch.summary import CSV, PAGE, check_output, failure_table, summary_table, write_summary
 
     if memory and not Path("/proc/self/statm").exists():
         raise SlamError("--memory needs Linux: leave it out here")
@@ -53,6 +53,7 @@ def batch(
     options += ["--seed", str(seed), "--device", device]
     planned = drives_of(drives, sequence or ["all"], options)
     each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
+    check_output(output)
     output.mkdir(parents=True, exist_ok=True)
     with dask_workers(min(workers, len(planned)), scheduler) as spread, progress_bar() as progress:
         outcomes = run_drives(planned, output, Limits(each, memory), spread, progress)

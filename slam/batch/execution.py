@@ -82,6 +82,8 @@ def run_drive(drive: Drive, output: Path, limits: Limits) -> Outcome:
     if exceeded:
         return Outcome(drive, folder, "failed", exceeded)
     reason = _reason(process.returncode, log)
+    if not reason and not _is_whole(folder, arguments):
+        reason = "it ended well and left no whole run: leave out options that only ask something"
     return Outcome(drive, folder, "failed" if reason else "whole", reason)
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 CSV = "drives.csv"
 PAGE = "index.html"
 _ALIGNED = ("trajectories", "optimised", "align")
+_FIRST = ("drive", "status", "reason")
 # column, its place in metrics.json, decimals on the page
 _COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("sequence", ("sequence", "name"), 0),
@@ -44,10 +45,24 @@ _COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
 _TEMPLATES = Environment(loader=PackageLoader("slam", "batch"), autoescape=True, undefined=StrictUndefined)
 
 
+def check_output(output: Path) -> None:
+    """Check that a batch may be written to a folder.
+
+    Raises:
+        RunError: a file, or a folder of other files with the names of a summary.
+    """
+    if output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: give a folder as --output")
+    for name, mark in ((CSV, ",".join(_FIRST)), (PAGE, "<title>erfsfm-slam: ")):
+        path = output / name
+        if path.is_file() and mark.encode() not in path.read_bytes():
+            raise RunError(f"{path} is none of ours and would be replaced: choose another --output")
+
+
 def write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
     """Write ``drives.csv`` and ``index.html``, each whole or not at all."""
     rows = [_row(outcome) for outcome in outcomes]
-    names = ["drive", "status", "reason", *(name for name, _, _ in _COLUMNS)]
+    names = [*_FIRST, *(name for name, _, _ in _COLUMNS)]
 
     def fill(path: Path) -> None:
         with path.open("w", newline="", encoding="utf-8") as file:

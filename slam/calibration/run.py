@@ -10,7 +10,7 @@ import yaml
 
 from erfsfm.errors import DataError
 from erfsfm.figure_file import require_figure
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.camera_file import CameraFile, read_camera_file
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images
 from erfsfm.readers.numbering import NumberedFiles
@@ -58,6 +58,7 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
+    _refuse_other_kind(output)
     picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
     require_figure(picture)
     images, own_fps = _open(recording)
@@ -85,6 +86,17 @@ def calibrate_camera(
     write_picture(picture, fit, camera, images)
     write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
     return CalibrationFiles(fit, camera, output, picture)
+
+
+def _refuse_other_kind(output: Path) -> None:
+    if output.is_dir():
+        raise CalibrationError(f"--output {output} is a folder: give the name of a file to write")
+    if not output.is_file() or not output.stat().st_size:
+        return
+    try:
+        read_camera_file(output)
+    except DataError as error:
+        raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
 
 
 def _among_images(output: Path) -> bool:

@@ -11,13 +11,15 @@ from scipy.stats import norm
 LEAST_M, LARGEST_M = 1.0, 80.0
 COVERAGES = (50, 90, 95)
 _PIXELS_OF_A_FRAME = 3000
+_MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, and so on
 
 
 class DepthErrors:
-    """Collects the pixels with truth between 1 and 80 m of many frames."""
+    """Collects the pixels with truth between 1 and 80 m of many frames, of very many evenly spread ones."""
 
     def __init__(self) -> None:
         self._depths: list[NDArray[np.float32]] = []
+        self._frames, self._step = 0, 1
 
     def add(
         self,
@@ -35,6 +37,9 @@ class DepthErrors:
         v, u = np.nonzero((truth >= LEAST_M) & (truth <= LARGEST_M))
         if len(v) == 0:
             return
+        self._frames += 1
+        if (self._frames - 1) % self._step:
+            return
         thinned = np.linspace(0, len(v) - 1, min(len(v), _PIXELS_OF_A_FRAME)).astype(int)
         v, u = v[thinned], u[thinned]
         (height, width), (true_height, true_width) = depth.shape, truth.shape
@@ -42,6 +47,8 @@ class DepthErrors:
         sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
         known = np.isfinite(depth[at]) & (depth[at] > 0)
         self._depths.append(np.stack([depth[at], truth[v, u], sigma])[:, known].astype(np.float32))
+        if len(self._depths) > _MOST_FRAMES:
+            self._depths, self._step = self._depths[::2], 2 * self._step
 
     def summary(self) -> dict[str, Any] | None:
         """The numbers over all pixels; None where no frame had truth.

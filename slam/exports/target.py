@@ -1,4 +1,4 @@
-"""Where a part of a run may be written: never over the run itself, nor over a file of another kind."""
+"""Where a part of a run may be written: never over a run or its recording, nor over a file of another kind."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from slam.exports.raster import RASTER
 from slam.formats.colmap import MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
+from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
-from slam.results.output import is_own
+from slam.results.replaced import check_replaced, check_replaced_trajectory
 
 _FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
 _NAMES = {
@@ -19,15 +20,20 @@ _NAMES = {
     "raster": ("height.png", "colour.png"),
 }
 _OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": lambda output: (output / RASTER).is_file()}
-_TEXTS = {"trajectory": (".txt", ".tum", ".kitti"), "graph": (".g2o", ".txt")}
+_BEGINNINGS = {
+    "mesh": {".ply": b"ply", ".obj": b"# erfsfm-slam", ".glb": b"glTF", ".gltf": b"{"},
+    "cloud": {".ply": b"ply", ".las": b"LASF", ".laz": b"LASF"},
+    "graph": {".g2o": b"VERTEX_SE3", ".txt": b"VERTEX_SE3"},
+    "occupancy": {".yaml": b"", ".pgm": b"P5"},
+}
 
 
 def check_target(folder: RunFolder, what: str, output: Path) -> None:
     """Check an ``output`` before anything is computed.
 
     Raises:
-        RunError: it is a folder where a file is wanted or the reverse, a file of the run itself, or what would be
-            replaced is something else.
+        RunError: it is a folder where a file is wanted or the reverse, a file of a run or of the run's recording, or
+            what would be replaced is something else.
     """
     if what in _FOLDERS:
         if output.exists() and not output.is_dir():
@@ -36,14 +42,21 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
         if others and not _OURS[what](output):
             raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
         return
-    if output.is_dir():
-        raise RunError(f"{output} is a folder: give the name of a file to write")
-    if is_own(output.name) and output.resolve().parent == folder.path.resolve():
-        raise RunError(f"{output} is a file of the run itself: choose another --output")
-    if not output.is_file():
-        return
-    suffixes = _TEXTS.get(what, (output.suffix,))
-    if output.suffix.lower() not in suffixes:
-        raise RunError(f"{output} exists and does not end in {' or '.join(suffixes)}: choose another --output")
-    if what == "occupancy" and output.suffix.lower() == ".yaml" and not describes_map(output):
+    if what == "trajectory":
+        check_replaced_trajectory(output)
+    else:
+        check_replaced(output, _BEGINNINGS[what])
+    if what == "occupancy" and output.suffix.lower() == ".yaml" and output.is_file() and not describes_map(output):
         raise RunError(f"{output} exists and is no map of ROS: choose another --output")
+    if output.is_file() and _is_in_recording(folder, output):
+        raise RunError(f"{output} belongs to the recording of the run: choose another --output")
+
+
+def _is_in_recording(folder: RunFolder, output: Path) -> bool:
+    """Whether a file lies in the folder that was run, and was there before the run."""
+    began = folder.path / "config.yaml"
+    if not began.is_file() or output.stat().st_mtime > began.stat().st_mtime:
+        return False
+    recording, _ = lookup(folder.metrics(), "provenance", "recording")
+    dataset = (recording or {}).get("dataset")
+    return dataset is not None and output.resolve().is_relative_to(Path(dataset).resolve())

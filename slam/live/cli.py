@@ -21,7 +21,7 @@ def live(
     output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<name>")] = None,
     publish: Annotated[str | None, typer.Option(help="also over ZeroMQ, e.g. tcp://127.0.0.1:5555 (extra)")] = None,
     view: Annotated[bool, typer.Option("--view", help="open the rerun viewer (extra)")] = False,
-    wait: Annotated[float, typer.Option(min=0.1, help="seconds without an image that end the stream")] = 10.0,
+    wait: Annotated[float, typer.Option(min=0.1, max=1e6, help="seconds without an image that end the stream")] = 10.0,
     weights: Annotated[str, typer.Option(help="as for run")] = "default",
     config: Annotated[str | None, typer.Option(help="as for run")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
@@ -11,6 +12,8 @@ from slam.errors import SlamError
 from slam.pipeline.tracker import Tracked
 from slam.runtime.imports import import_zmq
 from slam.trajectory import Trajectory
+
+_LAST_PORT = 65535
 
 Emit = Callable[[dict[str, Any]], None]
 
@@ -48,6 +51,11 @@ def emitters(stream: TextIO, address: str | None) -> Iterator[Emit]:
             socket.bind(address)
         except zmq.ZMQError as error:
             raise SlamError(f"--publish {address} cannot be bound: {error}; write tcp://127.0.0.1:5555") from error
+        port = re.fullmatch(r"tcp://.*:(\d+)", address)
+        if port and int(port[1]) > _LAST_PORT:  # ZeroMQ binds the remainder
+            raise SlamError(
+                f"--publish {address} cannot be bound: ports end at {_LAST_PORT}; write tcp://127.0.0.1:5555"
+            )
 
         def both(message: dict[str, Any]) -> None:
             _write(stream, message)

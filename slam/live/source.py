@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Any, Protocol
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 
 from erfsfm.errors import DataError
+from erfsfm.files import open_written
 from erfsfm.readers.images import read_image
 from erfsfm.readers.video import VIDEO_SUFFIXES
 from slam.errors import SequenceError, sequence_errors
@@ -104,8 +107,8 @@ class FolderSource:
 class VideoSource:
     """What OpenCV opens: a camera by number, a stream by address, a pipe, or a file, which plays at its own speed."""
 
-    def __init__(self, name: str) -> None:
-        """Open it.
+    def __init__(self, name: str, wait_s: float) -> None:
+        """Open it; wait up to ``wait_s`` for somebody who writes to a pipe.
 
         Raises:
             SequenceError: it cannot be opened or gives no image.
@@ -113,7 +116,8 @@ class VideoSource:
         self._name = name
         self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
         self.fps = DEFAULT_FPS
-        self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(name)
+        with _kept_open(name, wait_s):
+            self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(name)
         self._first = self._next()
         if self._first is None:
             raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
@@ -135,6 +139,22 @@ class VideoSource:
         return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
 
 
+@contextmanager
+def _kept_open(name: str, wait_s: float) -> Iterator[None]:
+    """Hold a pipe that is written to, until OpenCV has it: OpenCV itself would wait for ever."""
+    if not Path(name).is_fifo():
+        yield
+        return
+    try:
+        descriptor = open_written(name, wait_s)
+    except OSError as error:
+        raise SequenceError(f"no image comes from {name}: it is {error.strerror}") from error
+    try:
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def open_source(camera: str, wait_s: float) -> Source:
     """A source by what the user named; its ``fps``, of files, may be set before the first image.
 
@@ -142,4 +162,4 @@ def open_source(camera: str, wait_s: float) -> Source:
         SequenceError: it cannot be opened, or no image comes within ``wait_s``.
     """
     folder = Path(camera)
-    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera)
+    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)

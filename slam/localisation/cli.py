@@ -34,15 +34,19 @@ def localize(
 
     Example: erfsfm-slam localize photos --map results/latest --output photos.tum
     """
+    from slam.errors import RunError
     from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
     from slam.localisation.localiser import image_numbers, localise
-    from slam.localisation.tables import check_output, localisation_json, localisation_table, write_localisations
+    from slam.localisation.tables import localisation_json, localisation_table, write_localisations
     from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
+    from slam.results.replaced import check_replaced_trajectory
 
     run_folder = RunFolder.open(map)
     if output is not None:
-        check_output(output)
+        check_replaced_trajectory(output)
+        if truth is not None and output.resolve() == truth.resolve():
+            raise RunError(f"--output {output} is the file of --truth: choose another --output")
     numbers = image_numbers(images, frames, every)
     known = None if truth is None else (MapTruth.of(run_folder), true_poses(truth, images, numbers))
     with progress_bar() as progress:

@@ -64,18 +64,6 @@ def _entry(each: Localisation) -> dict[str, Any]:
     return entry | pose | {"nearest_frame": each.nearest_frame, "inliers": each.inliers}
 
 
-def check_output(path: Path) -> None:
-    """Check that the poses may be written there.
-
-    Raises:
-        RunError: it is a folder, or a file of another kind, such as one of the images.
-    """
-    if path.is_dir():
-        raise RunError(f"{path} is a folder: give the name of a file to write")
-    if path.is_file() and path.suffix not in (".tum", ".txt"):
-        raise RunError(f"{path} exists and does not end in .tum or .txt: choose another --output")
-
-
 def write_localisations(path: Path, found: Sequence[Localisation], numbers: Sequence[int] | None = None) -> None:
     """Write the poses found as a TUM file; the stamp is the number of the image, by default its place in the list.
 

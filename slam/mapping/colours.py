@@ -20,9 +20,9 @@ _EXPOSURE_PRIOR = 0.01  # of equal exposures, over the information in the bright
 class Painter:
     """Colours points by the views of all submaps."""
 
-    def __init__(self, store: SubmapStore, voxel_size_m: float, depth_max_m: float) -> None:
+    def __init__(self, store: SubmapStore, voxel_size_m: float, reach_m: float) -> None:
         """Even out the exposure of all views."""
-        self._store, self._voxel, self._range = store, voxel_size_m, depth_max_m
+        self._store, self._voxel, self._range = store, voxel_size_m, reach_m
         self._gains = np.exp(-evened(store.brightness_steps))
 
     def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:

@@ -16,6 +16,8 @@ from slam.se3 import FloatArray, invert
 Mask = NDArray[np.bool_]
 _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
+_MOST_SIGMA = 1e3  # relative, in place of infinity where depth is unknown
+_EXACT = 0.01  # relative sigma below which depth is not a network's: border, sky and edges are not in doubt
 FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agreement")
 
 
@@ -56,15 +58,18 @@ class DepthFilters:
         """The depth to fuse ``(H, W)``, 0 elsewhere; ``other`` sees the same place from another position."""
         config, depth = self._config, view.depth
         everything = np.ones(depth.shape, dtype=bool)
-        sigma = view.relative_sigma
+        sigma = np.full_like(depth, np.nan) if view.relative_sigma is None else view.relative_sigma
+        is_exact = sigma < _EXACT
+        is_sure = depth * np.minimum(sigma, _MOST_SIGMA) <= config.sure_sigma_m
+        farthest = np.where(is_sure, config.reach_m, config.depth_max_m)
         masks = (
             depth > 0,
-            self._inside,
+            self._inside | is_exact,
             self._above_bonnet,
-            ~self._is_sky(view.image),
-            (depth >= config.depth_min_m) & (depth < config.depth_max_m),
-            everything if sigma is None else sigma <= config.max_relative_sigma,
-            ~_at_edges(self.trusted(view), config.max_depth_step),
+            ~self._is_sky(view.image) | is_exact,
+            (depth >= config.depth_min_m) & (depth < farthest),
+            everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
+            ~_at_edges(self.trusted(view), config.max_depth_step) | is_exact,
             everything if other is None else self._agrees(view, other),
         )
         left = everything
@@ -98,6 +103,8 @@ class DepthFilters:
         """
         config, horizon = self._config, int(np.clip(self._camera.cy, 0, image.shape[0]))
         sky = np.zeros(image.shape[:2], dtype=bool)
+        if not horizon:
+            return sky
         red, green, blue = (each.astype(np.int16) for each in cv2.split(image[:horizon]))
         is_blue = (blue - red >= config.sky_blueness) & (blue > _DARK_BLUE)
         sky[:horizon] = (cv2.min(cv2.min(red, green), blue) >= config.sky_brightness) | is_blue

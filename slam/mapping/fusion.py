@@ -30,10 +30,10 @@ def new_grid(voxel_size_m: float, capacity: int = _CAPACITY) -> Any:
 class Fusion:
     """The voxels of one submap."""
 
-    def __init__(self, voxel_size_m: float, truncation_voxels: float, depth_max_m: float, camera: Intrinsics) -> None:
-        """An empty submap of depth maps of this camera, metres."""
+    def __init__(self, voxel_size_m: float, truncation_voxels: float, reach_m: float, camera: Intrinsics) -> None:
+        """An empty submap of depth maps of this camera; depth beyond ``reach_m`` is not fused."""
         self._grid = new_grid(voxel_size_m)
-        self._truncation, self._depth_max = truncation_voxels, depth_max_m
+        self._truncation, self._reach = truncation_voxels, reach_m
         K = camera.K
         # Open3D truncates projected pixels where we round them: its pixel centres are at (0.5, 0.5)
         K[:2, 2] += 0.5
@@ -52,7 +52,7 @@ class Fusion:
         o3d = import_open3d()
         image = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
         T_camera_world = o3d.core.Tensor(invert(T_world_camera))  # what Open3D calls extrinsic
-        how = (self._K, T_camera_world, 1.0, self._depth_max, self._truncation)
+        how = (self._K, T_camera_world, 1.0, self._reach, self._truncation)
         self._grid.integrate(self._grid.compute_unique_block_coordinates(image, *how), image, *how)
         return True
 

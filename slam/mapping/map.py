@@ -202,7 +202,7 @@ class TsdfMap:
         kept = self._filters.kept(view, other)
         config = self._config
         if self._stretch is None:
-            limits = config.truncation_voxels, config.depth_max_m
+            limits = config.truncation_voxels, config.reach_m
             self._stretch = _Stretch(Fusion(config.voxel_size_m, *limits, self._intrinsics))
         stretch = self._stretch
         if not stretch.fusion.integrate(kept, view.T_world_camera):

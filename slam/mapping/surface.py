@@ -150,7 +150,7 @@ class MapSurface:
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
 
     def _extract(self, store: SubmapStore, config: MappingConfig, progress: Progress | None) -> None:
-        painter = Painter(store, config.voxel_size_m, config.depth_max_m)
+        painter = Painter(store, config.voxel_size_m, config.reach_m)
         tiles = store.tiles()
         least_weight = min(config.min_weight, float(store.fused))  # with fewer frames nothing would be extracted
         for done, tile in enumerate(tiles, 1):

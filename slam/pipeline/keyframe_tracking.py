@@ -85,7 +85,7 @@ class KeyframeTracking:
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
             self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._seed)
-        corners = corners_of(frame.grey)
+        corners = corners_of(frame.grey, self._config)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
         if found is None:

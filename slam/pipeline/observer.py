@@ -271,9 +271,8 @@ class Observer:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         with self._stopwatch.stage("road"):
             self._seen.roads[frame.index] = road = self._plane.fit(depth)
-        height = road.height_unscaled if isinstance(road, GroundPlane) else None
         self._keyframes.learn(frame, depth)
-        self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
+        height = self._remember(frame, depth, road)
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
             with self._stopwatch.stage("loops"):
                 self._seen.views.append(self._features.view(frame, depth, height))
@@ -284,8 +283,13 @@ class Observer:
         if recent.depth is not None:
             return recent.depth, recent.height
         depth = self._networks.submit(self._predictor.depth, recent.frame).result()
-        road = self._plane.fit(depth)
-        return depth, road.height_unscaled if isinstance(road, GroundPlane) else None
+        return depth, self._remember(recent.frame, depth, self._plane.fit(depth))
+
+    def _remember(self, frame: Frame, depth: DepthMap, road: GroundPlane | MeasurementFailure) -> float | None:
+        """Keep the depth of a recent frame, and the camera height that is returned."""
+        height = road.height_unscaled if isinstance(road, GroundPlane) else None
+        self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
+        return height
 
     def _measure_step(self, previous: RecentFrame, current: Frame) -> Motion | None:
         """The motion from the frame before; None where it could not be measured or triangulated no point."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
 from erfsfm.readers.images import natural_key, read_values
 from erfsfm.readers.numbering import by_name
 from slam.config import DepthConfig
@@ -91,7 +92,7 @@ class DepthFolder:
             if path is None:  # the image may be missing as well
                 continue
             try:
-                content = path.read_bytes()
+                content = read_bytes(path, MAX_IMAGE_BYTES)
             except OSError as error:
                 raise SlamError(f"cannot read depth {path}: {error.strerror or error}") from error
             found = header(path, content)
@@ -135,7 +136,7 @@ def _frames_before(folder: Path, suffix: str, found: int, numbers: FrameNumbers)
 
 def _read_npy(path: Path) -> NDArray[Any]:
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_IMAGE_BYTES)
         _header_of_npy(path, content)
         return _plane(np.load(io.BytesIO(content), allow_pickle=False))
     except OSError as error:

@@ -18,6 +18,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
+from erfsfm.files import read_bytes
 from erfsfm.inference import NETWORK_THREADS
 from erfsfm.onnx_session import open_session
 from erfsfm.readers.images import resize_image
@@ -27,6 +28,7 @@ from slam.frames import Frame, Image
 from slam.prediction.depth_source import Disparity, Kind, disparity_of
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
+_MOST_BYTES = 2**31  # of a message of Protocol Buffers
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _OWN_INPUT = "RGB in [-1, 1]"  # as `erfsfm export` writes it into the metadata
 
@@ -101,7 +103,7 @@ class OnnxDepth:
 
     def _content(self) -> bytes:
         try:
-            return self._path.read_bytes()
+            return read_bytes(self._path, _MOST_BYTES)
         except OSError as error:
             raise SlamError(f"cannot read {self._path} ({error.strerror}): check depth.source=onnx:FILE") from error
 

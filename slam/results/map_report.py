@@ -26,7 +26,7 @@ _FILTERS = {
     "border": "left, right and upper border of the image (mapping.border)",
     "bonnet": "lower border, the car's own bonnet (mapping.bonnet)",
     "sky": "bright or blue above the horizon (mapping.sky_brightness, mapping.sky_blueness)",
-    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m)",
+    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m, mapping.sure_reach)",
     "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
     "edge": "at a step of depth (mapping.max_depth_step)",
     "agreement": "the keyframe before does not agree (mapping.consistency)",

@@ -149,6 +149,17 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if is_own(path.name) or _is_rest(path)]
 
 
+def refuse_file_of_run(path: Path) -> None:
+    """Refuse to write over, or among, what a run has written under the names of its own files.
+
+    Raises:
+        RunError: ``path`` has such a name in the folder of a run.
+    """
+    folder = path.parent
+    if is_own(path.name) and ((folder / METRICS).is_file() or (folder / ESTIMATE).is_file()):
+        raise RunError(f"{path} is a file of a run: choose another --output")
+
+
 def is_own(name: str) -> bool:
     """Whether a run writes a file of this name."""
     return name in _OWN or JOURNAL_FILE.fullmatch(name) is not None

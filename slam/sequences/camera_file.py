@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Protocol
 
-from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile, read_camera_file
+from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
 from slam.errors import SequenceError, sequence_errors
 
 DEFAULT_FPS = 10.0
@@ -133,13 +133,14 @@ def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
             f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
         )
     focal_px = images.width / 2 / math.tan(math.radians(fov_deg) / 2)
-    return CameraFile(
-        width=images.width,
-        height=images.height,
-        fx=focal_px,
-        fy=focal_px,
-        cx=(images.width - 1) / 2,
-        cy=(images.height - 1) / 2,
-        fps=fps,
-        source=f"a horizontal field of view of {fov_deg:g} degrees",
-    )
+    keys = {
+        "width": images.width,
+        "height": images.height,
+        "fx": focal_px,
+        "fy": focal_px,
+        "cx": (images.width - 1) / 2,
+        "cy": (images.height - 1) / 2,
+        "fps": fps,
+        "source": f"a horizontal field of view of {fov_deg:g} degrees",
+    }
+    return camera_of(keys, f"--camera {text}")

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from erfsfm.errors import ErfsfmError
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile, camera_of
 from erfsfm.readers.numbering import by_table
 from erfsfm.yaml_file import parse_yaml
@@ -104,7 +105,7 @@ class _Sensor:
 
 def _read_sensor(path: Path) -> _Sensor:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         # OpenCV's "%YAML:1.0" is no directive of YAML
         keys = parse_yaml(text.partition("\n")[2] if text.startswith("%") else text)
     except (OSError, UnicodeDecodeError, ErfsfmError) as error:
@@ -142,7 +143,7 @@ def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> 
 def _rows(table: Path) -> list[list[str]]:
     """The rows of a table of EuRoC, comments left out; at least one."""
     try:
-        lines = table.read_text(encoding="utf-8").splitlines()
+        lines = read_text(table).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"cannot read {table}: {error}") from error
     rows = [line.split(",") for line in lines if line.strip() and not line.startswith("#")]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from slam.errors import SequenceError
 from slam.geodesy import GpsTrack
 from slam.se3 import FloatArray
@@ -34,7 +35,7 @@ def read_gps(path: Path) -> GpsTrack:
         SequenceError: the file cannot be read or holds something else, with the row.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, "utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     lines = text.splitlines()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from slam import se3
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
@@ -24,7 +25,7 @@ def read_pose_files(paths: list[Path]) -> FloatArray:
         if not path.is_file():
             continue
         try:
-            pose = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)
+            pose = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
         except (OSError, ValueError) as error:
             raise SequenceError(f"{path} must hold the 4 x 4 numbers of a pose: {error}") from error
         if not np.isfinite(pose).all():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile, camera_of
 from erfsfm.readers.images import has_images, list_images
 from erfsfm.readers.numbering import by_name
@@ -63,7 +64,7 @@ def open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
 def _camera(path: Path, images: Sized) -> CameraFile:
     """The camera of a file of 4 x 4 numbers."""
     try:
-        K = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(4, 4)
+        K = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
         raise SequenceError(f"{path} must hold the 4 x 4 numbers of a camera: {error}") from error
     keys = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

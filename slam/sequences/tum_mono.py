@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.files import read_text
 from erfsfm.readers.camera_file import CameraFile, camera_of
 from erfsfm.readers.images import has_images, list_images
 from erfsfm.readers.numbering import NumberedFiles, by_name
@@ -55,7 +56,7 @@ def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
 def _camera(path: Path, fps: float) -> CameraFile:
     """Focal lengths and principal point over the image's size, and the angle of the lens; then the size."""
     try:
-        first, second = path.read_text(encoding="utf-8").splitlines()[:2]
+        first, second = read_text(path).splitlines()[:2]
         words = first.split()
         fx, fy, cx, cy, angle = (float(word) for word in words[words[0] == _LENS :])
         width, height = (int(word) for word in second.split())
@@ -71,7 +72,7 @@ def _camera(path: Path, fps: float) -> CameraFile:
 def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
     """Rows of number, seconds and perhaps exposure."""
     try:
-        rows = [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [line.split() for line in read_text(path).splitlines()]
         stamps = np.array([float(row[1]) for row in rows if row])
     except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
         raise SequenceError(f"{path} needs rows of number, seconds and exposure: {error}") from error
@@ -83,7 +84,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     if not path.is_file():
         return None
     try:
-        rows = np.array([line.split() for line in path.read_text(encoding="utf-8").splitlines() if line], np.float64)
+        rows = np.array([line.split() for line in read_text(path).splitlines() if line], np.float64)
         rows = rows.reshape(len(rows), 8)[np.isfinite(rows).all(axis=1)]
         T_known = poses_of(rows[:, 1:4], rows[:, 4:])
     except (OSError, UnicodeDecodeError, ValueError) as error:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,6 +38,7 @@ Answer = tuple[NDArray[Any], ...]
 GetOrCompute = Callable[[str, Sequence[Given], Callable[[], Answer]], Answer]
 
 _FORMAT = b"erfsfm-slam cache 2"
+_SUBFOLDER = re.compile("[0-9a-f]{2}")
 _CHECK_BYTES = 16
 _LENGTH_BYTES = 4
 
@@ -53,14 +55,17 @@ class DiskCache:
         """Use a folder, made where it is missing.
 
         Raises:
-            SlamError: the folder cannot be made.
+            SlamError: the folder cannot be made, or is that of something else, such as a recording or a run.
         """
         self._folder = folder
         self._is_writable = True
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            names = [path.name for path in folder.iterdir()]
         except OSError as error:
             raise SlamError(f"no cache can be made in {folder}: {error.strerror or error}") from error
+        if names and not any(_SUBFOLDER.fullmatch(name) for name in names):
+            raise SlamError(f"{folder} is not empty and holds no cache of erfsfm-slam: choose another --cache")
 
     def read(self, key: str) -> Answer | None:
         """An entry, or None where it is missing or damaged."""

@@ -96,6 +96,8 @@ def test_an_error_names_its_origin(tmp_path: Path) -> None:
     assert "a.yaml should be a valid integer" in refusal(path)
     path.write_text("{}")
     assert "'flow.window_px' in --set flow.window_px=x should be" in refusal(path, "flow.window_px=x")
+    assert "in --set flow.window_px.x=3 should be" in refusal(path, "flow.window_px.x=3")
+    assert "in --set flow={window_px: x} should be" in refusal(path, "flow={window_px: x}")
     assert len(refusal(path, f"flow.window_px=[{'1,' * 5000}]")) < 10_500  # of which the override itself is most
 
 

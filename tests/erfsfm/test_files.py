@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import threading
 from pathlib import Path
 
 import pytest
 
-from erfsfm.files import write_atomically
+from erfsfm import files
+from erfsfm.files import read_text, write_atomically
 
 
 @pytest.mark.parametrize("through", ["itself", "a link"])
@@ -32,3 +34,15 @@ def test_a_disk_that_is_full_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"depth\.png: cannot be written \(No space left on device\)$"):
         write_atomically(target, fill)
     assert list(target.parent.iterdir()) == []
+
+
+def test_a_pipe_is_read_if_something_is_written_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=lambda: pipe.write_text("a\r\nb"))
+    writer.start()
+    assert read_text(pipe) == "a\nb"
+    writer.join()
+    monkeypatch.setattr(files, "WAIT_FOR_PIPE_S", 0.01)
+    with pytest.raises(OSError, match="a pipe that nothing was written to"):
+        read_text(pipe)

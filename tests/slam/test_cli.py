@@ -369,6 +369,9 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
     assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
     assert call("localize", images, "--map", images)[0] == 1
+    reference = Path("run/reference.tum.txt").read_bytes()
+    code, _, err = call("localize", images, "--map", "run", "--output", "run/reference.tum.txt")
+    assert code == 1 and "is a file of a run" in err and Path("run/reference.tum.txt").read_bytes() == reference
 
 
 def test_plot(call: Call, make_run: MakeRun) -> None:

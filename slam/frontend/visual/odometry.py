@@ -66,7 +66,6 @@ class OdometryState:
     tracker: TrackerState
     dynamic_mask: DynamicMask
     history: MotionHistory
-    last_frame: int = -1
     last: Motion | None = None
 
 
@@ -104,17 +103,16 @@ class VisualOdometry:
         depth_previous_unscaled: DepthMap,
         height_unscaled: float | None = None,
     ) -> Motion | MeasurementFailure:
-        """Measure the motion between two frames; of several to one frame, only the first updates the state.
+        """Measure the motion between two frames, the next two of the sequence or with others left out between them.
 
         Args:
             previous: the earlier frame, at the size of the intrinsics.
-            current: a later frame.
+            current: a later frame, measured once.
             depth_previous_unscaled: learned z-depth ``(H, W)`` of the earlier frame.
             height_unscaled: camera height in the same unit; where known, farther depths than
                 ``max_depth_heights`` of it are not trusted.
         """
-        is_first = self._state.last_frame != current.index
-        flow = self._predicted_flow(previous, current, depth_previous_unscaled) if is_first else None
+        flow = self._predicted_flow(previous, current, depth_previous_unscaled)
         tracks = self._tracker.track(previous, current, flow)
         if len(tracks) < self._config.min_inliers:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
@@ -124,12 +122,10 @@ class VisualOdometry:
             ends = (previous.index, current.index)
             measured = (
                 self._still(ends, tracks, depth)
-                or self._by_essential(ends, tracks, learned, depth, is_first)
+                or self._by_essential(ends, tracks, learned, depth)
                 or self._by_points(ends, tracks, depth)
             )
-        if is_first:
-            last = measured if isinstance(measured, Motion) else None
-            self._state = replace(self._state, last_frame=current.index, last=last)
+        self._state = replace(self._state, last=measured if isinstance(measured, Motion) else None)
         return measured
 
     def relative_rotation(
@@ -195,9 +191,7 @@ class VisualOdometry:
         sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
         return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE))
 
-    def _by_essential(
-        self, ends: Ends, tracks: Tracks, learned: FloatArray, depth: FloatArray, is_first: bool
-    ) -> Motion | None:
+    def _by_essential(self, ends: Ends, tracks: Tracks, learned: FloatArray, depth: FloatArray) -> Motion | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
         matches = self._matches(tracks, learned, self._state.dynamic_mask)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
@@ -211,7 +205,7 @@ class VisualOdometry:
             return None
         two_view, history = estimated
         motion = self._triangulated(ends, tracks, matches, depth, two_view)
-        if motion is not None and is_first:
+        if motion is not None:
             mask = self._state.dynamic_mask.updated(tracks.current, two_view.inliers)
             self._state = replace(self._state, dynamic_mask=mask, history=history)
         return motion

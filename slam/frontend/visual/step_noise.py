@@ -52,13 +52,14 @@ def inflate_step_sigmas(
     directions = {k: _unit(invert(T)[:3, 3]) for k, T in T_previous_current.items()}
     jitter = _unexplained(rotation_jitter(rotations), np.median([own[k].rotation for k in rotations], axis=0))
     noise = {}
-    for k in rotations:
+    for k, rotation in rotations.items():
         rotation_residual, direction_residual = (
             _unexplained(neighbour_residual(values, k), _NEIGHBOUR_RESIDUAL_OF_NOISE * known)
             for values, known in ((rotations, own[k].rotation), (directions, own[k].direction))
         )
         rotation_sigmas = [
             config.jitter_rotation_ratio * jitter,
+            config.turn_rotation_ratio * rotation,
             config.neighbour_rotation_ratio * rotation_residual,
         ]
         across = np.sqrt(np.maximum(1.0 - directions[k] ** 2, 0.0))

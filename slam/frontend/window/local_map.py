@@ -36,7 +36,6 @@ _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
-MAX_CORNERS = 500  # largest number of corners of a keyframe
 CORNER_SPACING_PX = 12.0  # least distance between corners, pixels
 
 
@@ -78,10 +77,10 @@ class WindowKeyframe:
         )
 
 
-def corners_of(grey: Grey) -> Pixels:
+def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
     """Corners ``(M, 2)`` of an image without tracks."""
     none = np.zeros((0, 2), np.float32)
-    return new_corners(grey, none, MAX_CORNERS, CORNER_SPACING_PX)
+    return new_corners(grey, none, config.max_corners, CORNER_SPACING_PX)
 
 
 @dataclass

@@ -22,7 +22,6 @@ from slam.frontend.window.flow import Pixels, flow, new_corners
 from slam.frontend.window.initialisation import View, first_points
 from slam.frontend.window.local_map import (
     CORNER_SPACING_PX,
-    MAX_CORNERS,
     LocalMap,
     TrackIds,
     WindowKeyframe,
@@ -265,7 +264,7 @@ class WindowOdometry:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
-        fresh = new_corners(frame.grey, pixels, MAX_CORNERS - len(pixels), CORNER_SPACING_PX)
+        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels), CORNER_SPACING_PX)
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

@@ -80,7 +80,7 @@ def test_wrong_values(tmp_path: Path, camera_yaml: str, old: str, new: str, mess
 
 
 def test_is_frozen() -> None:
-    camera = CameraFile(width=4, height=4, fx=1, fy=1, cx=2, cy=2, fps=10)
+    camera = CameraFile(width=8, height=8, fx=8, fy=8, cx=4, cy=4, fps=10)
     with pytest.raises(ValueError):
         camera.width = 5
 

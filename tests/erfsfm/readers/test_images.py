@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,6 +82,17 @@ def test_not_an_image(tmp_path: Path) -> None:
         read_image(tmp_path / "a.png")
     with pytest.raises(DataError, match=r"cannot read image .*b\.png"):
         read_image(tmp_path / "b.png")
+
+
+def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path) -> None:
+    """The header of a PNG announces 60000 x 60000."""
+    _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
+    header = b"IHDR" + struct.pack(">II", 60_000, 60_000) + content.tobytes()[24:29]
+    (tmp_path / "a.png").write_bytes(
+        content.tobytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + content.tobytes()[33:]
+    )
+    with pytest.raises(DataError, match=r"a\.png has more pixels than any camera"):
+        read_image(tmp_path / "a.png")
 
 
 def test_natural_order_ignores_other_files(tmp_path: Path) -> None:

@@ -46,6 +46,9 @@ def test_real_cameras_pass_without_a_warning(camera: Pinhole, caplog: pytest.Log
         ({"fy": 100.0}, "fy: 100 is no focal length"),
         ({"fx": float("nan")}, "fx: nan is no focal length"),
         ({"cx": 1241.0}, r"cx, cy: \(1241, 185.216\) lies outside"),
+        ({"height": 7}, "width, height: images of 1241x7 are none of a camera"),
+        ({"width": 200_000}, "width, height: images of 200000x376 .*resize the images"),
+        ({"width": 30_000, "height": 30_000}, "width, height: images of 30000x30000"),
         ({"cy": 0.0}, r"cx, cy: \(607.193, 0\) lies outside"),
     ],
 )

@@ -16,8 +16,8 @@ import pytest
 from slam.batch.cluster import workers
 from slam.batch.execution import Limits, run_drive, run_drives
 from slam.batch.manifest import Drive, drives_of
-from slam.batch.summary import write_summary
-from slam.errors import SequenceError, SlamError
+from slam.batch.summary import check_output, write_summary
+from slam.errors import RunError, SequenceError, SlamError
 
 QUICK = ["--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false"]
 
@@ -94,6 +94,22 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
     assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
     write_summary(output, [outcome])
     assert "0 of 1 drives" in (output / "index.html").read_text()
+    check_output(output)
+
+
+def test_a_command_that_leaves_no_run_is_a_failure(tmp_path: Path) -> None:
+    outcome = run_drive(Drive("asked", tmp_path, ("--help",)), tmp_path / "out", Limits())
+    assert outcome.status == "failed" and "left no whole run" in outcome.reason
+
+
+@pytest.mark.parametrize("name", ["index.html", "drives.csv"])
+def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, name: str) -> None:
+    check_output(tmp_path)
+    (tmp_path / name).write_text("my own")
+    with pytest.raises(RunError, match=f"{name} is none of ours"):
+        check_output(tmp_path)
+    with pytest.raises(RunError, match="is a file: give a folder"):
+        check_output(tmp_path / name)
 
 
 def dies_once(path: Path) -> str:

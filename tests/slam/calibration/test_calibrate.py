@@ -89,6 +89,10 @@ def test_among_the_images_the_picture_is_none_of_them(make_studio, make_views, w
     assert (folder / "camera.pdf").is_file() and not (folder / "camera.png").exists()
     code, _, err = calibrate(folder, "--board", "9x6", "--output", folder / "new.yaml")
     assert code == 0 and all(path.read_bytes() == content for path, content in before.items())
+    (folder / "settings.yaml").write_text("mapping: {enabled: false}")
+    code, _, err = calibrate(folder, "--board", "9x6", "--output", folder / "settings.yaml")
+    assert code == 1 and "settings.yaml exists and is no camera file" in err
+    assert (folder / "settings.yaml").read_text() == "mapping: {enabled: false}"
 
 
 def test_a_video_gives_its_rate(tmp_path: Path, make_studio, make_views, calibrate: Call) -> None:

@@ -58,3 +58,12 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     nothing = DepthErrors()
     nothing.add(np.zeros((4, 4), np.float32), truth)
     assert nothing.summary() is None
+
+
+def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
+    errors = DepthErrors()
+    for k in range(3001):
+        errors.add(TRUTH * (1 + k / 3000), TRUTH)
+    summary = errors.summary()
+    assert summary is not None and 250 <= summary["frames"] <= 500
+    assert summary["abs_rel"] == pytest.approx(0.5, abs=0.01)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -129,11 +130,14 @@ def test_errors_are_clear_and_leave_nothing(
 @pytest.mark.parametrize(
     ("what", "name", "why"),
     [
-        ("trajectory", "run/trajectory_network.tum.txt", "is a file of the run itself"),
-        ("mesh", "run/map_mesh.ply", "is a file of the run itself"),
+        ("trajectory", "run/trajectory_network.tum.txt", "is a file of a run"),
+        ("mesh", "run/map_mesh.ply", "is a file of a run"),
         ("trajectory", "camera.yaml", r"exists and does not end in \.txt or \.tum"),
         ("graph", "camera.yaml", r"exists and does not end in \.g2o"),
         ("occupancy", "camera.yaml", "exists and is no map of ROS"),
+        ("mesh", "drive/thesis.ply", "thesis.ply exists and is a file of another kind"),
+        ("trajectory", "drive/images.txt", "images.txt exists and is a file of another kind"),
+        ("trajectory", "drive/truth.txt", "truth.txt belongs to the recording of the run"),
         ("nerfstudio", "drive", "drive/images is none of ours"),
         ("colmap", "drive", "drive/images.txt is none of ours"),
         ("raster", "drive", "drive/height.png is none of ours"),
@@ -145,6 +149,12 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
     for other in ("images.txt", "height.png"):
         (tmp_path / "drive" / other).write_text("another program's")
     (tmp_path / "camera.yaml").write_text("width: 40\n")
+    (tmp_path / "drive/thesis.ply").write_text("my own")
+    shutil.copy(folder.path / "reference.kitti.txt", tmp_path / "drive/truth.txt")
+    metrics = folder.metrics()
+    metrics["provenance"]["recording"] = {"dataset": str(tmp_path / "drive")}
+    folder.write_metrics(metrics)
+    folder.write_text("config.yaml", "")
     before = {path: path.read_bytes() for path in folder.path.iterdir()}
     with pytest.raises(RunError, match=why):
         export(folder, what, tmp_path / name)

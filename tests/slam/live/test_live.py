@@ -212,7 +212,7 @@ def test_the_viewer_is_shown_the_drive(
 
 
 def test_a_video_plays_at_its_own_speed(video: Path) -> None:
-    source = VideoSource(str(video))
+    source = VideoSource(str(video), 1.0)
     source.fps = 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
@@ -221,11 +221,14 @@ def test_a_video_plays_at_its_own_speed(video: Path) -> None:
 
 def test_sources_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="no image comes from"):
-        VideoSource(str(tmp_path / "none.mp4"))
+        VideoSource(str(tmp_path / "none.mp4"), 1.0)
     with pytest.raises(SequenceError, match="no image comes from 99: check the camera"):
         open_source("99", 0.1)
     with pytest.raises(SequenceError, match=r"no image came to .* within 0\.1 s"):
         FolderSource(tmp_path, 0.1)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SequenceError, match=r"pipe: it is a pipe that nothing was written to for 0\.1 s"):
+        open_source(str(tmp_path / "pipe"), 0.1)
     with pytest.raises(SlamError, match="choose camera-height"):
         run_live(
             LiveRequest("0", overrides=("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]")), print
@@ -242,6 +245,12 @@ def test_messages_are_published(tmp_path: Path) -> None:
             emit({"type": "pose", "frame": 7})
         assert socket.recv_json() == {"type": "pose", "frame": 7}
     assert json.loads(stream.getvalue().splitlines()[0]) == {"type": "pose", "frame": 7}
+
+
+def test_a_port_that_does_not_exist_is_refused() -> None:
+    pytest.importorskip("zmq")
+    with pytest.raises(SlamError, match="ports end at 65535"), emitters(io.StringIO(), "tcp://127.0.0.1:99999"):
+        pass
 
 
 def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:

@@ -75,3 +75,38 @@ def test_each_filter_counts_what_it_took():
     assert shares["sky"] == pytest.approx((14 * 10 + 5 * 10) / 5000)
     assert shares["range"] == pytest.approx(0.1 * 0.6) and shares["sigma"] == pytest.approx(0.1 * 0.6)
     assert 1 - sum(shares.values()) == pytest.approx((kept > 0).mean())
+
+
+def test_a_camera_that_looks_down_sees_no_sky():
+    filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
+    bright = np.full((50, 100, 3), 250, np.uint8)
+    filters.kept(DepthView(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
+    assert filters.shares()["sky"] == 0
+
+
+def test_how_far_depth_is_fused_depends_on_its_sigma():
+    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
+    depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
+    config = MappingConfig(depth_max_m=20, sure_reach=1.5, sure_sigma_m=1.2, border=0, max_depth_step=10)
+    image = np.full((50, 100, 3), 90, np.uint8)
+
+    def farthest(relative_sigma: np.ndarray | None) -> float:
+        view = DepthView(0, depth, relative_sigma, image, np.eye(4))
+        return float(DepthFilters(config, camera).kept(view, None).max())
+
+    assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
+    assert 23 < farthest(np.full_like(depth, 0.05)) <= 24  # 0.05 of 24 m is 1.2 m
+    assert 29 < farthest(np.full_like(depth, 0.02)) < 30
+
+
+def test_border_sky_and_edges_are_no_doubt_of_exact_depth():
+    camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
+    depth = np.full((50, 100), 10.0, np.float32)
+    depth[:, 60:] = 15.0
+    image = np.full((50, 100, 3), 250, np.uint8)
+    filters = DepthFilters(MappingConfig(border=0.1), camera)
+    exact = filters.kept(DepthView(0, depth, np.zeros_like(depth), image, np.eye(4)), None)
+    np.testing.assert_array_equal(exact, depth)
+    learned = filters.kept(DepthView(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), None)
+    assert (learned[24:, 10:59] > 0).all() and (learned[24:, 61:90] > 0).all()
+    assert np.count_nonzero(learned) == 26 * 78  # rows below the horizon

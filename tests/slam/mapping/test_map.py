@@ -97,7 +97,7 @@ def test_depth_inconsistent_between_views_is_left_out():
         return depth
 
     assert distance_to_street(street_map(ghost, min_weight=1).mesh().vertices_world).max() < 0.2
-    blind = street_map(ghost, min_weight=1, min_component_triangles=0, consistency=10.0)
+    blind = street_map(ghost, min_weight=1, min_component_triangles=0, consistency=10.0, depth_max_m=22)
     assert distance_to_street(blind.mesh().vertices_world).max() > 1.0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam.errors import SlamError
 from slam.storage.cache import Answer, CacheNamespace, DiskCache
 
 
@@ -48,3 +49,9 @@ def test_every_difference_is_computed(
     other = CacheNamespace(memory, identity)
     (answer,) = other.get_or_compute(kind, given, lambda: (np.ones(1),))
     assert answer == 1 and (other.asked, other.found) == (1, 0)
+
+
+def test_a_folder_of_something_else_is_no_cache(tmp_path: Path) -> None:
+    (tmp_path / "000000.png").write_bytes(b"an image")
+    with pytest.raises(SlamError, match="holds no cache of erfsfm-slam: choose another --cache"):
+        DiskCache(tmp_path)

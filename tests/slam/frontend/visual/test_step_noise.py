@@ -59,7 +59,7 @@ def test_the_neighbour_residual_is_large_at_a_jump_and_not_beside_it():
     np.testing.assert_array_equal(neighbour_residual({3: np.ones(3)}, 3), 0.0)
 
 
-def test_sigmas_are_ratios_of_jitter():
+def test_sigmas_are_ratios_of_jitter_and_rotation():
     jittery = turns(np.full(3, 1e-3))
     noise, jitter = inflate_step_sigmas(steps(jittery), own(400), CONFIG), rotation_jitter(dict(enumerate(jittery)))
     assert noise.keys() == set(range(400))
@@ -70,12 +70,13 @@ def test_sigmas_are_ratios_of_jitter():
         assert (step.rotation >= CONFIG.jitter_rotation_ratio * jitter).all()
 
 
-def test_jumps_widen_their_own_steps():
+def test_sharp_turns_and_jumps_widen_their_own_steps():
     smooth = np.zeros((60, 3))
-    smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 10.0) ** 2
+    smooth[:, 1] = np.deg2rad(5.0) * np.sin(np.arange(60) / 25.0) ** 2
     jumping = smooth.copy()
     jumping[30, 0] += np.deg2rad(1.0)
     before, after = (inflate_step_sigmas(steps(drive), own(60), CONFIG) for drive in (smooth, jumping))
+    assert before[39].rotation[1] == pytest.approx(CONFIG.turn_rotation_ratio * smooth[39, 1], rel=0.1)
     assert after[30].rotation[0] == pytest.approx(CONFIG.neighbour_rotation_ratio * np.deg2rad(1.0), rel=0.1)
     np.testing.assert_allclose(after[10].rotation, before[10].rotation, atol=1e-6)
 

@@ -46,7 +46,6 @@ def test_images_that_change_are_not_remembered():
         ("data", "colour_jitter", 0.1),
         ("data", "zoom", 1.2),
         ("data", "weather", 0.5),
-        ("data", "turn", 2.0),
         ("training", "frozen_stages", 5),
         ("training", "networks", "both"),
     ):

@@ -71,13 +71,6 @@ class DataConfig(Section):
     validation_snippets: int = Field(default=60, ge=1, description="number of snippets in each validation")
     flip: float = Field(default=0.5, ge=0, le=1, description="probability of a horizontal flip")
     zoom: float = Field(default=1.15, ge=1, le=2, description="largest factor of random scaling and cropping, per axis")
-    turn: float = Field(
-        default=0.0,
-        ge=0,
-        le=10,
-        description="largest random yaw of the camera from a snippet's middle to its ends, degrees, with some pitch and "
-        "roll; for training.networks: pose",
-    )
     colour_jitter: float = Field(
         default=0.0, ge=0, le=0.5, description="largest relative change of brightness, contrast, gamma"
     )
@@ -249,8 +242,6 @@ class ExperimentConfig(Section):
             raise ValueError("loss.mask_weight needs network.masks: true")
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
-        if self.data.turn > 0 and self.training.networks != "pose":
-            raise ValueError("data.turn needs training.networks: pose: depth of turned cameras is not known")
         if self.training.minutes > 0 and self.training.processes > 1:
             raise ValueError(
                 "training.minutes needs training.devices: 1 and training.nodes: 1: the clocks of several would differ"

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.augmentation import augment
-from erfsfm.data.turns import random_turns, turned, turned_motion
 from erfsfm.data.weather import weathered
 from erfsfm.geometry.camera import Camera
 from erfsfm.teacher.structure import TeacherStructure
@@ -48,17 +47,12 @@ def training_sample(
     network = config.network
     bounds = [] if seen is None else [seen.least.astype(np.float32), seen.most.astype(np.float32)]
     images, bounds, varied, mirrored = augment(images, bounds, camera, config.data, network.fidelity, rng)
-    turns = random_turns(len(images), config.data.turn, rng) if config.data.turn > 0 else None
-    if turns is not None:
-        images = turned(images, varied, turns)
     sample = as_tensors(images, varied.K)
     which, first = place
     number = (2 * which + mirrored) * _MOST_FRAMES + first
     sample["frames"] = torch.arange(number, number + network.sources + 1)
     if seen is not None:
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
-        if turns is not None:
-            T_source_target = turned_motion(T_source_target, turns)
         if config.teacher.views == "many":
             nearer = varied.fy / network.height / FOCAL_LENGTH
             bounds = [values * np.float32(nearer) for values in bounds]

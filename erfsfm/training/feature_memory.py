@@ -18,7 +18,7 @@ from erfsfm.networks.lite0_pose import PRETRAINED_STAGES, Lite0PoseNet
 def features_recur(config: ExperimentConfig) -> bool:
     """Whether images and the part of the network that encodes them stay the same over a training of poses."""
     data, training = config.data, config.training
-    images_stay = data.colour_jitter == 0 and data.zoom == 1 and data.weather == 0 and data.turn == 0
+    images_stay = data.colour_jitter == 0 and data.zoom == 1 and data.weather == 0
     return training.networks == "pose" and training.frozen_stages >= PRETRAINED_STAGES and images_stay
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.moving_cover import is_crossed
 
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
@@ -49,7 +50,8 @@ class GateState:
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
     from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length; ``tracked``, the image of
     ``usable`` at a smaller size, turned the right way; ``flip``, how the image before was flipped;
-    of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
+    of all ``compared`` images, ``exposed`` are much brighter or darker than the one before, and frames ``crossed`` have
+    something before the scene that moves.
     """
 
     last: Frame | None = None
@@ -62,6 +64,7 @@ class GateState:
     flip: str | None = None
     compared: int = 0
     exposed: int = 0
+    crossed: tuple[int, ...] = ()
 
 
 class ImageGate:
@@ -93,7 +96,8 @@ class ImageGate:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
-            self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
+            state = self._state
+            self._state = GateState(compared=state.compared, exposed=state.exposed, crossed=state.crossed)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
         thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
@@ -105,16 +109,19 @@ class ImageGate:
         failure = self._scene_failure(thumbnail, small)
         if failure is not None:
             return failure
-        self._count_exposure(small)
+        self._compare_with_last(frame.index, small)
         self._state = replace(self._state, usable=thumbnail, doubtful=None, tracked=small, flip=None)
         return "repeated" if self._is_copy(frame) else "new"
 
-    def _count_exposure(self, small: _Grey) -> None:
+    def _compare_with_last(self, index: int, small: _Grey) -> None:
+        """Count a change of exposure, and something that moves over the image."""
         state = self._state
         if state.tracked is not None:
             before, now = np.median(state.tracked), np.median(small)
             exposed = abs(float(np.log((now + 1.0) / (before + 1.0)))) > _EXPOSURE_STEP
-            self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + exposed)
+            crossed = (*state.crossed, index) if is_crossed(state.tracked, small) else state.crossed
+            exposed_now = state.exposed + exposed
+            self._state = replace(state, compared=state.compared + 1, exposed=exposed_now, crossed=crossed)
 
     def _scene_failure(self, thumbnail: _Layer, small: _Grey) -> MeasurementFailure | None:
         state, flip = self._state, self._flip_of(thumbnail, small)

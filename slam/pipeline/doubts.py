@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 from slam.frames import runs
+from slam.frontend.moving_cover import crossings
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import ObserverState
 
@@ -19,8 +20,12 @@ _LEAST_COMPARED = 30
 
 def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
     """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
-    for first, last in runs(seen.interpolated):
+    gaps = runs(seen.interpolated)
+    for first, last in gaps[:_MOST_NAMED]:
         logger.warning("frames %d to %d are interpolated: %s", first, last, seen.interpolated[first])
+    if len(gaps) > _MOST_NAMED:
+        more, frames_of_them = gaps[_MOST_NAMED:], sum(last - first + 1 for first, last in gaps[_MOST_NAMED:])
+        logger.warning("%d more stretches are interpolated, of %d frames: see metrics.json", len(more), frames_of_them)
     _warn_of_segments(seen)
     doubled = doubled_frames(frames, seen, state)
     if doubled:
@@ -33,6 +38,13 @@ def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) 
             "exposure, or its flicker under lamps",
             gate.exposed,
             gate.compared,
+        )
+    for first, last in crossings(gate.crossed):
+        logger.warning(
+            "frames %d to %d: something uniform moves over the images, such as a windscreen wiper: their poses are "
+            "less certain",
+            first,
+            last,
         )
     end = frames - 1
     for first, last in runs(state.seen.repeated):
@@ -58,12 +70,15 @@ def doubled_frames(frames: int, seen: ClosedObservations, state: ObserverState) 
 
 def _warn_of_segments(seen: ClosedObservations) -> None:
     """Where a segment begins, its place relative to the ones before is a guess."""
-    for segment in seen.segments[1:]:
+    later = seen.segments[1:]
+    for segment in later[:_MOST_NAMED]:
         logger.warning(
             "a new segment of the drive begins at frame %d (%s): its place relative to the frames before is a guess",
             segment.first,
             segment.reason,
         )
+    if len(later) > _MOST_NAMED:
+        logger.warning("%d more segments begin: see metrics.json", len(later) - _MOST_NAMED)
 
 
 def warn_of_another_place(seen: ClosedObservations, first: int) -> None:

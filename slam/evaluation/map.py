@@ -121,7 +121,7 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
     found: dict[str, list[MapDistances]] = {name: [] for name in maps}
     for part in parts:
         near = nearby(T_world_camera, views, part)
-        surface = accumulated(truth, near)
+        surface = accumulated(truth, near, T_world_camera[part, :3, 3])
         tree = cKDTree(surface.points) if truth.distance is None and len(surface.points) else None
         on_surface, surface_range = _surface_samples(surface, cameras, part)
         for name, points in maps.items():

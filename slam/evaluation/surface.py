@@ -24,6 +24,7 @@ SAMPLE_VOXEL_M = 0.2
 VIEW_STEP_M = 1.0
 SPARSE_VIEW_STEP_M = 3.0  # where views do not measure the accuracy
 
+_BEYOND_M = 5.0  # of the range of map points: a wrong one may be nearest to surface out there
 _MERGED_POINTS = 1_000_000
 _VIEW_STEP_DEG = 5.0
 _NEAR_TRUTH_M = 5.0  # of a camera to the nearest one that measured the surface
@@ -65,8 +66,9 @@ def thinned(points: FloatArray, voxel_m: float) -> Indices:
     """One point of each voxel, the first: indices into ``points`` ``(P, 3)``, increasing."""
     if len(points) == 0:
         return np.empty(0, dtype=np.int64)
-    keys = np.floor(points / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
-    key = (keys[:, 0] << (2 * _KEY_BITS)) | (keys[:, 1] << _KEY_BITS) | keys[:, 2]
+    key = np.zeros(len(points), dtype=np.int64)
+    for axis in points.T:  # one at a time, for there are millions
+        key = (key << _KEY_BITS) | (np.floor(axis / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1)))
     return np.sort(np.unique(key, return_index=True)[1])
 
 
@@ -119,9 +121,19 @@ def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices
     return near
 
 
-def accumulated(truth: SurfaceTruth, views: Indices) -> Surface:
-    """The surface from all ``views``, one point in each voxel of 5 cm, one in an image where there is one."""
-    return _merged(truth.view(int(frame)) for frame in views)
+def accumulated(truth: SurfaceTruth, views: Indices, positions: FloatArray) -> Surface:
+    """The surface from all ``views``, one point in each voxel of 5 cm, one in an image where there is one.
+
+    Of it what is in the box around ``positions`` ``(N, 3)`` of cameras and 30 m further.
+    """
+    margin = RANGE_M + _BEYOND_M
+    low, high = positions.min(axis=0) - margin, positions.max(axis=0) + margin
+    return _merged(_cropped(truth.view(int(frame)), low, high) for frame in views)
+
+
+def _cropped(surface: Surface, low: FloatArray, high: FloatArray) -> Surface:
+    inside = ((surface.points >= low) & (surface.points <= high)).all(axis=1)
+    return Surface(surface.points[inside], surface.in_image[inside])
 
 
 def _merged(views: Iterable[Surface]) -> Surface:

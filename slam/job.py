@@ -27,6 +27,7 @@ from slam.results.gps import write_places
 from slam.results.map import write_map
 from slam.results.map_view import write_map_views
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
+from slam.results.output import ESTIMATE
 from slam.results.report import DepthExample, write_report
 from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog
@@ -81,7 +82,8 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
         ignore_signals()
         _leave_failure(folder, log, job.settings.output.report, error)
         if folder.replaces is not None and isinstance(error, SlamError):
-            kept = f"{folder.replaces} keeps its earlier run, this one is in {folder.path}"
+            is_kept = (folder.replaces / ESTIMATE).is_file()  # else it failed while one was put in the other's place
+            kept = f"{folder.replaces} {'keeps' if is_kept else 'lost'} its earlier run, this one is in {folder.path}"
             raise RunError(f"{error}; {kept}") from error
         raise
     return folder

@@ -51,7 +51,7 @@ def check_output(output: Path) -> None:
     """Check that a run may write to ``output``: it is new, empty, or holds an earlier run.
 
     Raises:
-        RunError: it is a file, or holds files of something else.
+        RunError: it is a file, or holds files of something else, or a folder where a run has a file.
     """
     if not output.exists():
         return
@@ -59,6 +59,9 @@ def check_output(output: Path) -> None:
         raise RunError(f"{output} is a file: give a folder as --output")
     if not _is_run(output / METRICS) and any(not _is_rest(path) for path in output.iterdir()):
         raise RunError(f"{output} is not empty and holds no run of erfsfm-slam: choose another --output")
+    for path in output.iterdir():
+        if is_own(path.name) and path.is_dir():
+            raise RunError(f"{path} is a folder, where a run writes a file: move it away, or choose another --output")
 
 
 def claim(output: Path) -> Path:

@@ -249,17 +249,6 @@ def test_a_rejected_motion_updates_neither_history_nor_dynamic_mask(texture):
     assert accepted.state().dynamic_mask.corners.sum() > before.dynamic_mask.corners.sum()
 
 
-def test_only_the_first_motion_to_a_frame_updates_the_state(texture):
-    frames, _ = drive(texture)
-    odometry = VisualOdometry(CONFIG, CAMERA)
-    for k in (1, 2):
-        pose_of(odometry.measure(frames[k - 1][0], frames[k][0], frames[k - 1][1]))
-    before = odometry.state()
-    pose_of(odometry.measure(frames[0][0], frames[2][0], frames[0][1]))
-    after = odometry.state()
-    assert (after.history, after.dynamic_mask, after.last) == (before.history, before.dynamic_mask, before.last)
-
-
 def predictions(texture, steps, failing=()) -> dict[tuple[int, int], bool]:
     """Which of some steps between the frames of a drive were tracked with a predicted flow."""
     frames, _ = drive(texture, steps=(0.6,) * 8)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.moving_cover import is_crossed
+from slam.storage.cache import GetOrCompute, without_cache
 
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
@@ -70,7 +71,8 @@ class GateState:
 class ImageGate:
     """Classifies the images of one sequence in time order."""
 
-    def __init__(self, state: GateState | None = None) -> None:
+    def __init__(self, state: GateState | None = None, get_or_compute: GetOrCompute = without_cache) -> None:
+        self._get_or_compute = get_or_compute
         self._state = state or GateState()
 
     def state(self) -> GateState:
@@ -132,7 +134,9 @@ class ImageGate:
         known = [each for each in (state.usable, state.doubtful) if each is not None]
         doubt = bool(known) and max(float((thumbnail * each).sum()) for each in known) < _MIN_CORRELATION
         # after flipped images correlation is not enough; two such images in a row are a new scene, not damage
-        if doubt or (state.flip and state.doubtful is None and _tracked_share(state.tracked, small) < _LEAST_TRACKED):
+        if doubt or (
+            state.flip and state.doubtful is None and self._tracked_share(state.tracked, small) < _LEAST_TRACKED
+        ):
             self._state = replace(state, doubtful=thumbnail)
             return MeasurementFailure("the image does not correlate with those before it")
         return None
@@ -148,10 +152,17 @@ class ImageGate:
         for name, flip in _FLIPS.items():
             if float((thumbnail[flip] * usable).sum()) < _LEAST_FLIPPED_CORRELATION:
                 continue
-            tracked = _tracked_share(before, np.ascontiguousarray(small[flip]))
-            if tracked > max(_LEAST_TRACKED, _TRACKED_OVER_UNFLIPPED * _tracked_share(before, small)):
+            tracked = self._tracked_share(before, np.ascontiguousarray(small[flip]))
+            if tracked > max(_LEAST_TRACKED, _TRACKED_OVER_UNFLIPPED * self._tracked_share(before, small)):
                 return name
         return None
+
+    def _tracked_share(self, before: _Grey | None, now: _Grey) -> float:
+        """Share of corners that are followed to the other image and back to where they were."""
+        if before is None or before.shape != now.shape:
+            return 0.0
+        (share,) = self._get_or_compute("share of corners", (before, now), lambda: (_followed(before, now),))
+        return float(share[0])
 
     def _is_copy(self, frame: Frame) -> bool:
         """Whether the image is a re-encoded copy of the last new one, although the camera moved just before.
@@ -179,17 +190,15 @@ def _reduced(grey: _Grey) -> _Grey:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _tracked_share(before: _Grey | None, now: _Grey) -> float:
-    """Share of corners that are followed to the other image and back to where they were."""
-    if before is None or before.shape != now.shape:
-        return 0.0
+def _followed(before: _Grey, now: _Grey) -> NDArray[np.float64]:
+    """The share ``(1,)`` of corners that are followed there and back."""
     corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 5)
     if corners is None:
-        return 0.0
+        return np.zeros(1)
     moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(9, 9))
     back, found_again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, winSize=(9, 9))
     returned = np.linalg.norm(back - corners, axis=-1) < 0.5
-    return float((returned & (found == 1) & (found_again == 1)).mean())
+    return np.array([(returned & (found == 1) & (found_again == 1)).mean()])
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

@@ -6,10 +6,9 @@ import logging
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
@@ -116,8 +115,10 @@ class VideoSource:
         self._name = name
         self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
         self.fps = DEFAULT_FPS
-        with _kept_open(name, wait_s):
-            self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(name)
+        self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
+        # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
+        source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"
+        self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(source)
         self._first = self._next()
         if self._first is None:
             raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
@@ -133,26 +134,19 @@ class VideoSource:
             yield stamp, image
             count, image = count + 1, self._next()
         self._capture.release()
+        if self._pipe is not None:
+            self._pipe.close()
 
     def _next(self) -> Image | None:
         read, image = self._capture.read()
         return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
 
 
-@contextmanager
-def _kept_open(name: str, wait_s: float) -> Iterator[None]:
-    """Hold a pipe that is written to, until OpenCV has it: OpenCV itself would wait for ever."""
-    if not Path(name).is_fifo():
-        yield
-        return
+def _opened(pipe: str, wait_s: float) -> BinaryIO:
     try:
-        descriptor = open_written(name, wait_s)
+        return os.fdopen(open_written(pipe, wait_s), "rb")
     except OSError as error:
-        raise SequenceError(f"no image comes from {name}: it is {error.strerror}") from error
-    try:
-        yield
-    finally:
-        os.close(descriptor)
+        raise SequenceError(f"no image comes from {pipe}: it is {error.strerror}") from error
 
 
 def open_source(camera: str, wait_s: float) -> Source:

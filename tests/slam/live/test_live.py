@@ -171,6 +171,17 @@ def piped(video: Path) -> Iterator[str]:
 
 
 @contextmanager
+def written(video: Path) -> Iterator[str]:
+    """A pipe with the whole video in it, whose writer is gone."""
+    pipe = video.with_name("pipe")
+    os.mkfifo(pipe)
+    held = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    pipe.write_bytes(video.read_bytes())
+    yield str(pipe)
+    os.close(held)
+
+
+@contextmanager
 def served(video: Path) -> Iterator[str]:
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
@@ -182,7 +193,7 @@ def served(video: Path) -> Iterator[str]:
         server.shutdown()
 
 
-@pytest.mark.parametrize("opened", [piped, served])
+@pytest.mark.parametrize("opened", [piped, written, served])
 def test_a_pipe_and_an_address_give_images_as_they_arrive(
     video: Path, opened: Callable[[Path], AbstractContextManager[str]]
 ) -> None:

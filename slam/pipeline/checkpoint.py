@@ -99,7 +99,7 @@ class SessionCheckpoint:
                 "finished, and not with output.keep=nothing"
             )
         checkpoint = cls.read(folder / DRIVE)
-        if (folder / KEYFRAMES).is_file():
+        if (folder / KEYFRAMES).exists():
             checkpoint.state.seen.keyframes.extend(read_keyframes(folder / KEYFRAMES))
         return checkpoint
 

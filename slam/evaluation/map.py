@@ -7,7 +7,7 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -21,7 +21,6 @@ from slam.evaluation.surface import (
     VIEW_STEP_M,
     Indices,
     Mask,
-    Surface,
     SurfaceTruth,
     accumulated,
     length_m,
@@ -40,6 +39,7 @@ OUTLIER_M = 1.0
 
 _LEVER_M = 10.0  # distance from the camera at which an alignment counts rotations
 _LEAST_IN_BIN = 20
+_LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
 
 _NO_MAP = "no map point lies within 25 m of a camera whose surroundings are known"
 _NO_SURFACE = "no true surface is known at this distance from a camera"
@@ -121,19 +121,14 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
     found: dict[str, list[MapDistances]] = {name: [] for name in maps}
     for part in parts:
         near = nearby(T_world_camera, views, part)
-        surface = accumulated(truth, near, T_world_camera[part, :3, 3])
-        tree = cKDTree(surface.points) if truth.distance is None and len(surface.points) else None
-        on_surface, surface_range = _surface_samples(surface, cameras, part)
+        to_surface, on_surface, surface_range = _surface_along(truth, near, T_world_camera, cameras, part)
         for name, points in maps.items():
             away, camera = nearest[name]
             own = _sampled(points, np.flatnonzero(np.isin(camera, part) & np.isfinite(away)))
-            if truth.distance is not None:
-                to_surface = truth.distance(points[own]) if len(own) else np.empty(0)
-            else:
-                to_surface = np.full(len(own), np.inf) if tree is None else tree.query(points[own])[0]
-            to_map = _to_map(on_surface, points)
-            in_field = truth.in_field(points[own], near)
-            found[name].append(MapDistances(to_surface, away[own], in_field, to_map, surface_range))
+            distances = to_surface(points[own]) if len(own) else np.empty(0)
+            in_field, to_map = truth.in_field(points[own], near), _to_map(on_surface, points)
+            found[name].append(MapDistances(distances, away[own], in_field, to_map, surface_range))
+        del to_surface  # it holds the surface
     return MapComparison({name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts))
 
 
@@ -191,16 +186,30 @@ def _harmonic_mean(precision: float | None, recall: float | None) -> float | Non
 
 def _sampled(points: FloatArray, candidates: Indices) -> Indices:
     """Of the candidates, a random one of each 0.2 m voxel."""
-    shuffled = np.random.default_rng(0).permutation(candidates)
-    return shuffled[thinned(points[shuffled], SAMPLE_VOXEL_M)]
+    order = np.random.default_rng(0).permutation(len(candidates))
+    return candidates[thinned(points[candidates], SAMPLE_VOXEL_M, order)]
 
 
-def _surface_samples(surface: Surface, cameras: cKDTree, part: Indices) -> tuple[FloatArray, FloatArray]:
-    """Samples ``(S, 3)`` of the surface in images whose nearest camera is on a stretch, with that distance ``(S,)``."""
-    points = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
-    away, camera = cameras.query(points, distance_upper_bound=RANGE_M)
+def _surface_along(
+    truth: SurfaceTruth, views: Indices, T_world_camera: FloatArray, cameras: cKDTree, part: Indices
+) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, FloatArray]:
+    """The true surface around a stretch, from these views.
+
+    Returns:
+        distances ``(P,)`` of points ``(P, 3)`` to it, samples ``(S, 3)`` of what images show of it whose nearest camera
+        is on the stretch, and that distance ``(S,)``.
+    """
+    surface = accumulated(truth, views, T_world_camera[part, :3, 3])
+    samples = surface.points[_sampled(surface.points, np.flatnonzero(surface.in_image))]
+    away, camera = cameras.query(samples, distance_upper_bound=RANGE_M)
     own = np.flatnonzero(np.isfinite(away) & np.isin(camera, part))
-    return points[own], away[own]
+    return truth.distance or _distance_to(surface.points), samples[own], away[own]
+
+
+def _distance_to(surface: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """The function from points ``(P, 3)`` to their distances ``(P,)`` to surface points ``(S, 3)``."""
+    tree = cKDTree(surface, leafsize=_LEAF_POINTS)
+    return lambda points: np.asarray(tree.query(points)[0])
 
 
 def _to_map(samples: FloatArray, points: FloatArray) -> FloatArray:

@@ -300,7 +300,7 @@ class Observer:
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
             return None
         self._seen.motions.append(measured)
-        return measured if measured.triangulated is not None else None
+        return measured if measured.is_triangulated else None
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
@@ -308,7 +308,7 @@ class Observer:
         if baseline < 2 or len(self._recent) < baseline:
             return None
         first = self._recent[-baseline]
-        motions = {m.ends: m for m in self._seen.motions[-2 * baseline :] if m.triangulated}
+        motions = {m.ends: m for m in self._seen.motions[-2 * baseline :] if m.is_triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
         if path is None or len(path) != baseline:
             return None

@@ -11,12 +11,13 @@ import pytest
 
 from slam import se3
 from slam.evaluation.map import compare, pose_similarity, statistics
-from slam.evaluation.surface import Indices, Mask, Surface, backprojected, stretches, thinned
+from slam.evaluation.surface import Indices, Mask, Surface, accumulated, backprojected, stretches, thinned
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray
 
 HEIGHT_M = 1.65
 CELL_M = 0.05
+CLOSE_M = 1e-5
 
 
 def road(width_m: float = 6.0, length_m: float = 20.0) -> FloatArray:
@@ -65,8 +66,8 @@ def test_a_raised_plane_is_wrong_by_its_offset(
     offset_m: float, covered: float, f_scores: tuple[float, float], exact: bool
 ) -> None:
     found = errors(road() - [0.0, offset_m, 0.0], exact)
-    assert found["accuracy_median_m"] == pytest.approx(offset_m)
-    assert found["accuracy_90_m"] == pytest.approx(offset_m)
+    assert found["accuracy_median_m"] == pytest.approx(offset_m, abs=CLOSE_M)
+    assert found["accuracy_90_m"] == pytest.approx(offset_m, abs=CLOSE_M)
     assert found["completeness"] == covered
     assert (found["f_score"]["0.2"], found["f_score"]["0.5"]) == f_scores
     assert found["outlier_share"] == 0.0
@@ -75,7 +76,7 @@ def test_a_raised_plane_is_wrong_by_its_offset(
 def test_half_a_plane_is_accurate_and_half_complete() -> None:
     points = road()
     found = errors(points[points[:, 0] < 0])
-    assert found["accuracy_median_m"] == pytest.approx(0.0, abs=1e-9)
+    assert found["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M)
     assert found["completeness"] == pytest.approx(0.5 + 0.3 / 6.0, abs=0.02)
     assert found["precision"] == {"0.2": 1.0, "0.5": 1.0}
     recall = 0.5 + 0.5 / 6.0
@@ -87,9 +88,9 @@ def test_density_does_not_weigh() -> None:
     good, bad = points[points[:, 0] < 0], points[points[:, 0] >= 0] - [0.0, 2.0, 0.0]
     found = errors(np.concatenate([np.repeat(good, 20, axis=0), bad]))
     assert found["outlier_share"] == pytest.approx(0.5, abs=0.03)
-    assert found["accuracy_90_m"] == pytest.approx(2.0)
+    assert found["accuracy_90_m"] == pytest.approx(2.0, abs=CLOSE_M)
     assert found["in_field"]["share"] == pytest.approx(0.5, abs=0.03)
-    assert found["in_field"]["accuracy_median_m"] == pytest.approx(2.0)
+    assert found["in_field"]["accuracy_median_m"] == pytest.approx(2.0, abs=CLOSE_M)
 
 
 def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
@@ -99,8 +100,8 @@ def test_the_curve_is_over_the_distance_from_the_nearest_camera() -> None:
     found = statistics(compare(truth, straight(), {"map": points}).distances["map"])
     near, _, _, far, beyond = found["by_distance"]
     assert (near["from_m"], near["to_m"], beyond["to_m"]) == (0.0, 5.0, 25.0)
-    assert near["accuracy_median_m"] == pytest.approx(0.0, abs=1e-9) and near["f_score"]["0.2"] == 1.0
-    assert far["accuracy_median_m"] == pytest.approx(0.35) and far["completeness"] < 0.1
+    assert near["accuracy_median_m"] == pytest.approx(0.0, abs=CLOSE_M) and near["f_score"]["0.2"] == 1.0
+    assert far["accuracy_median_m"] == pytest.approx(0.35, abs=CLOSE_M) and far["completeness"] < 0.1
     assert far["f_score"] == {"0.2": 0.0, "0.5": 1.0}
     assert "too few" in beyond["f_score"]["0.2_reason"] and beyond["completeness"] is None
 
@@ -131,8 +132,20 @@ def test_a_long_drive_is_sampled_evenly() -> None:
 
 def test_one_point_of_each_voxel() -> None:
     points = np.array([[0.01, 0, 0], [0.04, 0, 0], [0.06, 0, 0], [-0.01, 0, 0], [0.02, 0.06, 0]])
-    assert thinned(points, 0.05).tolist() == [0, 2, 3, 4]
-    assert len(thinned(np.empty((0, 3)), 0.05)) == 0
+    assert sorted(thinned(points, 0.05, np.arange(5))) == [0, 2, 3, 4]
+    assert sorted(thinned(points, 0.05, np.arange(5)[::-1])) == [1, 2, 3, 4]
+    assert len(thinned(np.empty((0, 3)), 0.05, np.arange(0))) == 0
+
+
+def test_a_point_in_an_image_takes_the_place_of_one_beside_it() -> None:
+    class Views(Road):
+        def view(self, frame: int) -> Surface:
+            return Surface(self.points[frame : frame + 1], np.array([frame == 1]))
+
+    points = np.array([[1.01, 0.02, 3.0], [1.02, 0.02, 3.0], [1.03, 0.02, 3.0], [1.06, 0.02, 3.0]])
+    surface = accumulated(Views(points, np.arange(4)), np.arange(4), np.zeros((1, 3)))
+    np.testing.assert_allclose(surface.points, points[[1, 3]], atol=CLOSE_M)
+    assert surface.in_image.tolist() == [True, False]
 
 
 def test_depth_becomes_points_in_the_world() -> None:

@@ -92,9 +92,16 @@ def build_networks(config: NetworkConfig) -> tuple[nn.Module, nn.Module]:
     _require_kind("pose", config.pose)
 
     def built(name: str, width: float) -> nn.Module:
-        # a depth network has no sources and no mask branch
+        # a depth network has no sources, no mask branch, and no alignment
         return build(
-            name, config.fidelity, width, config.sources, config.normalisation, config.masks, config.activation
+            name,
+            config.fidelity,
+            width,
+            config.sources,
+            config.normalisation,
+            config.masks,
+            config.activation,
+            config.alignment,
         )
 
     return built(config.depth, config.depth_width), built(config.pose, config.pose_width)
@@ -166,10 +173,12 @@ def find_weights(name_or_folder: str | Path) -> Path:
 
 
 def weights_sha256(folder: Path) -> str:
-    """SHA-256 of both weight files together."""
+    """SHA-256 of both weight files together, and of the alignment of poses, which changes what they give."""
     digest = hashlib.sha256()
     for path in (folder / name for name in FILES):
         digest.update(path.read_bytes() if path.is_file() else b"")
+    alignment = read_record(folder / "model.yaml").network.alignment
+    digest.update(b"" if alignment == "none" else alignment.encode())
     return digest.hexdigest()
 
 

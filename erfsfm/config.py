@@ -13,6 +13,7 @@ from erfsfm.config_tree import Section
 from erfsfm.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
+_COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
 _LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
 
@@ -32,8 +33,20 @@ class NetworkConfig(Section):
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
     masks: bool = Field(default=False, description="explainability masks from a second head of the pose network")
+    alignment: Literal["none", "images"] = Field(
+        default="none", description="images: outside training the pose network's rotations are measured in the images"
+    )
     height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
     width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
+
+    @model_validator(mode="after")
+    def _can_be_halved(self) -> Self:
+        if self.alignment == "images" and (self.height % _COARSEST or self.width % _COARSEST):
+            raise ValueError(
+                f"network.alignment: images needs a height and width that are multiples of {_COARSEST}; got "
+                f"{self.height} and {self.width}"
+            )
+        return self
 
 
 class DataConfig(Section):

@@ -160,7 +160,7 @@ def read_pose_noise(folder: Path) -> PoseNoise | None:
         CheckpointError: damaged, of another format, or measured with another pose network; one line.
     """
     path = folder / NOISE_FILE
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
         return PoseNoise.model_validate(read_yaml(path))

@@ -99,10 +99,6 @@ class LoopsConfig(Section):
 
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
-    min_gap_frames: int = Field(default=30, ge=1, description="least distance of the two frames of a loop, frames")
-    min_path_m: float = Field(
-        default=15.0, ge=0, description="least distance of the two frames of a loop along the path"
-    )
     min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
     agreement_deg: float = Field(
         default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"

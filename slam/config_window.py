@@ -16,8 +16,4 @@ class WindowConfig(Section):
         default="auto",
         description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps alone",
     )
-    keyframes: int = Field(default=10, ge=3, le=50, description="number of the last keyframes that are adjusted")
     max_corners: int = Field(default=500, ge=50, le=10000, description="largest number of corners of a keyframe")
-    keyframe_parallax_ratio: float = Field(
-        default=0.03, gt=0, lt=1, description="median parallax that asks for a keyframe, over the image width"
-    )

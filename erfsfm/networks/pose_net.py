@@ -17,6 +17,7 @@ from erfsfm.networks.blocks import (
     initialise,
     scaled,
 )
+from erfsfm.networks.image_alignment import Alignment, aligned
 
 MAX_SOURCES = 8
 POSE_SCALE = 0.01
@@ -49,6 +50,7 @@ class PoseNet(nn.Module):
         sources: int = 4,
         normalisation: Normalisation = "none",
         mask_branch: bool = False,
+        alignment: Alignment = "none",
     ) -> None:
         super().__init__()
         if not 1 <= sources <= MAX_SOURCES:
@@ -56,6 +58,7 @@ class PoseNet(nn.Module):
         self.variant = variant
         self.fidelity = fidelity
         self.sources = sources
+        self.alignment = alignment
         channels = [scaled(count, width) for count in _ENCODER_CHANNELS]
         self.encoder = Encoder(
             [
@@ -95,12 +98,15 @@ class PoseNet(nn.Module):
 
         Returns:
             ``T_source_target`` as translation (unscaled) and XYZ Euler angles (radians),
-            (tx, ty, tz, rx, ry, rz), ``(B, N, 6)``.
+            (tx, ty, tz, rx, ry, rz), ``(B, N, 6)``. With alignment to the images, rotations are measured there; in
+            training they are not.
 
         Raises:
             ValueError: if there are not N sources.
         """
-        return pose_vectors(self.pose_head(self.encoder(stack_images(target, sources, self.sources))[-1]), self.sources)
+        stages = self.encoder(stack_images(target, sources, self.sources))
+        guess = pose_vectors(self.pose_head(stages[-1]), self.sources)
+        return guess if self.training or self.alignment == "none" else aligned(guess, target, sources)
 
     def forward_with_masks(self, target: Tensor, sources: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """Predict motions and the explainability mask of each source (Zhou et al. 2017, Section 3.3).

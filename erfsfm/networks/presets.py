@@ -9,6 +9,7 @@ import torch
 from erfsfm.errors import ConfigError
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.image_alignment import Alignment
 from erfsfm.networks.lite0_depth import Lite0DepthNet
 from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.pose_net import MAX_SOURCES, PoseNet
@@ -71,6 +72,7 @@ def build(
     normalisation: Normalisation = "none",
     mask_branch: bool = False,
     activation: Activation = "relu",
+    alignment: Alignment = "none",
 ) -> Network:
     """Build a network with fresh weights.
 
@@ -83,6 +85,7 @@ def build(
             encoder has its own, and what follows it has none.
         mask_branch: explainability masks in a pose network; a depth network ignores it.
         activation: after every convolution but the heads, as published or leaking a tenth.
+        alignment: of a pose network's rotations to the images; a depth network ignores it.
 
     Raises:
         ConfigError: if the name or an option is unknown or out of range.
@@ -90,17 +93,20 @@ def build(
     preset = _find(name)
     _check_choice("fidelity", fidelity, get_args(Fidelity))
     _check_choice("normalisation", normalisation, get_args(Normalisation))
+    _check_choice("alignment", alignment, get_args(Alignment))
     if not 0 < width <= 8:
         raise ConfigError(f"width must be above 0 and at most 8; got {width}")
     _check_choice("activation", activation, get_args(Activation))
     network: Network
     if preset.encoder == "lite0":
+        if preset.kind == "pose" and alignment != "none":
+            raise ConfigError(f"{name} solves for the motion by itself: set network.alignment to none")
         network = _build_lite0(name, preset, fidelity, width, sources, mask_branch)
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
         try:
-            network = PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch)
+            network = PoseNet(preset.variant, fidelity, width, sources, normalisation, mask_branch, alignment)
         except ValueError as error:
             raise ConfigError(str(error)) from error
     if activation == "leaky":

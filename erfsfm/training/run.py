@@ -96,6 +96,8 @@ def train(
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if rank == 0:
         folder.write_config(config)
+    if config.training.nodes > 1:
+        logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
     with raising_on_termination():
         _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
     if not trainer.is_global_zero:

@@ -119,7 +119,7 @@ def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[R
     factors = []
     for ends, motion in steps.motions.items():
         length = scale.lengths.get(ends)
-        if motion.triangulated is None or length is None:
+        if not motion.is_triangulated or length is None:
             factors.append(motion.relative_pose)
             continue
         pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])

@@ -41,8 +41,8 @@ class StepTable:
 
     @property
     def triangulated(self) -> dict[Ends, Motion]:
-        """The motions whose rotation and direction are by corners alone, so that their length is free."""
-        return {ends: motion for ends, motion in self.motions.items() if motion.triangulated is not None}
+        """The motions whose length is free."""
+        return {ends: motion for ends, motion in self.motions.items() if motion.is_triangulated}
 
     def replaced(self, motions: Mapping[Ends, Motion]) -> StepTable:
         """The same with some motions replaced."""

@@ -110,9 +110,7 @@ def close_loops(
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    candidates = find_candidates(
-        views, path[np.array([view.index for view in views], dtype=int)], config, get_or_compute
-    )
+    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], get_or_compute)
     thresholds = LoopThresholds.of_frames(config)
     verifier = LoopVerifier(thresholds, intrinsics, get_or_compute, seed)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)

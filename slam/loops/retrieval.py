@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from slam.config import LoopsConfig
 from slam.loops.descriptors import Descriptors, View, hamming
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
@@ -27,6 +26,8 @@ _CANDIDATES_PER_FRAME = 2  # largest number of places verified for a frame
 _PEAK_FRAMES = 10  # least distance between candidate places, frames
 _MIN_SCORE = 0.2  # least retrieval score, relative to that of neighbouring frames
 _WORDS = 1000  # size of the binary vocabulary learned on the run
+_LEAST_PATH_M = 15.0  # least distance of the two frames of a loop along the path
+_LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,13 @@ class Candidate:
 
 
 def find_candidates(
-    views: Sequence[View], path_m: FloatArray, config: LoopsConfig, get_or_compute: GetOrCompute = without_cache
+    views: Sequence[View], path_m: FloatArray, get_or_compute: GetOrCompute = without_cache
 ) -> list[Candidate]:
-    """For each view the most similar earlier views, the best first.
+    """For each view the most similar earlier views, the best first, none within 30 frames or 15 m of path.
 
     Args:
         views: in time order.
         path_m: distance driven up to each view ``(V,)``, in the unit of the trajectory.
-        config: least distance in time and path.
         get_or_compute: cache of the words.
     """
     everything = _all_descriptors(views)
@@ -67,8 +67,8 @@ def find_candidates(
     for start in range(0, len(views), _BLOCK):
         block = rows[start : start + _BLOCK]
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
-        near = indices[block, None] - indices[None, :] < config.min_gap_frames
-        near |= path_m[block, None] - path_m[None, :] < config.min_path_m
+        near = indices[block, None] - indices[None, :] < _LEAST_GAP_FRAMES
+        near |= path_m[block, None] - path_m[None, :] < _LEAST_PATH_M
         scores[near] = 0.0
         for later, row in zip(block, scores, strict=True):
             found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices)]

@@ -22,12 +22,13 @@ from slam.frontend.image_gate import GateState
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.dynamic_mask import DynamicMask
-from slam.frontend.visual.epipolar import TriangulatedPoints, UnitRelativePose
+from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.tracking import Corners, TrackerState
+from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
 from slam.loops.descriptors import View
@@ -98,7 +99,7 @@ class SessionCheckpoint:
                 "finished, and not with output.keep=nothing"
             )
         checkpoint = cls.read(folder / DRIVE)
-        if (folder / KEYFRAMES).is_file():
+        if (folder / KEYFRAMES).exists():
             checkpoint.state.seen.keyframes.extend(read_keyframes(folder / KEYFRAMES))
         return checkpoint
 

@@ -153,7 +153,7 @@ class KeyframeTracking:
 
 def is_vehicle(seen: Observations) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
-    triangulated = (motion for motion in seen.motions if motion.triangulated is not None)
+    triangulated = (motion for motion in seen.motions if motion.is_triangulated)
     first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]
     if len(first) < _DECISION_STEPS:
         return None

@@ -120,7 +120,7 @@ class RunFolder:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
         stem = name if name == "reference" else f"trajectory_{name}"
         path = self.path / f"{stem}.tum.txt"
-        return read_trajectory(path, "tum") if path.is_file() else None
+        return read_trajectory(path, "tum") if path.exists() else None
 
     def require(self, name: str) -> Path:
         """The path of a file of the run.

@@ -109,7 +109,7 @@ def beside(*folders: Path) -> CameraFile | None:
     Raises:
         SequenceError: if it is wrong.
     """
-    path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).is_file()), None)
+    path = next((folder / CAMERA_FILE for folder in folders if (folder / CAMERA_FILE).exists()), None)
     return None if path is None else read_camera_file(path)
 
 

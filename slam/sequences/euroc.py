@@ -123,7 +123,7 @@ def _read_sensor(path: Path) -> _Sensor:
 def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth."""
     table = folder / "data.csv"
-    if not table.is_file():
+    if not table.exists():
         return None
     rows = _rows(table)
     known = np.array([_stamp(row[0], table) for row in rows])
@@ -133,7 +133,7 @@ def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> 
     except (ValueError, IndexError) as error:
         raise SequenceError(f"{table} needs stamp, position and quaternion in each row: {error}") from error
     sensor = folder / "sensor.yaml"
-    T_body_sensor = _read_sensor(sensor).T_body_sensor if sensor.is_file() else np.eye(4)
+    T_body_sensor = _read_sensor(sensor).T_body_sensor if sensor.exists() else np.eye(4)
     T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
     T_any_camera = poses_near(T_any_body @ T_body_camera, known, stamps, table)
     describe_unknown(T_any_camera, table)

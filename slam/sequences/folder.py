@@ -48,7 +48,7 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
 
 
 def _stamps(places: tuple[Path, ...], files: NumberedFiles, fps: float) -> FloatArray:
-    path = next((path for path in places if path.is_file()), None)
+    path = next((path for path in places if path.exists()), None)
     return uniform_stamps(len(files), fps) if path is None else read_stamps(path, files)
 
 

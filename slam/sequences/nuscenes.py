@@ -131,7 +131,7 @@ def _scans(
     close = np.abs(known[nearest] - stamps) <= _SCAN_DELAY_S
     paths = {int(k): root / lidar.rows[nearest[k]]["filename"] for k in np.flatnonzero(close)}
     scans: dict[int, ScanReader] = {
-        k: partial(read_velodyne, path, _LIDAR_COLUMNS) for k, path in paths.items() if path.is_file()
+        k: partial(read_velodyne, path, _LIDAR_COLUMNS) for k, path in paths.items() if path.exists()
     }
     (T_ego_lidar,) = _poses([lidar.mount])
     return se3.invert(T_ego_camera) @ T_ego_lidar, scans

@@ -22,7 +22,7 @@ def read_pose_files(paths: list[Path]) -> FloatArray:
     """
     T_any_camera = np.full((len(paths), 4, 4), np.nan)
     for k, path in enumerate(paths):
-        if not path.is_file():
+        if not path.exists():
             continue
         try:
             pose = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)

@@ -108,7 +108,7 @@ def _text(path: Path) -> str:
 
 def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
     """The registered depth maps of ``depth.txt`` whose stamps are within 20 ms of an image's."""
-    if not (folder / _DEPTH_INDEX).is_file():
+    if not (folder / _DEPTH_INDEX).exists():
         return None
     known, paths = _read_index(folder / _DEPTH_INDEX)
     nearest = np.abs(known[None] - stamps[:, None]).argmin(axis=1)
@@ -118,7 +118,7 @@ def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
 
 def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where the ground truth does not cover them; None without it."""
-    if not path.is_file():
+    if not path.exists():
         return None
     truth = read_trajectory(path, format="tum")
     T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps, path)
@@ -127,7 +127,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:
-    if not (path / INDEX_FILE).is_file():
+    if not (path / INDEX_FILE).exists():
         return {}
     return {path.absolute().name: partial(open_tum, path, asked.camera)}
 

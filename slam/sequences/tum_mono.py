@@ -81,7 +81,7 @@ def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
 
 def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     """``T_any_camera`` at the images' stamps, NaN where unknown; None without the file."""
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
         rows = np.array([line.split() for line in read_text(path).splitlines() if line], np.float64)

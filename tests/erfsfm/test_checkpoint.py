@@ -191,6 +191,12 @@ def test_fingerprint_depends_on_both_files(folder: Path, tmp_path: Path) -> None
         assert weights_sha256(changed) != before
 
 
+def test_fingerprint_depends_on_what_makes_poses_of_the_same_weights(folder: Path) -> None:
+    before, record = weights_sha256(folder), folder / "model.yaml"
+    record.write_text(record.read_text().replace("alignment: none", "alignment: images"))
+    assert weights_sha256(folder) != before
+
+
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_text("old")

@@ -96,6 +96,7 @@ def test_the_last_override_counts() -> None:
         ("training.steps=many", "got 'many'"),
         ("training.learning_rate=-1", "greater than 0"),
         ("network.sources=3", "2 or 4"),
+        ("network.alignment=flow", "'none' or 'images'"),
         ("network.fidelity=exact", "'default' or 'paper'"),
         ("network.height=0", "network.height"),
         ("loss.reduction=median", "loss.reduction"),
@@ -127,6 +128,7 @@ def test_bad_overrides(override: str, words: str) -> None:
         ("a: b: c", "not YAML"),
         ("training: {precision: 64}", "training.precision"),
         ("loss: {mask_weight: 1}", "network.masks"),
+        ("network: {alignment: images, height: 100}", "multiples of 32; got 100 and 416"),
     ],
 )
 def test_bad_files(tmp_path: Path, text: str, words: str) -> None:

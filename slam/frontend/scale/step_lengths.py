@@ -20,12 +20,9 @@ from scipy.sparse.linalg import spsolve
 
 from slam.config import LengthConfig
 from slam.frames import Ends
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
-from slam.robust import mad_sigma, weighted_median
 from slam.se3 import FloatArray
 
-_LEAST_COMMON = 12
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5
 _HUBER_K = 1.345
@@ -91,35 +88,18 @@ def gather_evidence(
         prior_unit: that unit per unscaled length near each frame ``(N,)``.
     """
     evidence = StepEvidence.empty(len(links))
-    before: TriangulatedPoints | None = None
+    before: Motion | None = None
     for row, ends in enumerate(links):
         motion = motions.get(ends)
-        points = None if motion is None else motion.triangulated
-        if motion is not None and points is not None:
+        if motion is not None:
             evidence.learned[row] = np.log(motion.length_unscaled * prior_unit[ends[0]])
             if ends in absolute:
                 length, evidence.absolute_sigma[row] = absolute[ends]
                 evidence.absolute[row] = np.log(length)
-            ratio = None if before is None else length_ratio(before, points)
-            if ratio is not None:
-                evidence.ratio[row], evidence.ratio_sigma[row] = ratio
-        before = points
+            if before is not None and motion.length_ratio is not None:
+                evidence.ratio[row], evidence.ratio_sigma[row] = motion.length_ratio
+        before = motion
     return evidence
-
-
-def length_ratio(earlier: TriangulatedPoints, later: TriangulatedPoints) -> tuple[float, float] | None:
-    """Log of the later step's length over the earlier's, with its sigma, from points that both triangulated.
-
-    In the frame between, a point's depth is ``|t| z`` by either step; None with too few common points.
-    """
-    _, first, second = np.intersect1d(earlier.track_ids, later.track_ids, assume_unique=True, return_indices=True)
-    if len(first) < _LEAST_COMMON:
-        return None
-    logarithms = np.log(earlier.depth_current[first] / later.depth_previous[second])
-    weights = 1.0 / (earlier.relative_sigma[first] ** 2 + later.relative_sigma[second] ** 2)
-    middle = weighted_median(logarithms, weights)
-    deviation = mad_sigma(logarithms - middle)
-    return middle, deviation / float(np.sqrt(len(first)))
 
 
 def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:

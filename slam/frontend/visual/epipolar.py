@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.resection import consensus, ransac_order
@@ -26,19 +25,6 @@ class UnitRelativePose:
 
     R_current_previous: FloatArray
     direction: FloatArray
-
-
-@dataclass(frozen=True)
-class TriangulatedPoints:
-    """``M`` scene points that a motion triangulated, by the identifiers of their tracks ``track_ids`` ``(M,)``.
-
-    z-depths ``(M,)`` in both cameras are in units of the motion's length, ``relative_sigma`` ``(M,)`` is that of both.
-    """
-
-    track_ids: NDArray[np.int64]
-    depth_previous: FloatArray
-    depth_current: FloatArray
-    relative_sigma: FloatArray
 
 
 def unit_pose_by_essential(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.frames import Ends, RelativePose
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.step_noise import StepNoise
 from slam.se3 import FloatArray, invert, make
 
@@ -18,18 +17,24 @@ _LEAST_RELATIVE_SIGMA = 1e-3
 class Motion:
     """A measured ``relative_pose``, its length by learned depth, unscaled.
 
-    Where corners alone gave rotation and direction, ``triangulated`` holds the points that they triangulated and
-    ``direction_sigmas`` ``(3,)`` the noise of the direction in the later camera, radians; else both are None.
+    Where corners alone gave rotation and direction, ``direction_sigmas`` ``(3,)`` are the noise of the direction in the
+    later camera, radians, and ``length_ratio`` is the log of the length over that of the step before, by points that
+    both triangulated, with its sigma; else None.
     """
 
     relative_pose: RelativePose
-    triangulated: TriangulatedPoints | None = None
     direction_sigmas: FloatArray | None = None
+    length_ratio: tuple[float, float] | None = None
 
     @property
     def ends(self) -> Ends:
         """Both frames."""
         return self.relative_pose.ends
+
+    @property
+    def is_triangulated(self) -> bool:
+        """Whether corners alone gave rotation and direction, so that the length is free."""
+        return self.direction_sigmas is not None
 
     @property
     def length_unscaled(self) -> float:

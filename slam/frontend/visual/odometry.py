@@ -16,7 +16,6 @@ from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import (
-    TriangulatedPoints,
     UnitRelativePose,
     depth_in_current,
     parallax_px,
@@ -28,6 +27,7 @@ from slam.frontend.visual.motion_history import MotionHistory, usual_error
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.tracking import CornerTracker, TrackerState, Tracks
+from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
     DEPTH_RELATIVE_SIGMA,
@@ -61,12 +61,17 @@ _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degree
 
 @dataclass(frozen=True)
 class OdometryState:
-    """State of visual odometry; ``last`` is the motion to the last frame, where one was measured."""
+    """State of visual odometry; ``last`` is the motion to the last frame, where one was measured.
+
+    ``points`` are those of the last motion that triangulated any, which ended at frame ``points_at``.
+    """
 
     tracker: TrackerState
     dynamic_mask: DynamicMask
     history: MotionHistory
     last: Motion | None = None
+    points: TriangulatedPoints | None = None
+    points_at: int = -1
 
 
 class VisualOdometry:
@@ -231,8 +236,11 @@ class VisualOdometry:
         triangulated = TriangulatedPoints(
             tracks.track_ids[solid], depth_previous[solid], depth_current[solid], relative_sigma[solid]
         )
+        state = self._state
+        ratio = triangulated.length_ratio(state.points) if state.points and state.points_at == ends[0] else None
+        self._state = replace(state, points=triangulated, points_at=ends[1])
         sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
-        return Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), triangulated, direction)
+        return Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio)
 
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""

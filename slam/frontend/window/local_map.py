@@ -37,6 +37,7 @@ _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
 CORNER_SPACING_PX = 12.0  # least distance between corners, pixels
+_ADJUSTED = 10  # number of the last keyframes that are adjusted
 
 
 @dataclass(frozen=True)
@@ -106,14 +107,14 @@ class LocalMap:
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
 
-    def triangulate(self, intrinsics: Intrinsics, config: WindowConfig) -> None:
+    def triangulate(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
         newest = self.keyframes[-1]
         track_ids = newest.track_ids[~self.known(newest.track_ids)]
         if not len(track_ids):
             return
         poses, rays, point = [], [], []
-        for keyframe in self.keyframes[-config.keyframes - _SHARED :]:
+        for keyframe in self.keyframes[-_ADJUSTED - _SHARED :]:
             _, a, b = np.intersect1d(keyframe.track_ids, track_ids, assume_unique=True, return_indices=True)
             poses.append(np.repeat(keyframe.T_camera_world[None], len(a), axis=0))
             rays.append(intrinsics.rays(keyframe.pixels[a]))
@@ -129,17 +130,17 @@ class LocalMap:
         good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)
         self.points[track_ids[good]] = X[good]
 
-    def adjust(self, intrinsics: Intrinsics, config: WindowConfig) -> TrackIds:
+    def adjust(self, intrinsics: Intrinsics) -> TrackIds:
         """Adjust the last keyframes and their points; older ones that see many of these points stay fixed.
 
         Returns:
             Tracks whose point or newest sighting was taken out as an outlier.
         """
-        first = max(len(self.keyframes) - config.keyframes, 0)
+        first = max(len(self.keyframes) - _ADJUSTED, 0)
         seen = np.zeros(len(self.points), np.bool_)
         seen[np.concatenate([keyframe.track_ids for keyframe in self.keyframes[first:]])] = True
         seen &= np.isfinite(self.points[:, 0])
-        fixed = self._sharing(seen, first, config.keyframes)
+        fixed = self._sharing(seen, first)
         chosen = [*fixed, *range(first, len(self.keyframes))]
         sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
@@ -158,10 +159,10 @@ class LocalMap:
         newest = track_ids[sightings.point[bad & (sightings.camera == len(chosen) - 1)]]
         return np.concatenate([dead, newest])
 
-    def _sharing(self, seen: NDArray[np.bool_], first: int, most: int) -> list[int]:
+    def _sharing(self, seen: NDArray[np.bool_], first: int) -> list[int]:
         """The keyframes before ``first`` that share most of the points seen."""
         shared = [(int(seen[keyframe.track_ids].sum()), k) for k, keyframe in enumerate(self.keyframes[:first])]
-        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:most]
+        best = sorted((pair for pair in shared if pair[0] >= _SHARED), reverse=True)[:_ADJUSTED]
         return sorted(k for _, k in best)
 
     def sightings(self, chosen: Sequence[int], seen: NDArray[np.bool_]) -> tuple[Sightings, TrackIds]:

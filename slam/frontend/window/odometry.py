@@ -39,6 +39,7 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
+_KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
 
 @dataclass(frozen=True)
@@ -245,13 +246,13 @@ class WindowOdometry:
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
     def _wants_keyframe(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> bool:
-        keyframe, config = segment.map.keyframes[-1], self._config
+        keyframe = segment.map.keyframes[-1]
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(keyframe.track_ids), MIN_POINTS):
             return True
         before = keyframe.pixels[np.searchsorted(keyframe.track_ids, track_ids)]
         R = self._state.T_camera_world[:3, :3] @ keyframe.T_camera_world[:3, :3].T
         rays_before, rays = self._intrinsics.rays(before), self._intrinsics.rays(pixels.astype(np.float64))
-        limit = config.keyframe_parallax_ratio * self._intrinsics.width
+        limit = _KEYFRAME_PARALLAX_RATIO * self._intrinsics.width
         moved = float(np.median(np.linalg.norm(pixels - before, axis=1)))
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
         return parallax > limit or moved > _MOST_FLOW * limit
@@ -274,8 +275,8 @@ class WindowOdometry:
             self._add_first_keyframes(segment)
         local.add(WindowKeyframe(frame.index, T, track_ids, places, unknown, describe(frame.grey, places), frame.grey))
         if segment.started:
-            local.triangulate(intrinsics, config)
-            local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics, config))
+            local.triangulate(intrinsics)
+            local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
         state.places = local.keyframes[-1].pixels.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)

@@ -84,14 +84,14 @@ def _no_images(folder: Path) -> str:
 
 
 def _stamps(path: Path, files: NumberedFiles) -> FloatArray:
-    if not path.is_file():
+    if not path.exists():
         return fallback_stamps(path, len(files))
     return read_stamps(path, files)
 
 
 def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_cam0: FloatArray) -> FloatArray | None:
     """Poses of the camera in use from poses of camera 0; None where the root has no poses."""
-    if not path.is_file():
+    if not path.exists():
         return None
     T_world_cam0 = read_trajectory(path, format="kitti").T_world_camera
     assigned = files.rows_of(len(T_world_cam0))

@@ -94,7 +94,7 @@ def drive_sources(name: str) -> tuple[Source, ...]:
 
 def _times(path: Path, files: NumberedFiles) -> FloatArray | None:
     """Seconds since KITTI's year began, one for each row of files, or None without ``path``."""
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
         stamps = np.array(read_text(path).split("\n"), dtype="datetime64[ns]")
@@ -108,7 +108,7 @@ def _times(path: Path, files: NumberedFiles) -> FloatArray | None:
 def _T_camera_lidar(drive: Path, cameras: CalibrationFile, number: str) -> FloatArray | None:
     """LiDAR to the rectified camera; None where ``calib_velo_to_cam.txt`` is missing."""
     path = drive.parent / VELO_TO_CAM
-    if not path.is_file():
+    if not path.exists():
         logger.warning("no %s: neither LiDAR nor GPS/INS has extrinsics to the camera", path)
         return None
     T_rect0_cam0 = se3.make(cameras.matrix("R_rect_00", (3, 3)), np.zeros(3))
@@ -128,7 +128,7 @@ def _true_poses(
     folder, path = drive / "oxts" / "data", drive.parent / IMU_TO_VELO
     if T_camera_lidar is None or not folder.is_dir():
         return None
-    if not path.is_file():
+    if not path.exists():
         logger.warning("no %s: the drive has no reference poses", path)
         return None
     found = sorted(folder.glob("*.txt"))

@@ -121,6 +121,7 @@ def test_padding_is_tensorflows_same():
     [
         ({"name": "depthnet-lite0", "fidelity": "paper"}, "depthnet-lite0 is not of the paper"),
         ({"name": "posenet-lite0", "mask_branch": True}, "posenet-lite0 has no explainability masks"),
+        ({"name": "posenet-lite0", "alignment": "images"}, "posenet-lite0 solves for the motion by itself"),
         ({"name": "posenet-lite0", "sources": 9}, "sources must be 1 to 8; got 9"),
     ],
 )

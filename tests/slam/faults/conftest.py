@@ -130,11 +130,14 @@ def examine(path: Path, content: bytes, read: Read, sound: Sound, place: Path) -
         try:
             value = read(path)
         except (SlamError, ErfsfmError) as error:
-            line = str(error)
-            assert "\n" not in line and len(line) < 1000, line
-            assert path.name in line or path.parent.name in line or str(place) in line, line
+            _check_line(str(error), path, place)
             return
     assert value is None or sound(value)
+
+
+def _check_line(line: str, path: Path, place: Path) -> None:
+    assert "\n" not in line and len(line) < 1000, line
+    assert path.name in line or path.parent.name in line or str(place) in line, line
 
 
 @pytest.fixture
@@ -152,6 +155,20 @@ def damage_file(tmp_path: Path) -> Callable[[Path, Read, Sound, bool], None]:
         hold()
 
     return damage
+
+
+@pytest.fixture
+def refuse_folder(tmp_path: Path) -> Callable[[Path, Read], None]:
+    """Puts a folder in the place of a file, which must be refused in one line about it."""
+
+    def refuse(path: Path, read: Read) -> None:
+        path.unlink()
+        path.mkdir()
+        with pytest.raises((SlamError, ErfsfmError)) as raised:
+            read(path)
+        _check_line(str(raised.value), path, tmp_path)
+
+    return refuse
 
 
 @pytest.fixture(scope="session")

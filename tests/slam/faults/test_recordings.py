@@ -295,6 +295,13 @@ def test_a_damaged_recording_is_read_or_refused_in_one_line(
     damage_file(readable, file.read, file.sound, many=False)
 
 
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.path)
+def test_a_folder_in_the_place_of_a_file_is_refused(
+    file: File, readable: Path, refuse_folder: Callable[..., None]
+) -> None:
+    refuse_folder(readable, file.read)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.path)
 def test_many_damaged_recordings(file: File, readable: Path, damage_file: Callable[..., None]) -> None:

@@ -15,13 +15,11 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.step_table import StepTable
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.se3 import FloatArray, chain, from_rotation_vector, invert
 
 FRAMES = 12
 METRES = 4.0  # per unscaled length
-NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
 NOISE = PoseNoise(
     frame=(0.01,) * 6,
     turn=(0.0,) * 6,
@@ -48,7 +46,7 @@ def pose(first: int, last: int, source: str = "essential", T: FloatArray = TRUE)
 
 
 def table(steps: list[Ends], T: FloatArray) -> StepTable:
-    return StepTable.of([Motion(pose(*ends, T=T), NO_POINTS, np.full(3, 0.002)) for ends in steps])
+    return StepTable.of([Motion(pose(*ends, T=T), np.full(3, 0.002)) for ends in steps])
 
 
 def snippets(T: FloatArray) -> list[SnippetPoses]:

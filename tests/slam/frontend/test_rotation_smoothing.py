@@ -11,14 +11,12 @@ from scipy.spatial.transform import Rotation
 from slam.frames import Ends, RelativePose
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.step_table import StepTable
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.se3 import FloatArray, invert, make
 
 SIGMA = np.deg2rad(0.02)
 STEPS = 40
-NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
 T_CURRENT_PREVIOUS = np.array([0.1, 0.0, -1.2])  # translation of every step
 
 
@@ -38,7 +36,7 @@ def table_of(rotations: Mapping[Ends, FloatArray]) -> StepTable:
     """Triangulated steps with these ``R_current_previous``."""
     sigmas = np.repeat([SIGMA, 0.01], 3)
     return StepTable.of(
-        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), NO_POINTS, np.zeros(3))
+        Motion(RelativePose(*ends, invert(make(R, T_CURRENT_PREVIOUS)), sigmas, "essential"), np.zeros(3))
         for ends, R in rotations.items()
     )
 

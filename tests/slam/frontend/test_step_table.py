@@ -7,17 +7,14 @@ import pytest
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.step_table import StepTable, links, path_between, shortest_by_start
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.se3 import from_rotation_vector
-
-NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
 
 
 def motion(first: int, last: int, length: float = 1.0, is_triangulated: bool = True) -> Motion:
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, length]))
     if is_triangulated:
-        return Motion(RelativePose(first, last, T, np.full(6, 0.01), "essential"), NO_POINTS, np.zeros(3))
+        return Motion(RelativePose(first, last, T, np.full(6, 0.01), "essential"), np.zeros(3))
     return Motion(RelativePose(first, last, T, np.full(6, 0.01), "pnp"))
 
 

@@ -6,7 +6,6 @@ import pytest
 
 from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, RelativePose
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
 from slam.pipeline.observations import Observations
@@ -20,7 +19,6 @@ assert _SPEC is not None
 assert _SPEC.loader is not None
 room = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(room)
-POINTS = TriangulatedPoints(np.arange(1), np.ones(1), np.ones(1), np.ones(1))
 
 
 def steps(count: int, scatter: float) -> Observations:
@@ -28,7 +26,7 @@ def steps(count: int, scatter: float) -> Observations:
     motions = []
     for k in range(count):
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
-        motions.append(Motion(RelativePose(k, k + 1, T, np.ones(6), "essential"), POINTS, np.ones(3)))
+        motions.append(Motion(RelativePose(k, k + 1, T, np.ones(6), "essential"), np.ones(3)))
     return Observations(motions=motions)
 
 

@@ -15,7 +15,6 @@ from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_sca
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import ScaleEstimate
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion
 
 DOWN = np.array([0.0, 1.0, 0.0])
@@ -24,7 +23,6 @@ UNIT = 0.05  # unscaled lengths per metre
 STEPS_M = 1.0 + 0.2 * np.sin(np.arange(60) / 6.0)
 FRAMES = len(STEPS_M) + 1
 SINGLE = [(k, k + 1) for k in range(FRAMES - 1)]
-NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
 
 
 def metres(ends: Ends) -> float:
@@ -41,7 +39,7 @@ def measured(
     road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
 ) -> LengthMeasurements:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
-    motions = {ends: Motion(step(ends, UNIT, "essential"), NO_POINTS, np.zeros(3)) for ends in steps}
+    motions = {ends: Motion(step(ends, UNIT, "essential"), np.zeros(3)) for ends in steps}
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.sparse import csc_array
 
 from slam.config import LengthConfig
 from slam.frames import Ends, RelativePose
-from slam.frontend.scale.step_lengths import StepEvidence, gather_evidence, length_ratio, marginals, solve_lengths
-from slam.frontend.visual.epipolar import TriangulatedPoints
+from slam.frontend.scale.step_lengths import StepEvidence, gather_evidence, marginals, solve_lengths
 from slam.frontend.visual.motion import Motion
 from slam.se3 import from_rotation_vector
 
@@ -95,60 +93,30 @@ def test_steps_that_nothing_measured_have_no_length():
     np.testing.assert_array_equal(nothing.unit_correction, 1.0)
 
 
-def triangulated(track_ids: np.ndarray, previous: np.ndarray, current: np.ndarray) -> TriangulatedPoints:
-    return TriangulatedPoints(track_ids, previous, current, np.full(len(track_ids), 0.02))
-
-
-def test_ratio_of_lengths_from_common_points():
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(4.0, 20.0, 60)  # metres, in the camera between
-    track_ids = np.arange(60)
-    earlier = triangulated(track_ids, depth + 2.0, depth / 2.0)  # a step of 2 m
-    wrong = np.where(track_ids < 10, 3.0, 1.0)
-    later = triangulated(track_ids[::-1] + 5, depth[::-1] / 1.5, depth[::-1])
-    assert length_ratio(earlier, triangulated(track_ids + 100, depth, depth)) is None
-    shifted = triangulated(track_ids, wrong * depth / 1.5, depth)  # a step of 1.5 m, ten points on a car
-    ratio = length_ratio(earlier, shifted)
-    assert ratio is not None
-    assert ratio[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
-    again = length_ratio(triangulated(track_ids + 5, depth + 2.0, depth / 2.0), later)
-    assert again is not None and again[0] == pytest.approx(np.log(1.5 / 2.0), abs=1e-9)
-
-
-def motion(ends: Ends, metres: float, unit: float, points_between: np.ndarray | None) -> Motion:
-    """A step whose points lie at depths ``(M,)`` in the camera in which it begins; None is not triangulated."""
+def motion(ends: Ends, metres: float, unit: float, ratio: float) -> Motion:
+    """A step, whose ratio to the one before is measured."""
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres]))
-    pose = RelativePose(*ends, T, np.full(6, 0.01), "essential")
-    if points_between is None:
-        return Motion(pose)
-    depth = points_between - ends[0]  # every frame is a metre further on
-    return Motion(pose, triangulated(np.arange(len(depth)), depth / metres, (depth - metres) / metres), np.zeros(3))
+    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.zeros(3), (np.log(ratio), 0.01))
 
 
 def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
     """Frames a metre apart, a step over three frames between steps of one, and learned depth that drifts."""
     links = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (7, 8)]
-    points = np.random.default_rng(0).uniform(20.0, 40.0, 50)
-    motions = {ends: motion(ends, float(ends[1] - ends[0]), 0.1, points) for ends in links if ends != (6, 7)}
+    ratio = {(2, 5): 3.0, (5, 6): 1.0 / 3.0}
+    motions = {
+        ends: motion(ends, float(ends[1] - ends[0]), 0.1, ratio.get(ends, 1.0)) for ends in links if ends != (6, 7)
+    }
     absolute = {(2, 5): (3.1, 0.05), (5, 6): (1.2, 0.06), (6, 7): (9.0, 0.06), (3, 4): (1.0, 0.06)}
     unit = np.linspace(10.0, 20.0, 9)
     evidence = gather_evidence(links, motions, absolute, unit)
     nan = np.nan
     expected = np.log([nan, 1.0, 3.0, 1.0 / 3.0, nan, nan])
     np.testing.assert_allclose(evidence.ratio, expected, atol=1e-9)
+    np.testing.assert_array_equal(evidence.ratio_sigma, [nan, 0.01, 0.01, 0.01, nan, nan])
     lengths = np.array([1.0, 1.0, 3.0, 1.0, nan, 1.0])
     np.testing.assert_allclose(evidence.learned, np.log(0.1 * lengths * unit[[0, 1, 2, 5, 6, 7]]))
     np.testing.assert_allclose(evidence.absolute, np.log([nan, nan, 3.1, 1.2, nan, nan]))
     np.testing.assert_allclose(evidence.absolute_sigma, [nan, nan, 0.05, 0.06, nan, nan])
-
-
-def test_a_step_that_is_not_triangulated_gives_no_evidence() -> None:
-    points = np.random.default_rng(0).uniform(20.0, 40.0, 50)
-    links = [(0, 1), (1, 2), (2, 3)]
-    motions = {ends: motion(ends, 1.0, 0.1, None if ends == (1, 2) else points) for ends in links}
-    evidence = gather_evidence(links, motions, {(1, 2): (1.0, 0.05)}, np.ones(4))
-    assert np.isnan(evidence.ratio).all() and np.isnan(evidence.absolute).all()
-    np.testing.assert_array_equal(np.isnan(evidence.learned), [False, True, False])
 
 
 def test_sigmas_are_those_of_the_whole_system() -> None:

@@ -7,12 +7,10 @@ import pytest
 
 from slam import se3
 from slam.frames import RelativePose
-from slam.frontend.visual.epipolar import TriangulatedPoints
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.step_noise import StepNoise
 
 NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
-NO_POINTS = TriangulatedPoints(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(3)))
 ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])
 T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.array([0.1, 0.0, 2.0]))
 
@@ -20,7 +18,7 @@ T_PREVIOUS_CURRENT = se3.from_rotation_vector(np.deg2rad([0.0, 1.0, 0.0]), np.ar
 def triangulated_motion() -> Motion:
     sigmas = pose_sigmas(T_PREVIOUS_CURRENT, ROTATION_SIGMAS, DIRECTION_SIGMAS, 0.05)
     pose = RelativePose(4, 5, T_PREVIOUS_CURRENT, sigmas, "essential")
-    return Motion(pose, NO_POINTS, DIRECTION_SIGMAS)
+    return Motion(pose, DIRECTION_SIGMAS)
 
 
 def motion_by_points() -> Motion:

@@ -1,0 +1,180 @@
+"""Rotations of a pose network's guess, measured in the images: what is seen in two frames must meet.
+
+Between neighbouring frames cells of the image are followed from coarse to fine (Lucas and Kanade 1981), beginning where
+the guessed motion over a road would carry them. The rotation by which the rays of all cells meet follows by least
+squares; the depth of a cell is known hardly at all, so that parallax of something near is not taken for a turn. Where
+an image shows nothing to follow, the guess stays. Nothing here is learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from erfsfm.geometry.alignment import FOCAL, NOISE, align, cell_rays, project, rotation_to_euler
+from erfsfm.geometry.transforms import euler_to_rotation
+
+Alignment = Literal["none", "images"]
+
+
+class _Level(NamedTuple):
+    """One size of the images: how often halved, pixels from cell to cell and of a cell, and iterations."""
+
+    halvings: int
+    stride: int
+    cell: int
+    iterations: int
+
+
+_LEVELS = (_Level(3, 2, 6, 2), _Level(2, 2, 6, 2), _Level(1, 4, 8, 1))
+_GREY_STEPS = 127.5  # of 8 bits, in a unit of colours in [-1, 1]
+_LEAST_TEXTURE = 1.0  # mean squared gradient of a cell that is followed hesitatingly, (8-bit steps / pixel)^2
+_GREY_NOISE = 2.0  # 8-bit steps
+_INDEPENDENT = 8.0  # pixels of a cell whose noise is independent of the others'
+_SUREST = 0.15  # pixels of the whole image: sigma of a perfect match
+_LARGEST_STEP = 2.0  # pixels of a level, in one iteration
+_SHOWN = 0.75  # of a cell's height and width, for it to count
+_CAMERA_HEIGHT = 0.07  # roughly, in the unit of a pose network that was taught lengths
+_FARTHEST = 0.2  # inverse depth of what is not road
+_DEPTH_SIGMA = 4.0  # relative
+_OUTLIERS = (4.0, 1.5)  # of the linearisations, in NOISE
+
+
+def aligned(vectors: Tensor, target: Tensor, sources: Sequence[Tensor]) -> Tensor:
+    """The motion with rotations measured in the images; where the cameras are in the target's frame stays as guessed.
+
+    Args:
+        vectors: guessed pose vectors ``(B, N, 6)``.
+        target: colours in [-1, 1], ``(B, 3, H, W)``, H and W multiples of 32.
+        sources: N images like the target, in time order.
+
+    Returns:
+        Pose vectors ``(B, N, 6)``.
+    """
+    with torch.autocast(target.device.type, enabled=False):
+        images = [image[:, 1:2].float() for image in (target, *sources)]  # green, the sharpest of a colour camera
+        return _aligned(vectors.float(), images[0], images[1:])
+
+
+def _aligned(vectors: Tensor, target: Tensor, sources: list[Tensor]) -> Tensor:
+    middle, count = len(sources) // 2, len(sources)
+    images = torch.stack([*sources[:middle], target, *sources[middle:]], dim=1)
+    R, t = euler_to_rotation(vectors[..., 3:]), vectors[..., :3]
+    R_all = _inserted(R, torch.eye(3, device=R.device), middle)
+    t_all = _inserted(t, torch.zeros(3, device=t.device), middle)
+    R_step = R_all[:, 1:] @ R_all[:, :-1].transpose(-1, -2)  # each frame in the next one's camera
+    t_step = t_all[:, 1:] - _turned(R_step, t_all[:, :-1])
+    R_step = _rotations(images, R_step.flatten(0, 1), t_step.flatten(0, 1)).reshape(R_step.shape)
+    measured = [torch.eye(3, device=R.device).expand_as(R_step[:, 0])]
+    for k in range(middle - 1, -1, -1):
+        measured.insert(0, R_step[:, k].transpose(-1, -2) @ measured[0])
+    for k in range(middle, count):
+        measured.append(R_step[:, k] @ measured[-1])
+    R_new = torch.stack(measured[:middle] + measured[middle + 1 :], dim=1)
+    t_new = _turned(R_new @ R.transpose(-1, -2), t)
+    return torch.cat([t_new, rotation_to_euler(R_new)], dim=-1)
+
+
+def _rotations(images: Tensor, R: Tensor, t: Tensor) -> Tensor:
+    """Rotations ``(B * N, 3, 3)`` from each frame of ``(B, N + 1, 1, H, W)`` to the next, from guessed motions."""
+    size = (int(images.shape[-2]), int(images.shape[-1]))  # constants in an exported graph
+    flow, information = _followed(_levels(images), _guess(R, t, size))
+    h, w = flow.shape[-2:]
+    rays = cell_rays(h, w, (1 / h, 1 / w), images.device)
+    scale = torch.tensor([FOCAL[0] * size[1], FOCAL[1] * size[0]], device=images.device)
+    seen = rays[:, :2] + flow.flatten(2).transpose(1, 2) / scale
+    weights = information.flatten(2).transpose(1, 2) * scale**2
+    weights = NOISE**2 * weights / (1 + (_SUREST / scale) ** 2 * weights)
+    inverse_depth = _road(rays).expand(len(R), -1)
+    R, _ = align(seen, weights, rays, (inverse_depth, _DEPTH_SIGMA * inverse_depth), (R, t), _OUTLIERS)
+    return R
+
+
+def _guess(R: Tensor, t: Tensor, size: tuple[int, int]) -> Tensor:
+    """Flow ``(B, 2, h, w)`` in pixels of the image on the cells of the coarsest level, by guessed motions."""
+    h, w = (pixels // 2 ** _LEVELS[0].halvings // _LEVELS[0].stride for pixels in size)
+    rays = cell_rays(h, w, (1 / h, 1 / w), R.device)
+    _, at, _ = project(rays, _road(rays).expand(len(R), -1), R, t)
+    pixels = torch.tensor([FOCAL[0] * size[1], FOCAL[1] * size[0]], device=R.device)
+    return ((at - rays[:, :2]) * pixels).transpose(1, 2).reshape(len(R), 2, h, w)
+
+
+def _road(rays: Tensor) -> Tensor:
+    """Inverse depth ``(P,)`` of a level road, and of something far above it."""
+    return (rays[:, 1] / _CAMERA_HEIGHT).clamp(min=_FARTHEST)
+
+
+def _levels(images: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Frames ``(B * N, 1, h, w)`` and those that follow, without their local mean, by level as in `_LEVELS`."""
+    pyramid = {1: F.avg_pool2d(_GREY_STEPS * images.flatten(0, 1), 2)}
+    for halvings in range(2, _LEVELS[0].halvings + 3):
+        pyramid[halvings] = F.avg_pool2d(pyramid[halvings - 1], 2)
+    levels = []
+    for level in _LEVELS:
+        mean = F.interpolate(pyramid[level.halvings + 2], scale_factor=4.0, mode="bilinear")
+        frames = (pyramid[level.halvings] - mean).unflatten(0, images.shape[:2])
+        levels.append((frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1)))
+    return levels
+
+
+def _followed(levels: list[tuple[Tensor, Tensor]], guess: Tensor) -> tuple[Tensor, Tensor]:
+    """Flow ``(B, 2, h, w)`` of the finest level's cells in pixels of the image, and its information."""
+    flow, before = guess, 0
+    for level, (first, second) in zip(_LEVELS, levels):
+        flow = flow * 2.0 ** (before - level.halvings)
+        if before:
+            size = (int(first.shape[-2]) // level.stride, int(first.shape[-1]) // level.stride)
+            flow = F.interpolate(flow, size=size, mode="bilinear")
+        flow, information = _improved(first, second, flow, level)
+        before = level.halvings
+    return flow * 2.0**before, information / 4.0**before
+
+
+def _improved(first: Tensor, second: Tensor, flow: Tensor, level: _Level) -> tuple[Tensor, Tensor]:
+    """Flow of cells in pixels after some iterations of Lucas and Kanade, and information of both its coordinates."""
+    h, w = int(first.shape[-2]), int(first.shape[-1])
+    rows, columns = (torch.arange(n, device=flow.device).float() for n in (h, w))
+    places = torch.stack([columns.expand(h, w), rows.unsqueeze(-1).expand(h, w)])
+    edges = torch.tensor([float(w), float(h)], device=flow.device).reshape(2, 1, 1)
+
+    def mean(*values: Tensor) -> list[Tensor]:
+        """Over each cell; cells overlap."""
+        margin = (level.cell - level.stride) // 2
+        return list(F.avg_pool2d(torch.cat(values, dim=1), level.cell, level.stride, margin).split(1, dim=1))
+
+    g_x, g_y = _gradient(first)
+    xx, xy, yy = mean(g_x * g_x, g_x * g_y, g_y * g_y)
+    m_xx, m_yy = xx + _LEAST_TEXTURE, yy + _LEAST_TEXTURE
+    determinant = m_xx * m_yy - xy * xy
+    for _ in range(level.iterations):
+        at = places + F.interpolate(flow, size=(h, w), mode="bilinear")
+        grid = ((2 * at + 1) / edges - 1).permute(0, 2, 3, 1)
+        error = F.grid_sample(second, grid, mode="bilinear", align_corners=False) - first
+        x, y, square = mean(g_x * error, g_y * error, error * error)
+        step = torch.cat([xy * y - m_yy * x, xy * x - m_xx * y], dim=1) / determinant
+        flow = flow + step.clamp(-_LARGEST_STEP, _LARGEST_STEP)
+    from_middle = (F.avg_pool2d(places, level.stride) + flow - (edges - 1) / 2).abs()
+    counted = (from_middle < edges / 2 - level.cell * (_SHOWN - 0.5)).all(dim=1, keepdim=True).to(first.dtype)
+    variance = (square + _GREY_NOISE**2) / _INDEPENDENT
+    return flow, torch.cat([xx, yy], dim=1) * counted / variance
+
+
+def _gradient(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Central differences ``(B, 1, h, w)`` along x and along y."""
+    wide = F.pad(image, (1, 1, 1, 1), mode="replicate")
+    return (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) / 2, (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) / 2
+
+
+def _inserted(values: Tensor, between: Tensor, middle: int) -> Tensor:
+    """Values ``(B, N, ...)`` of the sources with the target's own in the middle."""
+    own = between.expand(len(values), 1, *between.shape)
+    return torch.cat([values[:, :middle], own, values[:, middle:]], dim=1)
+
+
+def _turned(R: Tensor, vectors: Tensor) -> Tensor:
+    """Rotations ``(..., 3, 3)`` of vectors ``(..., 3)``."""
+    return (R @ vectors.unsqueeze(-1)).squeeze(-1)

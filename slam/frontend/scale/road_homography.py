@@ -5,9 +5,9 @@ A plane ``n . X = h`` of the current camera maps to the previous one by the homo
 ``m = |t| n / h`` that aligns both images of the road is estimated; its norm is the length. Learned depth is
 not used, so this length has neither the bias nor the drift of the networks.
 
-What changes slowly over the image, as light and reflections do, is taken from the difference of the aligned images. Taken
-from each image before, it would not be the same part of the road in both, for the road is larger in the later one:
-lengths came out 1 % short.
+What changes slowly over the image, as light and reflections do, is taken from the difference of the aligned images.
+Taken from each image before, it would not be the same part of the road in both, for the road is larger in the later
+one: lengths came out 1 % short.
 """
 
 from __future__ import annotations
@@ -222,8 +222,8 @@ class _Shape:
 class _Strip:
     """Pixels ``(P,)`` that see a strip of a level road, rows from the first below the horizon, and rays ``(3, P)``.
 
-    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the blurred mask of them,
-    and ``gradual`` the sigma of the blur.
+    They lie on a grid; ``places`` are their rows and columns there, ``coverage`` ``(H, W)`` is the blurred mask of
+    them, and ``gradual`` the sigma of the blur.
     """
 
     shape: _Shape

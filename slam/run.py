@@ -32,13 +32,14 @@ from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.folder import RunFolder
-from slam.results.output import check_output
+from slam.results.output import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.results.summary import Provenance
 from slam.runtime.imports import import_rerun
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
+from slam.storage.lock import FolderLock
 
 logger = logging.getLogger(__name__)
 
@@ -133,19 +134,30 @@ def run_slam(
         request = RunRequest(dataset=dataset, sequence=sequence, **options)  # type: ignore[arg-type]  # text becomes a path
     except ValidationError as error:
         raise RunError(f"run_slam: {first_problem(error)}") from error
-    with run_log() as log, raising_on_termination() as ignore_signals:
-        return complete(*_begin(request), log, ignore_signals)
+    with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
+        return complete(*_begin(request, lock), log, ignore_signals)
 
 
-def _begin(request: RunRequest) -> tuple[Job, RunFolder]:
+def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
     """Check everything, then make the folder of a new run, or go on in that of one that did not end."""
     if request.continues is not None:
         provenance = provenance_to_resume(request.continues, request.output, _recording(request))
         if provenance is not None:
+            lock.take(whole_place(request.continues))
             return _resume(request, request.continues, provenance)
+        if _recording(request) == {}:
+            raise RunError(
+                f"name the frames that follow those of {request.continues} (--dataset, --frames): only what did not "
+                "end goes on without, in its own folder"
+            )
         require_other_output(request.continues, request.output)
     job = _prepare(request)
-    return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
+    if request.output is not None:
+        lock.take(request.output)
+    folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
+    if request.output is None:
+        lock.take(folder.path)
+    return job, folder
 
 
 def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tuple[Job, RunFolder]:

@@ -32,6 +32,7 @@ from slam.results.output import check_output
 from slam.results.run_log import run_log
 from slam.run import RunRequest, provenance_of
 from slam.runtime.imports import import_rerun
+from slam.storage.lock import FolderLock
 
 logger = logging.getLogger(__name__)
 
@@ -79,9 +80,15 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     """
     with run_log() as log, raising_on_termination() as ignore_signals:
         job, sequence = _prepare(request, emit)
-        with _stopping(sequence):
+        with _stopping(sequence), FolderLock() as lock:
+            if request.output is not None:
+                lock.take(request.output)
             folder = RunFolder.create(request.output, Path(job.settings.output.root), sequence.name)
-            return complete(job, folder, log, ignore_signals)
+            try:
+                return complete(job, folder, log, ignore_signals)
+            except SlamError as error:
+                dropped = sequence.reader.dropped
+                raise SlamError(f"{error}{_DROPPED.format(dropped) if dropped else ''}") from error
 
 
 def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
@@ -114,6 +121,9 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     stream = Stream(sequence.frames, session.watch, session.finish)
     sha256 = mixed_sha256(networks.sha256, depth)
     return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
+
+
+_DROPPED = "; {} images were dropped, for they came faster than they were measured ('run' takes all of a recording)"
 
 
 class _Session:

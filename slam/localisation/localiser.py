@@ -80,7 +80,7 @@ def localise(
     own_camera = _camera_file(camera, paths)
     localiser = Localiser(
         places,
-        load_stored(run.path / "config.yaml", "loops").loops,
+        load_stored(run.require("config.yaml"), "loops").loops,
         None if own_camera is None else _pinhole(own_camera),
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None

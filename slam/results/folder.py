@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.errors import RunError
-from slam.results.output import ESTIMATE, METRICS, UNFINISHED, claim, reclaim, replace_run, stamped
+from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
 from slam.results.output import TRAJECTORIES as TRAJECTORIES
 from slam.results.schema import MetricsFile
 from slam.storage.files import write_atomically
@@ -54,8 +54,8 @@ class RunFolder:
     def resume(cls, path: Path) -> RunFolder:
         """The folder of a run that did not end, to go on in it."""
         reclaim(path)
-        is_beside = path.name == UNFINISHED and (path.parent / ESTIMATE).is_file()
-        return cls(path, path.parent if is_beside else None)
+        place = whole_place(path)
+        return cls(path, None if place == path else place)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
@@ -132,5 +132,7 @@ class RunFolder:
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
-            raise RunError(f"{self.path} has no {name}: it holds {present}")
+            no_map = "it ran without a map: run it again with mapping.enabled=true"
+            why = no_map if name.endswith(".ply") else f"it holds {present}"
+            raise RunError(f"{self.path} has no {name}: {why}")
         return path

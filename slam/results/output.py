@@ -86,6 +86,11 @@ def claim(output: Path) -> Path:
     return place
 
 
+def whole_place(folder: Path) -> Path:
+    """Where a run will be once it is whole."""
+    return folder.parent if folder.name == UNFINISHED and (folder.parent / ESTIMATE).is_file() else folder
+
+
 def reclaim(output: Path) -> None:
     """Go on in the folder of a run that did not end: its files stay, what a killed process was writing goes."""
     for path in output.iterdir():

@@ -19,7 +19,7 @@ from slam.se3 import FloatArray
 _COLUMNS = ("stamp", "latitude", "longitude", "altitude")
 _DAY_S = 86400.0
 _EARTH_RADIUS_M = 6.371e6
-_FASTEST_M_S = 300.0
+FASTEST_M_S = 300.0
 _LEAST_FIXES = 3  # one step may be an error of one fix
 _MOST = np.array([90.0, 180.0, 1e5])
 
@@ -62,7 +62,7 @@ def _require_possible_speed(table: FloatArray, path: Path) -> None:
     steps = np.diff(angles, axis=0)
     steps[:, 1] *= np.cos(angles[1:, 0])
     speeds = _EARTH_RADIUS_M * np.linalg.norm(steps, axis=1) / np.diff(table[:, 0])
-    if np.median(speeds) > _FASTEST_M_S:
+    if np.median(speeds) > FASTEST_M_S:
         raise SequenceError(
             f"{path}: its fixes move at {np.median(speeds):.0f} m/s: check its columns, and that stamps are seconds"
         )

@@ -22,6 +22,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray, is_se3
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.depth_maps import DepthMaps
+from slam.sequences.gps import FASTEST_M_S
 from slam.sequences.images import too_long
 from slam.sequences.poses import known_poses, rebased
 
@@ -112,6 +113,8 @@ class RecordedSequence:
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
             raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
         self.reference = self.true_poses(0, len(self))
+        if self.reference is not None:
+            _doubt_speed(self.name, self.reference, self.stamps)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -182,6 +185,19 @@ def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
         logger.warning("%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period)
     if longest > max(_LONG_PAUSE_S, _LONG_PAUSE_PERIODS * period):
         logger.warning("%s: its stamps pause for %g s before frame %d", name, longest, int(periods.argmax()) + 1)
+
+
+def _doubt_speed(name: str, reference: FloatArray, stamps: FloatArray) -> None:
+    """Warn of true poses that no camera can follow, such as millimetres, or a jump."""
+    speeds = np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1) / np.diff(stamps)
+    fast = np.flatnonzero(speeds > FASTEST_M_S)
+    if fast.size:
+        logger.warning(
+            "%s: its true poses move at %g m/s after frame %d: check their unit, and the stamps",
+            name,
+            speeds[fast[0]],
+            fast[0],
+        )
 
 
 def require_frame(name: str, index: int, frames: int) -> None:

@@ -266,3 +266,25 @@ def test_a_run_that_fails_after_its_folder_is_made_prints_one_line(
     assert (finished.returncode, finished.stdout, finished.stderr.count("\n")) == (1, "", 1)
     assert finished.stderr.startswith("erfsfm-slam: no 5 usable frames") and "000003.png" in finished.stderr
     assert {path.name for path in output.iterdir()} == {"config.yaml", "metrics.json", "report.html", "run.log"}
+
+
+def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+    """Also of one that goes on in its own folder while it runs."""
+    output, refused = tmp_path / "run", []
+
+    def second(*_: object) -> None:
+        if not refused:
+            for other in ({"output": output}, {"dataset": None, "sequence": None, "frames": None, "continues": output}):
+                with pytest.raises(RunError, match="another run writes to") as error:
+                    run_slam(**quick | other)
+                refused.append(error)
+
+    run_slam(**quick, output=output, progress=second)
+    assert len(refused) == 2 and RunFolder.open(output).metrics()["status"] == "ok"
+    assert run_slam(**quick, output=output).metrics()["status"] == "ok"
+
+
+def test_a_whole_run_does_not_go_on_by_itself(quick: dict[str, Any], tmp_path: Path) -> None:
+    run_slam(**quick, output=tmp_path / "run")
+    with pytest.raises(RunError, match="name the frames that follow those of"):
+        run_slam(continues=tmp_path / "run", weights=quick["weights"])

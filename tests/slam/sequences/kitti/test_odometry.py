@@ -67,6 +67,16 @@ def test_scans(tmp_path: Path, odometry) -> None:
         sequence.scan(0)
 
 
+def test_poses_that_no_camera_follows_are_warned_of(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture) -> None:
+    odometry(tmp_path)
+    poses = tmp_path / "poses" / "00.txt"
+    open_sequence(tmp_path, "00")
+    assert "true poses" not in caplog.text
+    np.savetxt(poses, np.loadtxt(poses) * np.tile([1, 1, 1, 1000], 3))
+    open_sequence(tmp_path, "00")
+    assert "00: its true poses move at 10000 m/s after frame 0: check their unit" in caplog.text
+
+
 def test_missing_times_fall_back(tmp_path: Path, odometry, caplog: pytest.LogCaptureFixture) -> None:
     folder = odometry(tmp_path)
     (folder / "times.txt").unlink()

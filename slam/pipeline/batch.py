@@ -54,6 +54,7 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 EXAMPLES = 5
+_STREET_DEPTH_M = 15.0  # median depth of a street, which the lengths of mapping are made for
 
 
 @dataclass(frozen=True)
@@ -226,10 +227,14 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        tsdf_map = TsdfMap(config.mapping, intrinsics, folder)
         depths = KeyframeDepths(
             estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
         )
+        mapping = config.mapping
+        if not estimate.scale.is_metric:
+            mapping = mapping.in_unit(depths.median() / _STREET_DEPTH_M)
+            logger.info("map: lengths without metres: a voxel has %.3g, by the scene's depth", mapping.voxel_size_m)
+        tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
         ahead = read_ahead(depths.at, moved)
         for done in range(len(moved)):

@@ -15,6 +15,8 @@ from slam.frontend.scale.road_plane import GroundPlane
 from slam.pipeline.observations import ClosedObservations, Keyframe
 from slam.se3 import FloatArray
 
+_SOME = 20
+
 
 @dataclass(frozen=True)
 class KeyframeDepth:
@@ -69,14 +71,21 @@ class KeyframeDepths:
                 intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image
             )
 
+    def median(self) -> float:
+        """The median of the network's depth, over some keyframes, in the unit of the trajectory."""
+        some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
+        return float(np.median([np.median(self._of_network(self._keyframes[n])) for n in np.unique(some)]))
+
     def at(self, n: int) -> KeyframeDepth:
         """The n-th keyframe."""
         keyframe = self._keyframes[n]
-        scale = float(self._scale[keyframe.index])
-        depth = keyframe.depth_unscaled * np.float32(scale)
+        scale, depth = float(self._scale[keyframe.index]), self._of_network(keyframe)
         refined = None
         if self._refiner is not None:
             plane = self._roads[keyframe.index]
             road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
             refined = self._refiner.refine(n, depth, road)
         return KeyframeDepth(keyframe.index, keyframe.image, depth, refined)
+
+    def _of_network(self, keyframe: Keyframe) -> DepthMap:
+        return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

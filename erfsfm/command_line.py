@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
@@ -26,6 +27,7 @@ _OPENCV = {
     "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27),
 }
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
+_NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
 _MAY_BE_EMPTY = ("--hazards", "--hazards=")
 # what libraries in C++ say when memory ran out, whatever they raise
@@ -43,6 +45,7 @@ def run(app: Callable[..., object], name: str) -> None:
         os.environ.setdefault(variable, value)
     try:
         require_memory(_LOADING_BYTES)
+        _check_current_folder(name)
         app(args=_checked(sys.argv[1:], name), prog_name=name)
     except SystemExit as end:
         if end.code == _INTERRUPTED or isinstance(end, Terminated):
@@ -55,10 +58,25 @@ def run(app: Callable[..., object], name: str) -> None:
         _end(f"{name}: {_explained(error)}", 1)
 
 
+def _check_current_folder(name: str) -> None:
+    """End where it was removed, for libraries that cannot be loaded then, or where files cannot hold its name."""
+    try:
+        str(Path.cwd()).encode()
+    except FileNotFoundError:
+        _end(f"{name}: the folder that you are in was removed: change to another one", 1)
+    except UnicodeEncodeError:
+        _end(f"{name}: the name of the folder that you are in {_NOT_UTF8}", 1)
+
+
 def _checked(words: Sequence[str], name: str) -> list[str]:
-    """The words with ``~/`` as the home folder; an empty one, as of a shell variable that is not set, is refused."""
+    """The words with ``~/`` as the home folder.
+
+    An empty one, as of a shell variable that is not set, is refused, and one that no text file can hold.
+    """
     checked = []
     for before, word in zip(["", *words], words):
+        if not _is_text(word):
+            _end(f"{name}: {word!a} {_NOT_UTF8}", 1)
         option = _OPTION.match(word)
         start, value = (option.group(), word[option.end() :]) if option else ("", word)
         if not value and before not in _MAY_BE_EMPTY and start not in _MAY_BE_EMPTY:
@@ -68,11 +86,21 @@ def _checked(words: Sequence[str], name: str) -> list[str]:
     return checked
 
 
+def _is_text(word: str) -> bool:
+    try:
+        word.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _explained(error: Exception) -> str:
     if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
         return OUT_OF_MEMORY
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return one_line(f"{error.filename}: {error.strerror}: check the path")
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.strerror:
+        return f"{error.strerror}: standard output, or the folder for temporary files; what was written stays"
     if isinstance(error, OneLineError | OSError):
         return one_line(str(error))
     place = traceback.extract_tb(error.__traceback__)[-1]

@@ -30,9 +30,11 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
         sync: wait until the disk holds the content before it gets its name; a disk that fills up late is found then.
 
     Raises:
-        OSError: the file cannot be written, or is a device or a pipe; what was at ``path`` is unchanged.
+        OSError: the file cannot be written, or is a folder, a device or a pipe; what was at ``path`` is unchanged.
     """
-    if path.exists() and not (path.is_file() or path.is_dir()):  # a superuser's rename would put a file in its place
+    if path.is_dir():
+        raise OSError(f"{path}: is a folder: give the name of a file")
+    if path.exists() and not path.is_file():  # a superuser's rename would put a file in its place
         raise OSError(f"{path}: is a device or a pipe: give the name of a file")
     partial = path.with_name(f".{os.getpid()}.{threading.get_ident()}.partial.{path.name}")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-DISTRIBUTION = "erfsfm-slam"
+from erfsfm import DISTRIBUTION as DISTRIBUTION
 
 __all__ = ["Slam", "run_slam"]
 

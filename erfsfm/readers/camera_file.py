@@ -16,7 +16,7 @@ from erfsfm.yaml_file import read_yaml
 CAMERA_FILE = "camera.yaml"
 logger = logging.getLogger(__name__)
 
-_HIGHEST_M = 1000.0
+HIGHEST_M = 1000.0
 _USUAL_HEIGHTS_M = (0.1, 10.0)
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
@@ -46,8 +46,8 @@ class CameraFile(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> Self:
         height_m = self.camera_height_m
-        if not isinstance(height_m, str | None) and not 0 < height_m <= _HIGHEST_M:
-            raise ValueError(f"camera_height_m: must be greater than 0, to {_HIGHEST_M:g}, or 'unknown', is {height_m}")
+        if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
+            raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
         problem = impossible(self.pinhole)
         if problem is not None:
             raise ValueError(problem)

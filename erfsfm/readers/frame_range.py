@@ -14,8 +14,8 @@ from erfsfm.errors import ConfigError
 from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES
 
 EVERYTHING = 10**9
-_RANGED = re.compile(r"(?P<base>.+)\[(?P<start>\d*):(?P<stop>\d*)\]")
-_PLAIN = re.compile(r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+")  # users name their own folders as they like
+_RANGED = re.compile(r"(?P<base>.+)\[(?P<start>\d*):(?P<stop>\d*)\]", re.DOTALL)
+_PLAIN = re.compile(r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+", re.DOTALL)  # users name their own folders as they like
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Self
+from threading import RLock
+from typing import Concatenate, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
 
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
+from erfsfm.readers.camera_file import HIGHEST_M
+from erfsfm.readers.pinhole import impossible
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
@@ -26,12 +31,27 @@ from slam.runtime.timing import Stopwatch
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _in_turn(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[Slam, P], R]:
+    """A method that threads call one after the other."""
+
+    @wraps(method)
+    def locked(self: Slam, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._lock:
+            return method(self, *args, **kwargs)
+
+    return cast("Callable[Concatenate[Slam, P], R]", locked)
+
 
 class Slam:
     """Monocular SLAM frame by frame; it keeps no images and makes no map.
 
     Poses come from the measurements of the last 100 frames; those before stay, so a frame costs the same however long
-    the drive is. `close_loops` solves the whole drive as `run` does.
+    the drive is. `close_loops` solves the whole drive as `run` does. Threads may share a session: each call waits for
+    the one before.
     """
 
     def __init__(
@@ -61,9 +81,16 @@ class Slam:
             seed: of all RANSAC draws.
 
         Raises:
-            SlamError: a scale mode that needs more than images.
+            SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
         """
+        self._lock = RLock()
+        _check(intrinsics, camera_height_m, config)
         config = config or SlamConfig()
+        if update_frames < 1 or sweep_frames < 0 or not 0 <= seed < 2**31:
+            raise SlamError(
+                f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
+                f"{sweep_frames} and {seed}"
+            )
         self._mode = resolve_mode(config.scale, camera_height_m)
         if self._mode in ("reference", "lidar", "known", "gps"):
             raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
@@ -94,9 +121,10 @@ class Slam:
         """With a shipped model by name or a training output folder; depth is that of ``config.depth``.
 
         Raises:
-            SlamError: a depth source that cannot be opened, or a folder of files.
+            SlamError: as the constructor; a depth source that cannot be opened, or a folder of files.
             ErfsfmError: as ``DepthPosePredictor.from_weights``.
         """
+        _check(intrinsics, camera_height_m, config)
         depth = (config or SlamConfig()).depth
         source = open_depth(depth, intrinsics, None)
         networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
@@ -120,6 +148,7 @@ class Slam:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @_in_turn
     def close(self) -> None:
         """Finish every frame so far and end the threads; results stay available."""
         self._is_closed = True
@@ -128,6 +157,7 @@ class Slam:
         finally:
             self._observer.close()
 
+    @_in_turn
     def add_frame(self, image: Image, stamp: float) -> None:
         """Process the next frame.
 
@@ -142,15 +172,19 @@ class Slam:
         if self._is_closed:
             raise SlamError("this session is closed: make another Slam and resume what was saved of this one")
         size = (self._sequence.intrinsics.height, self._sequence.intrinsics.width, 3)
-        if image.shape != size or image.dtype != np.uint8:
-            raise ValueError(f"image must be {size} uint8; got {image.shape} {image.dtype}")
+        shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
+        if not isinstance(image, np.ndarray) or shape != size or kind != np.uint8:
+            raise ValueError(f"image must be {size} uint8; got {shape} {kind}")
+        if not isinstance(stamp, int | float | np.number):
+            raise ValueError(f"a stamp must be a number of seconds; got {stamp!r}")
+        stamp = float(stamp)
         if not np.isfinite(stamp) or (len(self) and not stamp > self._sequence.stamps[-1]):
             raise ValueError(f"stamps must increase; got {stamp} after {self._sequence.stamps[-1:].tolist()}")
         image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)
         try:
-            self._observer.add(index, Frame(index, float(stamp), image))
+            self._observer.add(index, Frame(index, stamp, image))
         finally:  # the error may be of the frame before
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
@@ -158,6 +192,7 @@ class Slam:
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
             self.close_loops()
 
+    @_in_turn
     def save(self, path: str | Path) -> None:
         """Write all measurements to a file for `resume`; more frames may follow.
 
@@ -167,6 +202,7 @@ class Slam:
         checkpoint = SessionCheckpoint.of(self._sequence, self._observer.state(), self._weights_sha256)
         write_atomically(Path(path), checkpoint.write)
 
+    @_in_turn
     def resume(self, path: str | Path) -> None:
         """Continue after the last frame of a file by `save`, with the whole drive solved.
 
@@ -184,6 +220,7 @@ class Slam:
         self._sequence.stamps = checkpoint.stamps
         self.close_loops()
 
+    @_in_turn
     def trajectory(self) -> Trajectory:
         """All frames so far; before the first snippet the camera is assumed to stand.
 
@@ -194,8 +231,9 @@ class Slam:
             raise SlamError("no trajectory before the first frame")
         self._observer.flush()
         self._tracker.add(self._observer)
-        return Trajectory(self._sequence.stamps, self._tracker.T_world_camera)
+        return Trajectory(self._sequence.stamps.copy(), self._tracker.T_world_camera)
 
+    @_in_turn
     def close_loops(self) -> LoopClosures:
         """Solve the whole drive so far with its loops, as ``run`` does; later frames go on from its poses.
 
@@ -213,3 +251,16 @@ class Slam:
         return Observer(
             self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
         )
+
+
+def _check(intrinsics: Intrinsics, camera_height_m: float | None, config: SlamConfig | None) -> None:
+    """Refuse a camera that cannot be, and settings by their name."""
+    if not isinstance(config, SlamConfig | None):
+        raise SlamError(f"config must be what slam.config.load_config gives; got {type(config).__name__}")
+    if not isinstance(intrinsics, Intrinsics):
+        raise SlamError(f"intrinsics must be slam.frames.Intrinsics; got {type(intrinsics).__name__}")
+    problem = impossible(intrinsics)
+    if problem is not None:
+        raise SlamError(f"intrinsics: {problem}")
+    if camera_height_m is not None and not 0 < camera_height_m <= HIGHEST_M:
+        raise SlamError(f"camera_height_m must be metres above the road, to {HIGHEST_M:g}; got {camera_height_m}")

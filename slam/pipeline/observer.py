@@ -28,6 +28,7 @@ from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
 from slam.pipeline.pending import PendingFrame, PendingTask
+from slam.pipeline.reading import predicted_depth
 from slam.runtime.memory import return_freed_memory
 from slam.runtime.timing import Stopwatch
 from slam.se3 import FloatArray, chain
@@ -220,7 +221,7 @@ class Observer:
         is_sparse = self._keyframes.measure_alone(self._seen, index - 2)  # finished, whatever else is
         depth = snippet = None
         if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
-            depth = self._networks.submit(self._predictor.depth, frame)
+            depth = self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._window) > sources and (not is_sparse or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._window))
         return PendingFrame(frame, depth, snippet)
@@ -264,7 +265,7 @@ class Observer:
             self._learn(frame, depth)
             self._keyframes.look_for_lost(frame, depth)
         elif self._keyframes.is_keyframe(frame.index):
-            late = self._networks.submit(self._predictor.depth, frame)
+            late = self._networks.submit(predicted_depth, self._predictor, frame)
             self._tasks.append(PendingTask("depth network", late, partial(self._learn, frame)))
 
     def _learn(self, frame: Frame, depth: DepthMap) -> None:
@@ -282,7 +283,7 @@ class Observer:
         """Depth and camera height, predicted late where nobody asked for them before."""
         if recent.depth is not None:
             return recent.depth, recent.height
-        depth = self._networks.submit(self._predictor.depth, recent.frame).result()
+        depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
         return depth, self._remember(recent.frame, depth, self._plane.fit(depth))
 
     def _remember(self, frame: Frame, depth: DepthMap, road: GroundPlane | MeasurementFailure) -> float | None:

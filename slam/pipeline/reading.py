@@ -1,9 +1,11 @@
-"""Reading the frames of a sequence one by one."""
+"""What others give for each frame: its image, or why there is none, and its depth."""
 
 from __future__ import annotations
 
-from slam.errors import SequenceError
-from slam.frames import Frame, Sequence
+import numpy as np
+
+from slam.errors import SequenceError, SlamError
+from slam.frames import DepthMap, Frame, Predictor, Sequence
 
 
 def read_frame(sequence: Sequence, index: int) -> Frame | SequenceError:
@@ -14,3 +16,16 @@ def read_frame(sequence: Sequence, index: int) -> Frame | SequenceError:
         return frame
     except SequenceError as error:
         return error
+
+
+def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
+    """Depth ``(H, W)`` of a frame.
+
+    Raises:
+        SlamError: a user's predictor gives something else.
+    """
+    depth = predictor.depth(frame)
+    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
+    if shape != wanted or kind != np.float32:
+        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
+    return depth

@@ -79,7 +79,7 @@ class MapMeshFile:
 
     def _part(self, inside: NDArray[np.bool_]) -> MapMesh:
         renumbered = np.cumsum(inside) - 1
-        faces = [piece["vertices"].astype(np.int64) for piece in _chunks(self._faces)]
+        faces = (piece["vertices"].astype(np.int64) for piece in _chunks(self._faces))
         kept = [renumbered[corners[inside[corners].all(axis=1)]] for corners in faces]
         triangles = np.concatenate(kept) if kept else np.empty((0, 3), np.int64)
         vertices = self._vertices[inside]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,3 +23,12 @@ def test_the_demo_runs_without_sockets(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(socket, "getaddrinfo", forbidden)
     run = run_slam(frames="0:7", weights="sim", output=tmp_path / "run", overrides=["mapping.voxel_size_m=0.5"])
     assert run.metrics()["status"] == "ok" and (run.path / "report.html").is_file()
+
+
+@pytest.mark.parametrize("module", ["erfsfm.onnx_session", "slam.prediction.onnx_depth"])
+def test_onnx_runtime_keeps_nothing_to_report(tmp_path: Path, module: str) -> None:
+    """Unless told not to, it reports to its maker, by an identifier that it keeps in the home folder."""
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    place = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", f"import {module}"], env=environment | place, check=True)
+    assert not list(tmp_path.rglob("*onnxruntime*"))

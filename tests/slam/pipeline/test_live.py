@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import functools
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,6 +114,75 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         started(load_config(None, ["lidar.factors=true"]))
     with pytest.raises(SlamError, match="needs camera_height_m"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
+
+
+@pytest.mark.parametrize("image", [None, [[1]], "image.png"])
+def test_an_image_that_is_no_array_is_refused(image: Any) -> None:
+    with pytest.raises(ValueError, match=rf"image must be .* uint8; got None {type(image).__name__}"):
+        started(load_config(None, SETTINGS)).add_frame(image, 0.0)
+
+
+@pytest.mark.parametrize("stamp", [None, "0.1", np.array([0.1, 0.2])])
+def test_a_stamp_that_is_no_number_is_refused(stamp: Any) -> None:
+    with pytest.raises(ValueError, match="a stamp must be a number of seconds; got"):
+        started(load_config(None, SETTINGS)).add_frame(drive().frame(0).image, stamp)
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [("fx", -200.0), ("fx", np.nan), ("cx", 1e6), ("width", 0), ("camera_height_m", 0.0), ("camera_height_m", np.nan)],
+)
+def test_an_impossible_camera_is_refused(key: str, value: float) -> None:
+    intrinsics, height = drive().intrinsics, {}
+    if key == "camera_height_m":
+        height = {key: value}
+    else:
+        intrinsics = replace(intrinsics, **{key: value})  # type: ignore[arg-type]
+    with pytest.raises(SlamError, match=f"{key}.*"):
+        Slam(oracle(), intrinsics, load_config(None, SETTINGS), **height)
+
+
+@pytest.mark.parametrize("option", [{"update_frames": 0}, {"sweep_frames": -1}, {"seed": -1}, {"seed": 2**31}])
+def test_a_number_out_of_its_range_is_refused(option: dict[str, int]) -> None:
+    with pytest.raises(SlamError, match="wanted update_frames >= 1"):
+        started(load_config(None, SETTINGS), **option)
+
+
+def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
+    class Small(OraclePredictor):
+        def depth(self, frame: Frame) -> DepthMap:
+            return super().depth(frame)[::2, ::2]
+
+    predictor = oracle()
+    predictor.__class__ = Small
+    slam = Slam(predictor, drive().intrinsics, load_config(None, SETTINGS))
+    with pytest.raises(SlamError, match=r"depth of frame 0 must be \(96, 312\) float32; got \(48, 156\)"):
+        feed(slam, 0, 2)
+
+
+def test_threads_take_turns() -> None:
+    slam = started(load_config(None, SETTINGS))
+    ready, stamps = Barrier(4), iter(range(1000))
+
+    def add(index: int) -> None:
+        ready.wait()
+        for _ in range(2):
+            with suppress(ValueError):  # another thread's frame was later
+                slam.add_frame(drive().frame(index).image, float(next(stamps)))
+            slam.trajectory()
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(add, range(4)))
+    assert len(slam.trajectory()) == len(slam) > 0
+
+
+def test_a_trajectory_belongs_to_the_caller() -> None:
+    slam = started(load_config(None, SETTINGS))
+    feed(slam, 0, 2)
+    slam.trajectory().stamps[:] = 1e9
+    slam.trajectory().T_world_camera[:] = np.nan
+    feed(slam, 2, 4)
+    assert np.isfinite(slam.trajectory().T_world_camera).all()
 
 
 def test_a_first_stamp_that_is_no_number_is_refused() -> None:

@@ -77,7 +77,6 @@ def test_length_is_measured_in_camera_heights(texture, length_m, turn_deg, pitch
 
 
 def test_lengths_are_right_on_average(texture):
-    """The alignment alone makes them 1 % short."""
     ratios = []
     for k in range(16):
         T_road_camera = se3.make(np.eye(3), np.array([3.7 * k, 0.0, 11.3 * k % 20]))

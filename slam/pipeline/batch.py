@@ -54,7 +54,6 @@ logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 EXAMPLES = 5
-_STREET_DEPTH_M = 15.0  # median depth of a street, which the lengths of mapping are made for
 
 
 @dataclass(frozen=True)
@@ -227,13 +226,9 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        depths = KeyframeDepths(
-            estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
-        )
-        mapping = config.mapping
-        if not estimate.scale.is_metric:
-            mapping = mapping.in_unit(depths.median() / _STREET_DEPTH_M)
-            logger.info("map: lengths without metres: a voxel has %.3g, by the scene's depth", mapping.voxel_size_m)
+        scales = estimate.scale.per_frame
+        depths = KeyframeDepths(estimate.observations, scales, T_world_camera, intrinsics, config.depth)
+        mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
         ahead = read_ahead(depths.at, moved)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from erfsfm.refinement.refine import RefinedDepth, Road
-from slam.config import DepthConfig
+from slam.config import DepthConfig, MappingConfig
 from slam.depth_refinement import DepthRefiner
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.frontend.scale.road_plane import GroundPlane
@@ -16,6 +16,7 @@ from slam.pipeline.observations import ClosedObservations, Keyframe
 from slam.se3 import FloatArray
 
 _SOME = 20
+_STREET_DEPTH_M = 15.0  # median depth of a street
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,11 @@ class KeyframeDepths:
                 intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image
             )
 
-    def median(self) -> float:
-        """The median of the network's depth, over some keyframes, in the unit of the trajectory."""
+    def fitted(self, mapping: MappingConfig) -> MappingConfig:
+        """Settings whose lengths are for this scene as those in metres are for a street, by the median depth."""
         some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
-        return float(np.median([np.median(self._of_network(self._keyframes[n])) for n in np.unique(some)]))
+        median = np.median([np.median(self._of_network(self._keyframes[n])) for n in np.unique(some)])
+        return mapping.in_unit(float(median) / _STREET_DEPTH_M)
 
     def at(self, n: int) -> KeyframeDepth:
         """The n-th keyframe."""

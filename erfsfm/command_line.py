@@ -53,7 +53,7 @@ def run(app: Callable[..., object], name: str) -> None:
             _say(f"{name}: {why}; what was written stays")
         raise
     except Exception as error:  # the last place where an error can become one line
-        if os.environ.get(SHOW_TRACEBACK):
+        if os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0"):
             raise
         _end(f"{name}: {_explained(error)}", 1)
 

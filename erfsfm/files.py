@@ -33,7 +33,7 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
         OSError: the file cannot be written, or is a folder, a device or a pipe; what was at ``path`` is unchanged.
     """
     if path.is_dir():
-        raise OSError(f"{path}: is a folder: give the name of a file")
+        raise OSError(f"{path}: cannot be written (it is a folder): give the name of a file")
     if path.exists() and not path.is_file():  # a superuser's rename would put a file in its place
         raise OSError(f"{path}: is a device or a pipe: give the name of a file")
     partial = path.with_name(f".{os.getpid()}.{threading.get_ident()}.partial.{path.name}")

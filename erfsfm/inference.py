@@ -154,6 +154,7 @@ class DepthPosePredictor:
         Returns:
             ``(H, W)`` float32, positive, at the image's size. Disparity is what is interpolated.
         """
+        require_image(image)
         height, width = image.shape[:2]
         return depth_at(self.disparity(image), height, width)
 
@@ -206,8 +207,7 @@ class DepthPosePredictor:
 
     def _input(self, image: NDArray[np.uint8]) -> Tensor:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {image.shape} {image.dtype}")
+        require_image(image)
         resized = resize_image(image, self.record.network.height, self.record.network.width)
         tensor = torch.from_numpy(resized.astype(np.float32)).to(self.device)
         return tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
@@ -252,6 +252,23 @@ class _Motion(nn.Module):
         return vectors
 
 
+def require_image(image: object) -> None:
+    """Refuse what is no image ``(H, W, 3)`` uint8.
+
+    Raises:
+        ValueError: naming what came.
+    """
+    shape, kind = getattr(image, "shape", None), getattr(image, "dtype", type(image).__name__)
+    if (
+        not isinstance(image, np.ndarray)
+        or image.ndim != 3
+        or image.shape[2] != 3
+        or kind != np.uint8
+        or not image.size
+    ):
+        raise ValueError(f"image must be (H, W, 3) uint8 RGB; got {shape} {kind}")
+
+
 def depth_at(disparity: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Depth ``(height, width)`` from disparity ``(h, w)`` at the networks' size, both unscaled."""
     if disparity.shape != (height, width):
@@ -269,9 +286,10 @@ def colour_disparity(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def save_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Write an RGB image, whole or not at all."""
-    ok, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]))
-    if not ok:
+    if path.suffix.lower() not in (".png", ".jpg"):
         raise DataError(f"cannot write {path}: images are .png or .jpg")
+    require_image(image)
+    _, encoded = cv2.imencode(path.suffix, np.ascontiguousarray(image[..., ::-1]))
     write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()))
 
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Annotated, Any, TypedDict, Unpack
+
+from pydantic import Field, ValidationError
+from pydantic.dataclasses import dataclass
 
 from erfsfm import __version__
+from erfsfm.config_tree import first_problem
 from erfsfm.inference import DepthPosePredictor, commit
 from erfsfm.signals import raising_on_termination
 from slam.config import SlamConfig, load_config
@@ -42,20 +46,20 @@ logger = logging.getLogger(__name__)
 class RunOptions(TypedDict, total=False):
     """Keyword arguments of `run_slam`; defaults and meanings as in `RunRequest`."""
 
-    camera: Path | None
+    camera: str | Path | None
     weights: str | Path
     config: str | Path | None
     overrides: Sequence[str]
     frames: str | None
-    output: Path | None
+    output: str | Path | None
     seed: int
     device: str
     progress: Progress | None
     command: str
-    cache: Path | None
-    rerun: Path | None
-    continues: Path | None
-    gps: Path | None
+    cache: str | Path | None
+    rerun: str | Path | None
+    continues: str | Path | None
+    gps: str | Path | None
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ class RunRequest:
     overrides: Sequence[str] = ()
     frames: str | None = None
     output: Path | None = None
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     device: str = "auto"
     progress: Progress | None = None
     command: str = "slam.run_slam"
@@ -119,9 +123,16 @@ def run_slam(
         The run folder.
 
     Raises:
+        TypeError: an unknown argument.
         SlamError, ErfsfmError: one line. However a run ends, its folder keeps its results and the reason.
     """
-    request = RunRequest(dataset, sequence, **options)
+    unknown = options.keys() - RunOptions.__annotations__.keys()
+    if unknown:
+        raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+    try:
+        request = RunRequest(dataset=dataset, sequence=sequence, **options)  # type: ignore[arg-type]  # text becomes a path
+    except ValidationError as error:
+        raise RunError(f"run_slam: {first_problem(error)}") from error
     with run_log() as log, raising_on_termination() as ignore_signals:
         return complete(*_begin(request), log, ignore_signals)
 

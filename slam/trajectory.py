@@ -41,10 +41,10 @@ class Trajectory:
     timed: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse shapes that do not fit.
+        """Refuse shapes that do not fit, and stamps that are no times.
 
         Raises:
-            ValueError: if there is no pose, or the shapes are not ``(N,)`` and ``(N, 4, 4)``.
+            ValueError: if there is no pose, the shapes are not ``(N,)`` and ``(N, 4, 4)``, or stamps do not increase.
         """
         count = len(self.T_world_camera)
         if not count or self.stamps.shape != (count,) or self.T_world_camera.shape != (count, 4, 4):
@@ -52,6 +52,8 @@ class Trajectory:
                 "stamps and T_world_camera must have shapes (N,) and (N, 4, 4), N >= 1; "
                 f"got {self.stamps.shape} and {self.T_world_camera.shape}"
             )
+        if not (np.isfinite(self.stamps).all() and (np.diff(self.stamps) > 0).all()):
+            raise ValueError("stamps must be finite and increase")
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from erfsfm.errors import DataError, ErfsfmError
 from erfsfm.readers.pinhole import Pinhole, impossible, require_plausible
@@ -42,6 +42,13 @@ class CameraFile(BaseModel):
         description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4; fov: the angle",
     )
     source: str | None = Field(default=None, description="a note on where the numbers come from")
+
+    @field_validator("width", "height", "fx", "fy", "cx", "cy", "fps", "camera_height_m", mode="before")
+    @classmethod
+    def _refuse_truth(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("wanted a number")
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -125,5 +132,6 @@ def _complaints(error: ValidationError) -> str:
         elif not key:
             lines.append(str(item["ctx"]["error"]))
         else:
-            lines.append(f"{key}: {item['msg'][0].lower() + item['msg'][1:]}, is {item['input']!r}")
+            problem = item["msg"].removeprefix("Value error, ")
+            lines.append(f"{key}: {problem[0].lower() + problem[1:]}, is {item['input']!r}")
     return "; ".join(dict.fromkeys(lines))

@@ -58,12 +58,13 @@ class RunFolder:
         return cls(path, path.parent if is_beside else None)
 
     @classmethod
-    def open(cls, path: Path) -> RunFolder:
+    def open(cls, path: str | Path) -> RunFolder:
         """An existing run, also one that failed or was killed, with a warning.
 
         Raises:
             RunError: no run there.
         """
+        path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
             what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
             raise RunError(f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote")

@@ -53,6 +53,10 @@ def check_output(output: Path) -> None:
     Raises:
         RunError: it is a file, or holds files of something else, or a folder where a run has a file.
     """
+    if output.is_symlink() and not output.exists():
+        raise RunError(
+            f"{output} is a link to {output.readlink()}, which is not there: make it, or choose another --output"
+        )
     if not output.exists():
         return
     if not output.is_dir():
@@ -187,4 +191,6 @@ def _link(link: Path, target: Path) -> None:
         temporary.symlink_to(target.name, target_is_directory=True)
         temporary.replace(link)
     except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         logger.warning("could not link %s to %s: %s", link, target, error)

@@ -58,4 +58,4 @@ def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     return {path.absolute().name: partial(open_folder, path, asked.camera)}
 
 
-LOADER = Loader("images", "images/*.png", _find)
+LOADER = Loader("images", "images/*.png, *.jpg or *.bmp", _find)

@@ -136,10 +136,15 @@ def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[Ima
         SequenceError: if the images have another size than the camera, or its lens cannot be undistorted.
     """
     if (images.width, images.height) != (camera.width, camera.height):
+        wanted = (
+            "they are turned by a quarter, perhaps by their own metadata: turn them back"
+            if (images.width, images.height) == (camera.height, camera.width)
+            else "resize the images, or if they were only resized, scale the "
+            f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
+        )
         raise SequenceError(
             f"the images of {where} are {images.width}x{images.height}, but the camera file is for "
-            f"{camera.width}x{camera.height}: resize the images, or if they were only resized, scale the "
-            f"file to {{{_scaled_hint(camera, images.width, images.height)}}}"
+            f"{camera.width}x{camera.height}: {wanted}"
         )
     if not camera.is_distorted:
         return images, Intrinsics.of(camera.pinhole)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,3 +248,10 @@ def test_near_is_bright() -> None:
     brightness = colour_disparity(depth).astype(int).sum(axis=2).ravel()
     assert brightness[0] > brightness[50] > brightness[-1]
     assert colour_disparity(np.full((4, 5), 3.0, np.float32)).shape == (4, 5, 3)
+
+
+@pytest.mark.parametrize("thing", [None, [[1]], "image.png", np.zeros((0, 0, 3), np.uint8), np.zeros((4, 4), np.uint8)])
+def test_what_is_no_image_is_refused(predictor: DepthPosePredictor, thing: Any, tmp_path: Path) -> None:
+    for use in (predictor.depth, predictor.prepare, lambda image: save_image(tmp_path / "a.png", image)):
+        with pytest.raises(ValueError, match=r"image must be \(H, W, 3\) uint8 RGB; got"):
+            use(thing)

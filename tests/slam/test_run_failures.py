@@ -66,6 +66,33 @@ def test_every_option_has_a_type_and_a_default() -> None:
         run_slam(**{"sped": 3})  # type: ignore[misc]
 
 
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"seed": -1},
+        {"seed": 2**31},
+        {"frames": 8},
+        {"overrides": "mapping.enabled=false"},
+        {"progress": 5},
+    ],
+)
+def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
+        run_slam(**quick | {"output": tmp_path / "run"} | option)
+    assert not (tmp_path / "run").exists()
+
+
+def test_paths_may_be_text(quick: dict[str, Any], tmp_path: Path) -> None:
+    run = run_slam(**quick | {"dataset": str(quick["dataset"]), "output": str(tmp_path / "run")})
+    assert RunFolder.open(str(tmp_path / "run")).metrics() == run.metrics()
+
+
+def test_a_link_to_nothing_is_no_place_for_a_run(quick: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "run").symlink_to(tmp_path / "unmounted")
+    with pytest.raises(RunError, match=r"run is a link to .*unmounted, which is not there"):
+        run_slam(**quick, output=tmp_path / "run")
+
+
 @pytest.mark.parametrize("content", [{"config.yaml": "mine"}, {"metrics.json": '{"loss": 1}', "config.yaml": "mine"}])
 def test_a_folder_of_another_program_is_refused_before_any_work(
     quick: dict[str, Any], tmp_path: Path, content: dict[str, str]

@@ -46,6 +46,12 @@ def test_length_and_rebasing() -> None:
     assert len(trajectory.select(np.array([0, 2]))) == 2
 
 
+def test_stamps_must_increase() -> None:
+    for stamps in ([0.0, 0.0], [1.0, 0.0], [0.0, np.nan]):
+        with pytest.raises(ValueError, match="stamps must be finite and increase"):
+            Trajectory(np.array(stamps), np.stack([np.eye(4)] * 2))
+
+
 @pytest.mark.parametrize("shapes", [((3,), (2, 4, 4)), ((2,), (2, 3, 4)), ((0,), (0, 4, 4)), ((2, 1), (2, 4, 4))])
 def test_shapes_must_fit(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
     with pytest.raises(ValueError, match="shapes"):

@@ -127,3 +127,12 @@ def test_a_rotation_flag_turns_the_images(tmp_path: Path) -> None:
     assert (sequence.intrinsics.width, sequence.intrinsics.height) == (48, 64)
     image = sequence.frame(2).image
     assert image[:28].mean() > 200 and image[36:].mean() < 130
+
+
+def test_a_camera_of_the_lying_images_is_named(tmp_path: Path, camera_64: str) -> None:
+    path = write_mp4(tmp_path / "upright.mp4", [20 * k for k in range(4)], rotated=True)
+    (tmp_path / "camera.yaml").write_text(camera_64)
+    with pytest.raises(
+        SequenceError, match="are 48x64, but the camera file is for 64x48: they are turned by a quarter"
+    ):
+        open_sequence(path)

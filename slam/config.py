@@ -120,7 +120,7 @@ class PoseGraphConfig(Section):
 
 
 class MappingConfig(Section):
-    """TSDF fusion, see ``mapping/``; metres, or camera heights under scale mode none."""
+    """TSDF fusion, see ``mapping/``; without a known scale, lengths follow the depth of the scene."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
@@ -169,6 +169,11 @@ class MappingConfig(Section):
     memory_mb: int = Field(
         default=1000, ge=100, description="memory of the map, MiB: a submap ends before submap_m where it would be more"
     )
+
+    def in_unit(self, per_metre: float) -> MappingConfig:
+        """The same lengths in a unit of which a metre has ``per_metre``."""
+        lengths = {name: per_metre * getattr(self, name) for name in type(self).model_fields if name.endswith("_m")}
+        return self.model_copy(update=lengths)
 
     @property
     def reach_m(self) -> float:

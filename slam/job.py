@@ -113,7 +113,7 @@ def _run(job: Job, folder: RunFolder) -> None:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
         write_report(folder, examples, views)
     if job.rerun is not None:
-        write_rerun(job.rerun, result, job.recording.intrinsics, job.settings.mapping.voxel_size_m)
+        write_rerun(job.rerun, result, job.recording.intrinsics)
 
 
 def _journal(job: Job, folder: Path) -> Journal | None:

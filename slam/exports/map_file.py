@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from slam.config import load_stored
-from slam.mapping.submap import FOLDER, submap_paths
+from slam.mapping.submap import FOLDER, Submap, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
 
@@ -35,7 +35,9 @@ def map_file(folder: RunFolder, what: str, progress: Progress | None = None) -> 
         yield folder.require(f"map_{what}.ply")
         return
     logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
-    surface = MapSurface(paths, load_stored(folder.require("config.yaml"), "mapping").mapping, progress)
+    settings = load_stored(folder.require("config.yaml"), "mapping").mapping
+    voxel_size = float(Submap.read(paths[0]).voxel_size)  # which follows the scene where no metres were known
+    surface = MapSurface(paths, settings.in_unit(voxel_size / settings.voxel_size_m), progress)
     with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
         path = Path(temporary) / f"map_{what}.ply"
         (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)

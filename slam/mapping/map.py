@@ -50,7 +50,7 @@ class MapCloud:
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """Size of a map, the share of pixels that each filter took, and that of triangles in small loose pieces."""
+    """Sizes of a map and its voxels, the share of pixels that each filter took, and of triangles in loose pieces."""
 
     triangles: int
     points: int
@@ -58,6 +58,7 @@ class MapStatistics:
     submaps: int
     frames_fused: int
     frames_left_out: int
+    voxel_size: float
     filters: dict[str, float]
     floater_share: float
 
@@ -180,15 +181,20 @@ class TsdfMap:
         points = np.concatenate(list(self.surface().cloud_pieces()))
         return MapCloud(positions(points), normals(points), colours(points))
 
+    @property
+    def voxel_size(self) -> float:
+        """Side of a voxel, in the trajectory's unit."""
+        return self._config.voxel_size_m
+
     def statistics(self) -> MapStatistics:
         """Counts, zero for an empty map."""
-        filters = self._filters.shares()
+        filters, voxel_size = self._filters.shares(), self.voxel_size
         try:
             surface = self.surface()
         except EmptyMapError:
-            return MapStatistics(0, 0, 0, self._submaps, self._fused, 0, filters, 0.0)
+            return MapStatistics(0, 0, 0, self._submaps, self._fused, 0, voxel_size, filters, 0.0)
         sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
-        return MapStatistics(*sizes, self._fused, 0, filters, surface.floater_share)
+        return MapStatistics(*sizes, self._fused, 0, voxel_size, filters, surface.floater_share)
 
     def _has_moved(self, T_world_camera: FloatArray, T_world_previous: FloatArray) -> bool:
         T_previous_camera = invert(T_world_previous) @ T_world_camera
@@ -220,8 +226,8 @@ class TsdfMap:
         if self._stretch is None or not self._stretch.frames:
             return
         keys, observed, tsdf, weight = self._stretch.fusion.observed()
-        fused = np.array(self._stretch.frames)
-        submap = Submap(keys, observed, tsdf, weight, fused=fused, **self._views.take(self._intrinsics))
+        numbers = {"fused": np.array(self._stretch.frames), "voxel_size": np.array(self.voxel_size)}
+        submap = Submap(keys, observed, tsdf, weight, **numbers, **self._views.take(self._intrinsics))
         submap.write(submap_path(self._folder, self._submaps))
         self._submaps += 1
         self._stretch = None

@@ -34,7 +34,8 @@ class Submap:
     voxels in the order z, y, x; ``tsdf`` ``(S,)`` float16 in truncation distances and ``weight`` ``(S,)`` uint16 belong
     to the observed ones. Of each view: its frame, ``T_world_camera`` ``(K, 4, 4)``, image ``(K, h, w, 3)``, fused depth
     ``(K, h, w)`` float16, 0 where nothing was fused, and ``brightness_steps`` ``(K,)``: the logarithm of its brightness
-    over that of the view before, NaN where they share nothing. ``camera`` is fx, fy, cx, cy; ``fused`` counts frames.
+    over that of the view before, NaN where they share nothing. ``camera`` is fx, fy, cx, cy; ``fused`` counts
+    frames; ``voxel_size`` is the side of a voxel.
     """
 
     keys: NDArray[np.int32]
@@ -48,6 +49,7 @@ class Submap:
     brightness_steps: FloatArray
     camera: FloatArray
     fused: NDArray[np.int64]
+    voxel_size: FloatArray
 
     def write(self, path: Path) -> None:
         """Write a file, atomically.

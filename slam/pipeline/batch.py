@@ -226,10 +226,10 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        tsdf_map = TsdfMap(config.mapping, intrinsics, folder)
-        depths = KeyframeDepths(
-            estimate.observations, estimate.scale.per_frame, T_world_camera, intrinsics, config.depth
-        )
+        scales = estimate.scale.per_frame
+        depths = KeyframeDepths(estimate.observations, scales, T_world_camera, intrinsics, config.depth)
+        mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
+        tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
         ahead = read_ahead(depths.at, moved)
         for done in range(len(moved)):

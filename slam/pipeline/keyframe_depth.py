@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from erfsfm.refinement.refine import RefinedDepth, Road
-from slam.config import DepthConfig
+from slam.config import DepthConfig, MappingConfig
 from slam.depth_refinement import DepthRefiner
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.pipeline.observations import ClosedObservations, Keyframe
 from slam.se3 import FloatArray
+
+_SOME = 20
+_STREET_DEPTH_M = 15.0  # median depth of a street
 
 
 @dataclass(frozen=True)
@@ -69,14 +72,22 @@ class KeyframeDepths:
                 intrinsics, indices, T_world_camera[indices], lambda n: self._keyframes[n].image
             )
 
+    def fitted(self, mapping: MappingConfig) -> MappingConfig:
+        """Settings whose lengths are for this scene as those in metres are for a street, by the median depth."""
+        some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
+        median = np.median([np.median(self._of_network(self._keyframes[n])) for n in np.unique(some)])
+        return mapping.in_unit(float(median) / _STREET_DEPTH_M)
+
     def at(self, n: int) -> KeyframeDepth:
         """The n-th keyframe."""
         keyframe = self._keyframes[n]
-        scale = float(self._scale[keyframe.index])
-        depth = keyframe.depth_unscaled * np.float32(scale)
+        scale, depth = float(self._scale[keyframe.index]), self._of_network(keyframe)
         refined = None
         if self._refiner is not None:
             plane = self._roads[keyframe.index]
             road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
             refined = self._refiner.refine(n, depth, road)
         return KeyframeDepth(keyframe.index, keyframe.image, depth, refined)
+
+    def _of_network(self, keyframe: Keyframe) -> DepthMap:
+        return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

@@ -13,7 +13,6 @@ from slam.errors import SlamError
 from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
 from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Sequence
-from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import readable_scan
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
@@ -171,7 +170,7 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: SlamResult, s
         "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
         "with_scale": pose_similarity(sequence.reference, result.optimised.T_world_camera),
     }
-    unmetric = result.scale.mode == "none" or isinstance(result.scale.estimate, MeasurementFailure)
+    unmetric = not result.scale.is_metric
     if unmetric:
         del fits["rigid"]
     looked_at = np.concatenate([*stretches(sequence.reference, truth.frames), np.empty(0, np.int64)]).astype(np.int64)

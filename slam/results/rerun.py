@@ -21,7 +21,7 @@ _JPEG_QUALITY = 85
 _POINT_VOXELS = 0.25  # radius of a map point in voxels
 
 
-def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics, voxel_size: float) -> None:
+def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics) -> None:
     """Write ``.rrd``: on the timeline ``frame`` the camera with image and depth, over all time trajectories and map.
 
     The world is that of the optimised trajectory, y down. Images and depth are those of keyframes,
@@ -31,7 +31,6 @@ def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics, voxel_si
         path: the file.
         result: of a whole run.
         intrinsics: of the sequence's images.
-        voxel_size: side of a voxel of the map.
 
     Raises:
         SlamError: rerun is not installed, or the file cannot be written.
@@ -54,7 +53,7 @@ def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics, voxel_si
             _log_camera(rr, stream, T_world_camera)
             if index in keyframes:
                 _log_images(rr, stream, keyframes[index], intrinsics, float(result.scale.per_frame[index]))
-        _log_map(rr, stream, result, voxel_size)
+        _log_map(rr, stream, result)
         stream.flush()
         stream.disconnect()
 
@@ -75,7 +74,7 @@ def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics
     )
 
 
-def _log_map(rr: Any, stream: Any, result: SlamResult, voxel_size: float) -> None:
+def _log_map(rr: Any, stream: Any, result: SlamResult) -> None:
     if result.map is None:
         return
     try:
@@ -83,5 +82,5 @@ def _log_map(rr: Any, stream: Any, result: SlamResult, voxel_size: float) -> Non
     except EmptyMapError:  # an empty map, which the run has reported
         return
     colours = np.round(255 * np.clip(cloud.colours, 0, 1)).astype(np.uint8)
-    points = rr.Points3D(cloud.points_world, colors=colours, radii=_POINT_VOXELS * voxel_size)
+    points = rr.Points3D(cloud.points_world, colors=colours, radii=_POINT_VOXELS * result.map.voxel_size)
     stream.log("world/map", points, static=True)

@@ -49,6 +49,11 @@ class Scale:
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
 
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.mode != "none" and not isinstance(self.estimate, MeasurementFailure)
+
     def in_unit_of(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
         """The same times an estimate in this unit; unchanged where that failed."""
         if isinstance(other, MeasurementFailure):

@@ -272,6 +272,7 @@ def drive_street(
     progress: Callable[[str, int, int], None] | None = None,
     noise: PoseNoise | None = None,
     use: str = "calibrated",
+    mode: str = "auto",
 ) -> SlamResult:
     oracle = OraclePredictor(
         street.reference,
@@ -279,7 +280,8 @@ def drive_street(
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
-    settings = load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", f"frontend.use={use}"])
+    overrides = ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", f"frontend.use={use}", f"scale.mode={mode}"]
+    settings = load_config(None, overrides)
     return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
 
 
@@ -314,6 +316,16 @@ def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
+
+
+def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt) -> None:
+    """In camera heights, which are no metres."""
+    result = drive_street(street, mode="none")
+    depths = [street.base.street.render(street.start + k).depth for k in range(0, 25, 6)]
+    nearness = np.median([np.median(np.where(depth > 0, depth, 200.0)) for depth in depths]) / street.camera_height_m
+    assert result.map is not None
+    assert result.map.voxel_size == pytest.approx(0.2 * nearness / 15.0, rel=0.15)
+    assert result.map.statistics().triangles > 5000
 
 
 def test_calibrated_network_factors_are_used_at_every_step(street: Excerpt) -> None:

@@ -36,6 +36,10 @@ class ConfigError(ErfsfmError):
     """A configuration, preset name or option is wrong."""
 
 
+class BusyError(ErfsfmError):
+    """Another process writes to a folder."""
+
+
 class CheckpointError(ErfsfmError):
     """Weights are missing, damaged, or of another architecture."""
 

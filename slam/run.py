@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 from erfsfm import __version__
 from erfsfm.config_tree import first_problem
 from erfsfm.inference import DepthPosePredictor, commit
+from erfsfm.lock import FolderLock
 from erfsfm.signals import raising_on_termination
 from slam.config import SlamConfig, load_config
 from slam.continuation import (
@@ -39,7 +40,6 @@ from slam.runtime.imports import import_rerun
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
-from slam.storage.lock import FolderLock
 
 logger = logging.getLogger(__name__)
 

@@ -31,6 +31,7 @@ from erfsfm.data.splits import merge
 from erfsfm.errors import ConfigError, DataError
 from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
+from erfsfm.lock import FolderLock
 from erfsfm.networks.transfer import take_over
 from erfsfm.signals import Terminated, raising_on_termination
 from erfsfm.threads import single_threaded_opencv
@@ -75,10 +76,8 @@ def train(
     _require_devices(config.training.devices, device)
     folder = OutputFolder(output)
     rank = rank_of(config.training)
-    done_steps = 0
-    if resume:
-        done_steps = folder.resumable_steps(config)
-    elif rank == 0:  # the first process has written there before it starts the others
+    done_steps = folder.resumable_steps(config) if resume else 0
+    if rank == 0 and not resume:  # the first process has written there before it starts the others
         folder.require_free()
     training, validation = split_recordings(config.data)
     if config.data.validation and not validation and rank == 0:
@@ -94,11 +93,12 @@ def train(
     keeper = WeightKeeper(output, seen, command, validates=bool(validation))
     loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
-    if rank == 0:
-        folder.write_config(config)
     if config.training.nodes > 1:
         logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
-    with raising_on_termination():
+    with raising_on_termination(), FolderLock() as lock:
+        if rank == 0:
+            lock.take(output)
+            folder.write_config(config)
         _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
     if not trainer.is_global_zero:
         sys.exit()

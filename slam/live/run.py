@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Thread
 
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.lock import FolderLock
 from erfsfm.signals import raising_on_termination
 from slam.config import SlamConfig, load_config
 from slam.errors import SlamError
@@ -32,7 +33,6 @@ from slam.results.output import check_output
 from slam.results.run_log import run_log
 from slam.run import RunRequest, provenance_of
 from slam.runtime.imports import import_rerun
-from slam.storage.lock import FolderLock
 
 logger = logging.getLogger(__name__)
 

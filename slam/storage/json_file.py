@@ -28,6 +28,8 @@ def read_json(path: Path, model: type[BaseModel]) -> dict[str, Any]:
         json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except FileNotFoundError:
         raise
+    except PermissionError as error:
+        raise RunError(f"{path} cannot be read: {error.strerror}: check its permissions") from error
     except ValidationError as error:
         raise RunError(f"{path} is damaged: {first_problem(error)}; run the sequence again") from error
     except RecursionError as error:

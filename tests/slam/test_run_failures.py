@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from erfsfm.errors import BusyError
 from erfsfm.signals import Terminated
 from slam import run_slam
 from slam.cli import main
@@ -275,7 +276,7 @@ def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None
     def second(*_: object) -> None:
         if not refused:
             for other in ({"output": output}, {"dataset": None, "sequence": None, "frames": None, "continues": output}):
-                with pytest.raises(RunError, match="another run writes to") as error:
+                with pytest.raises(BusyError, match="another process writes to") as error:
                     run_slam(**quick | other)
                 refused.append(error)
 

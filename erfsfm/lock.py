@@ -6,12 +6,14 @@ import os
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from slam.errors import RunError
+from erfsfm.errors import BusyError
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+_held: set[int] = set()
 
 
 class FolderLock(ExitStack):
@@ -21,17 +23,35 @@ class FolderLock(ExitStack):
         """Hold a folder, which is made; without effect where the file system has no locks, or no folder can be made.
 
         Raises:
-            RunError: another process holds it.
+            BusyError: another process holds it.
         """
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if fcntl is None or not folder.is_dir():
             return
         descriptor = os.open(folder, os.O_RDONLY)
-        self.callback(os.close, descriptor)
+        _held.add(descriptor)
+        self.callback(_release, descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise RunError(f"another run writes to {folder}: wait for its end, or choose another --output") from error
+            raise BusyError(
+                f"another process writes to {folder}: wait for its end, or choose another --output"
+            ) from error
         except OSError:
             return
+
+
+def _release(descriptor: int) -> None:
+    _held.discard(descriptor)
+    os.close(descriptor)
+
+
+def _leave_to_parent() -> None:
+    """A process that was forked, and may live longer, holds nothing."""
+    for descriptor in tuple(_held):
+        _release(descriptor)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)

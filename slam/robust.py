@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.se3 import FloatArray
 
@@ -10,7 +13,7 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of normal errors over their median absolute deviation."""
 
 
-def mad_sigma(residuals: FloatArray) -> float:
+def mad_sigma(residuals: NDArray[np.floating[Any]]) -> float:
     """Sigma of residuals about zero, any shape, by their median absolute value; NaN where there are none."""
     return MAD_TO_SIGMA * float(np.median(np.abs(residuals)))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
-from slam.mapping.surface import MapSurface, Progress, colours, normals, positions
+from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
 from slam.mapping.views import ViewChooser
 from slam.se3 import FloatArray, invert, rotation_angle
 
@@ -102,7 +103,7 @@ class TsdfMap:
         self._previous: DepthView | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None
-        self._submaps = 0
+        self._views_of_submaps: list[NDArray[np.int64]] = []
         self._fused = 0
         self._surface: MapSurface | None = None
 
@@ -181,6 +182,19 @@ class TsdfMap:
         points = np.concatenate(list(self.surface().cloud_pieces()))
         return MapCloud(positions(points), normals(points), colours(points))
 
+    def submap_of(self, frame: int) -> int:
+        """Number of the finished submap whose stretch of road a frame is on."""
+        return max(bisect_right([int(views[0]) for views in self._views_of_submaps], frame) - 1, 0)
+
+    def submap_anchor(self, number: int) -> int:
+        """The frame in the middle of a finished submap."""
+        views = self._views_of_submaps[number]
+        return int(views[len(views) // 2])
+
+    def submap_mesh(self, number: int) -> tuple[FloatArray, NDArray[np.int64]]:
+        """A finished submap by itself, as `slam.mapping.surface.submap_mesh`."""
+        return submap_mesh(submap_path(self._folder, number), self._config)
+
     @property
     def voxel_size(self) -> float:
         """Side of a voxel, in the trajectory's unit."""
@@ -192,7 +206,7 @@ class TsdfMap:
         try:
             surface = self.surface()
         except EmptyMapError:
-            return MapStatistics(0, 0, 0, self._submaps, self._fused, 0, voxel_size, filters, 0.0)
+            return MapStatistics(0, 0, 0, len(self._views_of_submaps), self._fused, 0, voxel_size, filters, 0.0)
         sizes = (surface.triangles, surface.points, surface.blocks, surface.submaps)
         return MapStatistics(*sizes, self._fused, 0, voxel_size, filters, surface.floater_share)
 
@@ -228,6 +242,6 @@ class TsdfMap:
         keys, observed, tsdf, weight = self._stretch.fusion.observed()
         numbers = {"fused": np.array(self._stretch.frames), "voxel_size": np.array(self.voxel_size)}
         submap = Submap(keys, observed, tsdf, weight, **numbers, **self._views.take(self._intrinsics))
-        submap.write(submap_path(self._folder, self._submaps))
-        self._submaps += 1
+        submap.write(submap_path(self._folder, len(self._views_of_submaps)))
+        self._views_of_submaps.append(submap.frames)
         self._stretch = None

@@ -13,6 +13,7 @@ from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import positions
 from slam.pipeline.batch import Progress, SlamResult
+from slam.results.double_walls import AT_LOOPS, double_walls_at_loops
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
@@ -40,13 +41,14 @@ def write_map(
     with result.stopwatch.stage("mesh"):
         surface.write_mesh(folder.path / "map_mesh.ply")
         surface.write_cloud(folder.path / "map_cloud.ply")
-    remove_submaps(folder.path / SUBMAPS)
     walls = {"double_wall_share": double_wall_share(surface.meshes())}
+    walls |= double_walls_at_loops(result.map, result.loops, result.odometry, result.optimised)
+    remove_submaps(folder.path / SUBMAPS)
     errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, sequence)
     return asdict(result.map.statistics()) | walls | errors
 
 
 def _no_map(reason: str) -> dict[str, Any]:
     names = ("triangles", "points", "blocks", "submaps", "filters", "floater_share", "double_wall_share")
-    sizes = {key: value for name in names for key, value in null(name, reason).items()}
+    sizes = {key: value for name in (*names, AT_LOOPS) for key, value in null(name, reason).items()}
     return sizes | no_map_errors(reason)

@@ -69,6 +69,10 @@ def map_filters(metrics: Metrics) -> Table | None:
         share, _ = lookup(metrics, "map", key)
         if share is not None:
             rows.append([Cell(name), Cell(f"{share:.1%}"), Cell(what)])
+    shares, _ = lookup(metrics, "map", "double_wall_share_at_loops")
+    if shares is not None:
+        what = "of the two submaps that most loops join: by the odometry, then at the poses of the map"
+        rows.append([Cell("double walls there"), Cell(f"{shares['before']:.1%}, {shares['after']:.1%}"), Cell(what)])
     return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows)
 
 

@@ -280,7 +280,7 @@ def _ahead(points: _Layer) -> _Layer:
     return points
 
 
-def _correlation(a: FloatArray, b: FloatArray) -> float:
+def _correlation(a: _Layer, b: _Layer) -> float:
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-9))
 
 

@@ -27,8 +27,9 @@ from torch import Tensor
 import erfsfm.training.run
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
-from erfsfm.errors import CheckpointError, ConfigError, DataError, TrainingError
+from erfsfm.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.lock import FolderLock
 from erfsfm.signals import Terminated
 from erfsfm.training.keeper import decisive, licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
@@ -249,6 +250,14 @@ def test_a_finished_run_can_be_extended(small: Small, world: Path, tmp_path: Pat
     train(longer, tmp_path / "run", resume=True, device="cpu")
     assert same(tmp_path / "whole", tmp_path / "run")
     assert load_experiment(tmp_path / "run" / "config.yaml").training.steps == 6
+
+
+def test_a_folder_that_another_training_writes_to_is_refused(small: Small, world: Path, tmp_path: Path) -> None:
+    with FolderLock() as lock:
+        lock.take(tmp_path / "run")
+        with pytest.raises(BusyError, match="another process writes to"):
+            train(configure(small, [world]), tmp_path / "run", device="cpu")
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_resuming_a_finished_run_changes_nothing(small: Small, world: Path, held_out: Path, tmp_path: Path) -> None:

@@ -80,6 +80,13 @@ def _extract(blocks: Blocks, voxel_size_m: float, least_weight: float) -> tuple[
 def _sorted(vertices: FloatArray, triangles: Triangles) -> tuple[FloatArray, Triangles]:
     """The same mesh in an order that does not depend on Open3D's threads."""
     order = np.lexsort(vertices.T)
+    differs = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
+    if not differs.all():  # several vertices in one place: by the places that the triangles around them reach
+        place = np.empty_like(order)
+        place[order] = np.append(0, np.cumsum(differs))
+        reached = np.zeros(len(vertices), dtype=np.int64)
+        np.add.at(reached, triangles, (place[triangles] ** 2).sum(axis=1)[:, None])  # of integers, in any order
+        order = np.lexsort((reached, *vertices.T))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     triangles = rank[triangles]

@@ -70,7 +70,7 @@ SHORTER: tuple[tuple[str, str], ...] = (
 SLOW = (
     r"^erfsfm export .*--format onnx",  # the README has it without the default format
     r"^python tools/",  # several whole runs each
-    r"^erfsfm receptive-field .*--weights default",  # docs/receptive-fields.md has it with smaller weights
+    r"^erfsfm receptive-field --(output|weights default)",  # docs/receptive-fields.md has it with smaller weights
     r"^erfsfm train --config table1",  # networks of the paper's size
 )
 

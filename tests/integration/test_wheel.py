@@ -93,6 +93,7 @@ def test_the_programs_are_those_of_the_wheel(installed: Installed, tmp_path: Pat
     assert all(Path(file).is_relative_to(installed.environment) for file in where.split())
 
 
+@pytest.mark.slow
 def test_it_runs(installed: Installed, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     installed.run(tmp_path, "erfsfm-slam", "run", "--frames", "0:40")
     metrics = check_run(tmp_path / "results" / "latest")

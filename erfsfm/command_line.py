@@ -61,10 +61,10 @@ def run(app: Callable[..., object], name: str) -> None:
 def _check_current_folder(name: str) -> None:
     """End where it was removed, for libraries that cannot be loaded then, or where files cannot hold its name."""
     try:
-        str(Path.cwd()).encode()
+        folder = Path.cwd()
     except FileNotFoundError:
         _end(f"{name}: the folder that you are in was removed: change to another one", 1)
-    except UnicodeEncodeError:
+    if not _is_text(str(folder)):
         _end(f"{name}: the name of the folder that you are in {_NOT_UTF8}", 1)
 
 

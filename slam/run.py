@@ -152,12 +152,7 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
             )
         require_other_output(request.continues, request.output)
     job = _prepare(request)
-    if request.output is not None:
-        lock.take(request.output)
-    folder = RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name)
-    if request.output is None:
-        lock.take(folder.path)
-    return job, folder
+    return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
 
 
 def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tuple[Job, RunFolder]:

@@ -121,7 +121,7 @@ def lidar_depth(frame: RawFrame, size: tuple[int, int], fidelity: Fidelity = "de
     height, width = size
     to_pixels = _projection(frame, size)  # (3, 4)
     path = frame.folder / "velodyne_points" / "data" / f"{frame.index:010d}.bin"
-    if not path.exists():
+    if not path.is_file():
         raise DataError(f"{path} is missing: the true depth of the split's frames comes from the LiDAR")
     numbers = np.fromfile(path, dtype=np.float32)
     if numbers.size % 4:
@@ -156,7 +156,7 @@ def displacements(frame: RawFrame, window: list[int]) -> FloatArray:
     """
     folder = frame.folder / "oxts"
     path = folder / "timestamps.txt"
-    if not path.exists():
+    if not path.is_file():
         raise DataError(f"{path} is missing: how far the car moved needs a date and a time a frame")
     stamps = path.read_text().split("\n")
     try:

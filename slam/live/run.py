@@ -81,9 +81,7 @@ def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
     with run_log() as log, raising_on_termination() as ignore_signals:
         job, sequence = _prepare(request, emit)
         with _stopping(sequence), FolderLock() as lock:
-            if request.output is not None:
-                lock.take(request.output)
-            folder = RunFolder.create(request.output, Path(job.settings.output.root), sequence.name)
+            folder = RunFolder.create(request.output, Path(job.settings.output.root), sequence.name, lock)
             try:
                 return complete(job, folder, log, ignore_signals)
             except SlamError as error:

@@ -184,7 +184,7 @@ class TsdfMap:
 
     def submap_of(self, frame: int) -> int:
         """Number of the finished submap whose stretch of road a frame is on."""
-        return max(bisect_right([int(views[0]) for views in self._views_of_submaps], frame) - 1, 0)
+        return max(bisect_right(self._views_of_submaps, frame, key=lambda views: int(views[0])) - 1, 0)
 
     def submap_anchor(self, number: int) -> int:
         """The frame in the middle of a finished submap."""

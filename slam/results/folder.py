@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from erfsfm.lock import FolderLock
 from slam.errors import RunError
 from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
 from slam.results.output import TRAJECTORIES as TRAJECTORIES
@@ -33,17 +34,24 @@ class RunFolder:
         self.replaces = replaces
 
     @classmethod
-    def create(cls, output: Path | None, results: Path, sequence: str) -> RunFolder:
+    def create(cls, output: Path | None, results: Path, sequence: str, lock: FolderLock | None = None) -> RunFolder:
         """A new folder: ``output`` itself, or ``results/<stamp>_<sequence>`` with ``results/latest`` linked to it.
 
-        Where ``output`` holds an earlier run, the new one is written to ``output/unfinished`` until `publish`.
+        Where ``output`` holds an earlier run, the new one is written to ``output/unfinished`` until `publish`. A
+        ``lock`` holds it from now on.
 
         Raises:
             RunError: ``output`` exists and holds something else than a run, or the folder cannot be made.
+            BusyError: another process holds ``output``.
         """
         try:
             if output is None:
-                return cls(stamped(results, sequence))
+                folder = cls(stamped(results, sequence))
+                if lock is not None:
+                    lock.take(folder.path)
+                return folder
+            if lock is not None:
+                lock.take(output)
             place = claim(output)
             return cls(place, None if place == output else output)
         except OSError as error:

@@ -63,7 +63,7 @@ _DIRECTION_FLOOR_DEG = 0.045  # least sigma of the translation direction, degree
 class OdometryState:
     """State of visual odometry; ``last`` is the motion to the last frame, where one was measured.
 
-    ``points`` are those of the last motion that triangulated any, which ended at frame ``points_at``.
+    Where corners alone gave its rotation and direction, ``points`` are those that it triangulated.
     """
 
     tracker: TrackerState
@@ -71,7 +71,6 @@ class OdometryState:
     history: MotionHistory
     last: Motion | None = None
     points: TriangulatedPoints | None = None
-    points_at: int = -1
 
 
 class VisualOdometry:
@@ -236,9 +235,10 @@ class VisualOdometry:
         triangulated = TriangulatedPoints(
             tracks.track_ids[solid], depth_previous[solid], depth_current[solid], relative_sigma[solid]
         )
-        state = self._state
-        ratio = triangulated.length_ratio(state.points) if state.points and state.points_at == ends[0] else None
-        self._state = replace(state, points=triangulated, points_at=ends[1])
+        last, earlier = self._state.last, self._state.points
+        is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
+        ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
+        self._state = replace(self._state, points=triangulated)
         sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
         return Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio)
 

@@ -188,10 +188,10 @@ def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
             module.take_imagenet()
         return []
     model = load_model(name)
-    free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width")}
+    free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width", "alignment")}
     try:
         if model.record.network.model_copy(update=free) != wanted:
-            raise ConfigError("only presets and widths may differ")
+            raise ConfigError("only presets, widths and alignment may differ")
         take_over(module.depth_net, model.depth_net.state_dict())
         take_over(module.pose_net, model.pose_net.state_dict())
     except ConfigError as error:

@@ -430,6 +430,13 @@ def test_initial_weights_of_another_network(small: Small, world: Path, tmp_path:
         train(wider.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
 
 
+def test_initial_weights_without_alignment(small: Small, world: Path, tmp_path: Path) -> None:
+    first = train(configure(small, [world], training={"steps": 1}), tmp_path / "first", device="cpu")
+    aligned = configure(small, [world], network={"alignment": "images"}, training={"steps": 1})
+    second = train(aligned.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
+    assert load_model(second).record.network.alignment == "images", "it has no weights: any may begin with it"
+
+
 def test_resume_with_other_data_keeps_the_leak_record(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,7 +55,17 @@ class Undistortion:
         self._maps = self._look_up()
 
     def apply(self, image: Image) -> Image:
-        """Undistort an image ``(H, W, 3)``."""
+        """Undistort an image ``(H, W, 3)``.
+
+        Raises:
+            SequenceError: it has another size than the camera.
+        """
+        camera, (height, width) = self.intrinsics, image.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise SequenceError(
+                f"the image is {width}x{height}, its camera {camera.width}x{camera.height}: "
+                "give the calibration of this camera at this size"
+            )
         flat: Image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return flat
 

@@ -136,6 +136,17 @@ def test_another_size_of_the_same_camera_is_found_too() -> None:
         Localiser(places(), CONFIG).locate("cut", twice[:, :300])
 
 
+@pytest.mark.parametrize("model", ["pinhole", "opencv"])
+def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path, model: str) -> None:
+    lens = "distortion: [-0.1, 0, 0, 0]" if model == "opencv" else "distortion: []"
+    camera = album / "camera.yaml"
+    camera.write_text(
+        f"{{width: 156, height: 48, fx: 90, fy: 90, cx: 77.5, cy: 23.5, fps: 10, model: {model}, {lens}}}"
+    )
+    for found in list(localise(album, run, camera))[:4]:
+        assert found.T_world_camera is None and "the image is 312x96, its camera 156x48: give" in found.reason
+
+
 @pytest.mark.parametrize("what", ["another street", "noise", "black"])
 def test_images_of_other_places_are_refused(what: str) -> None:
     images = {

@@ -52,7 +52,7 @@ def _scale_crop(
     top = int(rng.integers(enlarged.height - height + 1))
     size, part = (enlarged.width, enlarged.height), (slice(top, top + height), slice(left, left + width))
     crops = [np.ascontiguousarray(cv2.resize(i, size, interpolation=cv2.INTER_LINEAR)[part]) for i in images]
-    moved = [np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST)[part]) for m in maps]
+    moved = [np.ascontiguousarray(cv2.resize(m, size, interpolation=cv2.INTER_NEAREST_EXACT)[part]) for m in maps]
     return crops, moved, enlarged.cropped(left, top, width, height)
 
 

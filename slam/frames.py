@@ -37,7 +37,7 @@ class Intrinsics(Pinhole):
     are read.
     """
 
-    undistorted: bool = field(default=False, compare=False, repr=False)
+    undistorted: bool = field(default=False, kw_only=True, compare=False, repr=False)
 
     @property
     def K(self) -> FloatArray:

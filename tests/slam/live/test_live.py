@@ -84,6 +84,21 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     assert folder.metrics()["status"] == "ok"
 
 
+def test_without_a_road_there_is_no_unit(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
+    settings = (*SETTINGS, *at_the_horizon)
+    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    folder = run_live(request, messages.append)
+    assert folder.metrics()["scale"]["value"] is None
+    *poses, last = messages
+    assert [(each["state"], each["unit"], each["scale"]) for each in poses] == len(poses) * [("starting", None, None)]
+    assert last["unit"] is None
+
+
 def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
     street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -13,6 +13,7 @@ from erfsfm.config_tree import Section
 from erfsfm.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
+TrainedNetworks = Literal["both", "depth", "pose"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
 _LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
@@ -189,9 +190,7 @@ class TrainingConfig(Section):
         description="GPUs of a machine, or processes on its CPU; batch normalisation is synchronised on GPUs alone",
     )
     nodes: int = Field(default=1, ge=1, description="machines, on each of which the same command is started")
-    networks: Literal["both", "depth", "pose"] = Field(
-        default="both", description="trained networks; the other one keeps its weights"
-    )
+    networks: TrainedNetworks = Field(default="both", description="trained networks; the other one keeps its weights")
     frozen_stages: int = Field(
         default=0, ge=0, le=7, description="first stages of a lite0 encoder that keep their weights, the stem being one"
     )

@@ -31,7 +31,13 @@ LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the 
 
 @dataclass(frozen=True)
 class Intrinsics(Pinhole):
-    """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel."""
+    """A pinhole camera without distortion; (0, 0) is the centre of the top-left pixel.
+
+    ``undistorted`` is True where the camera itself has a lens with distortion, and its images are undistorted as they
+    are read.
+    """
+
+    undistorted: bool = field(default=False, kw_only=True, compare=False, repr=False)
 
     @property
     def K(self) -> FloatArray:

@@ -102,7 +102,7 @@ def _run(job: Job, folder: RunFolder) -> None:
     folder.publish()
     if stream is not None:
         stream.finish(estimate, folder.path)
-    quality = DepthQuality(job.recording, estimate.scale.mode)
+    quality = DepthQuality(job.recording, estimate.scale.is_metric)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
     numbers = write_map(folder, result, job.recording, job.progress)
     depth = quality.summary(job.settings.depth.refine != "none")

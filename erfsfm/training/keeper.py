@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -12,6 +13,7 @@ from lightning.pytorch.callbacks import Callback
 
 import erfsfm
 from erfsfm.checkpoint import Model, ModelRecord, commit, read_record, save_model
+from erfsfm.config import TrainedNetworks
 from erfsfm.data.splits import merge
 from erfsfm.errors import TrainingError
 from erfsfm.training.module import SelfSupervision
@@ -22,16 +24,18 @@ logger = logging.getLogger(__name__)
 class WeightKeeper(Callback):
     """Writes weights folders: the latest, the best, and those with the best poses.
 
+    The best is chosen by what is trained, `decisive`; poses of a network that keeps its weights have no best.
     The step of the last improvement is read from the record of the best weights, so that a run that is
     killed and resumed stops at the same step as an uninterrupted one.
     """
 
-    def __init__(self, output: Path, seen: list[str], command: str, validates: bool) -> None:
+    def __init__(self, output: Path, seen: list[str], command: str, validates: bool, networks: TrainedNetworks) -> None:
         self._output = output
         self._seen = seen
         self._command = command
         self.validates = validates
-        self._best = {output: math.inf, output / "best_pose": math.inf}
+        self._networks = networks
+        self._best = dict.fromkeys(self._measures({}), math.inf)
         self._best_step = 0
         for folder in self._best:
             if (folder / "model.yaml").is_file():
@@ -40,6 +44,13 @@ class WeightKeeper(Callback):
                 if math.isfinite(self._best[folder]):
                     self._best_step = max(self._best_step, record.step)
         self._saved_step = -1
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Ask for a stop after the last step: Lightning then validates once more."""
+        if self.validates and trainer.global_step >= trainer.max_steps:
+            trainer.should_stop = True
 
     def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Write the validated weights; end the run after `patience` validations without improvement."""
@@ -106,8 +117,11 @@ class WeightKeeper(Callback):
 
     def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
         """The metric by which each folder's weights are chosen; less is better."""
-        pose = metrics.get("snippet_ate", math.inf)
-        return {self._output: decisive(metrics), self._output / "best_pose": pose if math.isfinite(pose) else math.inf}
+        measures = {self._output: decisive(metrics, self._networks)}
+        if self._networks != "depth":
+            pose = metrics.get("snippet_ate", math.inf)
+            measures[self._output / "best_pose"] = pose if math.isfinite(pose) else math.inf
+        return measures
 
     def _improved(self, metrics: dict[str, float]) -> dict[Path, float]:
         return {folder: value for folder, value in self._measures(metrics).items() if value < self._best[folder]}
@@ -125,9 +139,12 @@ def _all_finite(module: SelfSupervision) -> bool:
     return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
 
 
-def decisive(metrics: dict[str, float]) -> float:
-    """The metric of a validation: error of depth where it has ground truth, else photometric error; less is better."""
-    value = metrics.get("abs_rel", metrics.get("photometric", math.inf))
+def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:
+    """The metric of a validation: error of depth, of poses where these alone are trained; less is better.
+
+    Without ground truth it is the photometric error.
+    """
+    value = metrics.get("snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf))
     return value if math.isfinite(value) else math.inf
 
 

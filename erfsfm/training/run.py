@@ -60,7 +60,7 @@ def train(
     Args:
         config: the experiment.
         output: receives ``config.yaml``, the best weights at its top (see `decisive`), those with the best
-            poses under ``best_pose/`` where true poses validate, the latest under ``last/``,
+            poses under ``best_pose/`` where poses are trained and true ones validate, the latest under ``last/``,
             ``checkpoints/last.ckpt`` for ``resume``, and CSV and TensorBoard logs under ``logs/``.
         resume: continue from ``checkpoints/last.ckpt``.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -90,7 +90,7 @@ def train(
     seen = trained_on(draws.recordings)
     if not resume:
         seen = merge([*seen, *_start_from(module, config)])
-    keeper = WeightKeeper(output, seen, command, validates=bool(validation))
+    keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks)
     loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if config.training.nodes > 1:

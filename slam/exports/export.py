@@ -25,7 +25,7 @@ from slam.formats.obj import write_obj
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.loops.places import PLACES, Places
-from slam.results.comparison import lookup
+from slam.results.comparison import METRES, is_metric, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, write_kitti, write_tum
@@ -122,27 +122,23 @@ def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOpti
 
 
 def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:
-    mode, _ = lookup(folder.metrics(), "scale", "mode")
-    if options.origin is not None and mode == "none":
-        raise RunError(
-            "a place on the earth needs metres, but this run's lengths are in camera heights: leave --origin"
-        )
+    unit = unit_of_lengths(folder.metrics())
+    if options.origin is not None and unit != METRES:
+        raise RunError(f"a place on the earth needs metres, but this run's lengths are in {unit}: leave --origin")
     with map_file(folder, "mesh", progress) as source:
         mesh = prepared(read_ply(source), options)
     raster = height_raster(_rotated(mesh, "z"), options.resolution or DEFAULT_RESOLUTION, options.origin)
-    write_raster(output, raster, "camera heights" if mode == "none" else "metres")
+    write_raster(output, raster, unit)
 
 
 def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
     if output.suffix.lower() not in (".yaml", ".pgm"):
         raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
-    mode, _ = lookup(folder.metrics(), "scale", "mode")
     with map_file(folder, "mesh", progress) as source:
         mesh = prepared(read_ply(source), options)
     trajectory = _trajectory(folder, "z")
-    grid = occupancy_grid(
-        _rotated(mesh, "z"), trajectory.T_world_camera, options.resolution or DEFAULT_RESOLUTION, mode != "none"
-    )
+    metric, resolution = is_metric(folder.metrics()), options.resolution or DEFAULT_RESOLUTION
+    grid = occupancy_grid(_rotated(mesh, "z"), trajectory.T_world_camera, resolution, metric)
     written = output.with_suffix(".yaml")
     write_ros_map(written, grid.cells, grid.corner, grid.resolution)
     return written

@@ -19,10 +19,10 @@ from slam.errors import RunError
 from slam.formats.ply import Ply
 from slam.storage.files import write_atomically
 
-_FLOAT, _UNSIGNED_INT, _UNSIGNED_BYTE = 5126, 5125, 5121
+_FLOAT, _UNSIGNED_INT, _UNSIGNED_SHORT = 5126, 5125, 5123
 _VERTICES, _INDICES = 34962, 34963
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_OPAQUE = 255
+_OPAQUE = 65535
 
 
 class _Buffer:
@@ -45,7 +45,7 @@ class _Buffer:
 
 
 def write_gltf(path: Path, mesh: Ply) -> None:
-    """Write a mesh, atomically; coordinates in single precision, colours as the bytes of the map.
+    """Write a mesh, atomically; coordinates in single precision, colours linear as the format wants them.
 
     Args:
         path: ends in ``.glb`` or ``.gltf``.
@@ -69,6 +69,13 @@ def write_gltf(path: Path, mesh: Ply) -> None:
     write_atomically(path, lambda partial: partial.write_bytes(whole), RunError)
 
 
+def _linear() -> NDArray[np.uint16]:
+    """Linear light of the 256 levels of sRGB; in 8 bits the dark ones would fall together."""
+    level = np.arange(256) / 255.0
+    light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    return np.asarray(np.rint(_OPAQUE * light), np.uint16)
+
+
 def _document(mesh: Ply, buffer: _Buffer) -> dict[str, Any]:
     points = mesh.points.astype(np.float32)
     low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
@@ -78,8 +85,8 @@ def _document(mesh: Ply, buffer: _Buffer) -> dict[str, Any]:
         upright = np.where(lengths > 0, mesh.normals / np.where(lengths > 0, lengths, 1), [0.0, 0.0, 1.0])
         attributes["NORMAL"] = buffer.add(upright.astype(np.float32), _FLOAT, "VEC3", _VERTICES)
     if mesh.colours is not None:
-        colours = np.column_stack([mesh.colours, np.full(len(points), _OPAQUE, np.uint8)])
-        attributes["COLOR_0"] = buffer.add(colours, _UNSIGNED_BYTE, "VEC4", _VERTICES, normalized=True)
+        colours = np.column_stack([_linear()[mesh.colours], np.full(len(points), _OPAQUE, np.uint16)])
+        attributes["COLOR_0"] = buffer.add(colours, _UNSIGNED_SHORT, "VEC4", _VERTICES, normalized=True)
     assert mesh.triangles is not None
     corners = mesh.triangles.astype(np.uint32).reshape(-1)
     indices = buffer.add(corners, _UNSIGNED_INT, "SCALAR", _INDICES)

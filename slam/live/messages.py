@@ -18,14 +18,14 @@ _LAST_PORT = 65535
 Emit = Callable[[dict[str, Any]], None]
 
 
-def pose_message(index: int, stamp: float, tracked: Tracked, unit: str) -> dict[str, Any]:
+def pose_message(index: int, stamp: float, tracked: Tracked, unit: str | None) -> dict[str, Any]:
     """One frame: its pose ``(4, 4)`` as 12 numbers, row by row as in KITTI's files."""
     pose = [float(x) for x in tracked.T_world_camera[:3].ravel()]
     scale = {"unit": unit, "scale": tracked.unit}
     return {"type": "pose", "frame": index, "stamp": stamp, "state": tracked.state, **scale, "T_world_camera": pose}
 
 
-def corrected_message(trajectory: Trajectory, loops: int, unit: str, run: str) -> dict[str, Any]:
+def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run: str) -> dict[str, Any]:
     """All poses after the whole drive was solved, with its loops closed."""
     poses = [[float(x) for x in T[:3].ravel()] for T in trajectory.T_world_camera]
     state = "loop closed" if loops else "whole drive"

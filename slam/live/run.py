@@ -110,6 +110,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=request.source,
+        camera=request.calibration,
         weights=request.weights,
         output=request.output,
         seed=request.seed,
@@ -147,7 +148,7 @@ class _Session:
     def finish(self, result: SlamResult, folder: Path) -> None:
         """Say all poses again as the whole drive gives them, and why it ended."""
         reader = self._sequence.reader
-        message = corrected_message(result.optimised, len(result.loops.accepted), self._tracker.unit_name, str(folder))
+        message = corrected_message(result.optimised, len(result.loops.accepted), result.scale.unit_name, str(folder))
         self._emit(message | {"dropped": reader.dropped, "ended": reader.ended})
         if self._viewer is not None:
             self._viewer.correct(result.optimised)

@@ -12,7 +12,7 @@ import numpy as np
 from slam.errors import RunError
 from slam.evaluation.map import pose_similarity
 from slam.localisation.localiser import Localisation, image_paths
-from slam.results.comparison import lookup
+from slam.results.comparison import is_metric
 from slam.results.folder import RunFolder
 from slam.se3 import FloatArray, Similarity, invert, rotation_angle
 from slam.trajectory import read_trajectory
@@ -60,7 +60,7 @@ class MapTruth:
         if reference is None or optimised is None or len(reference) != len(optimised):
             raise RunError(f"{run.path} has no reference, so that no error can be computed: leave out --truth")
         T_true_camera, T_world_camera = reference.T_world_camera, optimised.T_world_camera
-        with_scale = lookup(run.metrics(), "scale", "mode")[0] == "none"
+        with_scale = not is_metric(run.metrics())
         return cls(T_world_camera, T_true_camera, pose_similarity(T_true_camera, T_world_camera, with_scale))
 
     def error(self, found: Localisation, T_true_image: FloatArray) -> PoseError | None:

@@ -19,7 +19,9 @@ verbs = typer.Typer()
 def localize(
     images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
     map: Annotated[Path, typer.Option("--map", help="a run folder")],
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the images; default: that of the run")] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml or fov=DEGREES; default: beside the images, else the run's")
+    ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
     every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
     truth: Annotated[

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.errors import DataError
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images, read_image
 from erfsfm.readers.numbering import by_name
@@ -66,18 +66,24 @@ def localise(
     Args:
         images: an image or a folder of images.
         run: a finished run with loops switched on.
-        camera: their ``camera.yaml``; None for the one beside them, or else the camera of the run.
+        camera: their ``camera.yaml``; None for the one beside them or their folder, or else the camera of the run.
         numbers: of the images to localise; None for all of them.
 
     Raises:
-        SlamError, DataError: no images, no places in the run, or a camera file that does not fit.
+        SlamError, DataError: no images, no places in the run, a camera file that does not fit, or none where the run
+            undistorted its images.
     """
     take_working_memory()
     paths = image_paths(images)
     places = Places.read(run.require(PLACES))
     if not places.views:
         raise RunError(f"{run.path} has no places: it ran with loops.enabled=false; run the sequence again")
-    own_camera = _camera_file(camera, paths)
+    own_camera = _camera_file(camera, images, paths)
+    if own_camera is None and places.intrinsics.undistorted:
+        raise SequenceError(
+            f"{run.path} undistorted its images, and {images} has no {CAMERA_FILE}: give its --camera, which is fov=70 "
+            "for images without distortion"
+        )
     localiser = Localiser(
         places,
         load_stored(run.require("config.yaml"), "loops").loops,
@@ -230,9 +236,11 @@ def image_paths(images: Path) -> list[Path]:
     return list_images(folder)
 
 
-def _camera_file(explicit: Path | None, paths: list[Path]) -> CameraFile | None:
+def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> CameraFile | None:
+    """That of the user, or else the one that ``run`` would find."""
     if explicit is None:
-        return beside(paths[0].parent)
+        folder = images if images.is_dir() else images.parent
+        return beside(paths[0].parent, folder, folder.absolute().parent)
     if is_field_of_view(explicit):
         return explicit_camera(explicit, ImageFiles(by_name(paths)))
     return read_explicit(explicit)

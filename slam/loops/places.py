@@ -45,6 +45,7 @@ class Places:
             path,
             format=np.array(_FORMAT),
             camera=np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
+            undistorted=np.array(camera.undistorted),
             frames=np.array([view.index for view in self.views], np.int64),
             counts=np.array([len(view) for view in self.views], np.int64),
             T_world_camera=self.T_world_camera,
@@ -70,7 +71,9 @@ class Places:
             # the part after the last view is empty
             parts = [np.split(content[name], ends)[: len(frames)] for name in ("pixels", "descriptors", "points")]
             views = tuple(View(index, *arrays) for index, *arrays in zip(frames, *parts, strict=True))
-            return cls(Intrinsics(int(width), int(height), *pinhole), views, content["T_world_camera"])
+            undistorted = "undistorted.npy" in file.namelist() and bool(read_array(file, "undistorted"))
+            camera = Intrinsics(int(width), int(height), *pinhole, undistorted=undistorted)
+            return cls(camera, views, content["T_world_camera"])
 
 
 def _check(content: dict[str, NDArray[Any]]) -> None:

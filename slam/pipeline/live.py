@@ -244,7 +244,7 @@ class Slam:
         if not self._observer.seen.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
         solved = self._pipeline.solve(self._mode, self._pipeline.close_maps(self._observer.closed()))
-        self._tracker.correct(solved.T_world_camera, float(solved.measured.scale.per_frame[-1]))
+        self._tracker.correct(solved.T_world_camera, solved.measured.scale)
         return solved.loops
 
     def _observe(self, state: ObserverState | None) -> Observer:

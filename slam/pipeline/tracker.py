@@ -10,6 +10,7 @@ import numpy as np
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.frames import Intrinsics, Predictor
+from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.growing import GrowingSequence
@@ -51,16 +52,12 @@ class Tracker:
         self._recent = GrowingSequence(intrinsics, camera_height_m)
         self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
         self._window, self._update = window, update
+        self.unit_name: str | None = None  # of all lengths, None while unknown
         self._mode: ScaleMode = resolve_mode(config.scale, camera_height_m)
         self._T_world_camera: list[FloatArray] = []
         self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
         self._was_bridged = False
-
-    @property
-    def unit_name(self) -> str:
-        """Of all lengths."""
-        return "camera heights" if self._mode == "none" else "m"
 
     @property
     def T_world_camera(self) -> FloatArray:
@@ -75,19 +72,19 @@ class Tracker:
             self._step(observer, index)
         if seen.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
-        return [
-            Tracked(self._T_world_camera[k], self._state(k in seen.unusable), self._unit) for k in range(first, count)
-        ]
+        unit = None if self.unit_name is None else self._unit
+        return [Tracked(self._T_world_camera[k], self._state(k in seen.unusable), unit) for k in range(first, count)]
 
-    def correct(self, T_world_camera: FloatArray, unit: float) -> None:
+    def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
-        self._T_world_camera, self._unit = list(T_world_camera), unit
+        self._T_world_camera, self._unit = list(T_world_camera), float(scale.per_frame[-1])
+        self.unit_name = scale.unit_name
         if len(T_world_camera) > 1:
             self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]
 
     def _state(self, is_bridged: bool) -> State:
         before, self._was_bridged = self._was_bridged, is_bridged
-        if self._unit is None:
+        if self.unit_name is None:
             return "starting"
         return "bridged" if is_bridged else "relocalised" if before else "tracking"
 
@@ -116,6 +113,7 @@ class Tracker:
             return
         self._recent.stamps = np.arange(count - first, dtype=np.float64)
         measured = self._pipeline.measure(self._mode, closed(window, self._sources))
+        self.unit_name = measured.scale.unit_name
         if observer.keyframe_step(count - 1) is not None:
             self._unit = float(np.median(measured.scale.per_frame))
             return

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 MISSING = "–"
 NOT_RECORDED = "not recorded"
+METRES = "metres"
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,21 @@ def failure(metrics: Mapping[str, Any]) -> str:
     return " ".join(str(reason).split())
 
 
+def unit_of_lengths(metrics: Mapping[str, Any]) -> str:
+    """``metres``, ``camera heights``, or ``the networks' own unit`` where no road was found."""
+    mode, value = (lookup(metrics, "scale", key)[0] for key in ("mode", "value"))
+    if mode == "none":
+        return "camera heights"
+    if mode is None or value is not None:
+        return METRES
+    return "camera heights" if mode in ("gps", "known", "reference") else "the networks' own unit"
+
+
+def is_metric(metrics: Mapping[str, Any]) -> bool:
+    """Whether lengths of a run are metres; so are those of one that does not tell."""
+    return unit_of_lengths(metrics) == METRES
+
+
 def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
     """Notes on the unit of length of a run."""
     mode, _ = lookup(metrics, "scale", "mode")
@@ -87,10 +103,9 @@ def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
             "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
             "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres."
         )
-    elif mode is not None and lookup(metrics, "scale", "value")[0] is None:
+    elif not is_metric(metrics):
         reason = lookup(metrics, "scale", "value")[1]
-        own = "camera heights" if mode in ("gps", "known", "reference") else "the networks' own unit"
-        notes.append(f"No scale was found ({reason}): lengths are in {own}, not in metres.")
+        notes.append(f"No scale was found ({reason}): lengths are in {unit_of_lengths(metrics)}, not in metres.")
     return notes
 
 

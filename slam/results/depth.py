@@ -24,10 +24,9 @@ _EVERY_RENDERED = 5  # rendering a keyframe's true depth takes as long as refini
 class DepthQuality:
     """Collects the errors of keyframes while the map is fused."""
 
-    def __init__(self, sequence: Sequence, unit: str) -> None:
-        """``unit`` is the run's scale mode: with ``none`` depth is not in metres."""
-        self._sequence = sequence
-        self._is_metric = unit != "none"
+    def __init__(self, sequence: Sequence, is_metric: bool) -> None:
+        """``is_metric`` tells whether the run's depth is in metres."""
+        self._sequence, self._is_metric = sequence, is_metric
         self._network, self._refined = DepthErrors(), DepthErrors()
         self._keyframes = self._not_refined = 0
         self._unreadable: list[str] = []
@@ -60,7 +59,7 @@ class DepthQuality:
         if self._keyframes == 0:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:
-            missing = "depth is in camera heights, not in metres (scale.mode none)"
+            missing = "depth is not in metres (see scale)"
         numbers = null("network", missing) if network is None else {"network": network}
         if refined is not None:
             return numbers | {"refined": refined}

@@ -50,7 +50,7 @@ class Undistortion:
                 _CHECK,
             )
         self.intrinsics = Intrinsics(
-            camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
+            camera.width, camera.height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy, undistorted=True
         )
         self._maps = self._look_up()
 

@@ -205,8 +205,9 @@ def test_true_and_false_loops(
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
     derived = derived_metrics.derive_metrics(tmp_path, metrics())
     assert (derived["true_loops"], derived["false_loops"]) == (1 - false, false)
-    in_heights = metrics() | {"scale": {"mode": "none", "value": 1.0}}
-    assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
+    for mode, value in (("none", 1.0), ("gps", None)):
+        in_heights = metrics() | {"scale": {"mode": mode, "value": value}}
+        assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
 
 
 def test_summary_counts_drives_and_pairs_hazards_with_clean_drives(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.results.comparison import lookup
+from slam.results.comparison import is_metric, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.results.summary import null
 from slam.se3 import FloatArray, invert, rotation_angle
@@ -54,8 +54,8 @@ def _loops(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
     reason = lookup(metrics, "loops", "accepted")[1]
     if reference is None:
         reason = "the sequence has no true poses"
-    elif lookup(metrics, "scale", "mode")[0] == "none":
-        reason = "loops in camera heights cannot be compared with metres"
+    elif not is_metric(metrics):
+        reason = f"loops in {unit_of_lengths(metrics)} cannot be compared with metres"
     if reference is None or reason:
         return null("true_loops", reason) | null("false_loops", reason)
     accepted = json.loads((folder / "loops.json").read_text(encoding="utf-8"))["accepted"]

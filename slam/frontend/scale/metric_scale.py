@@ -54,6 +54,13 @@ class Scale:
         """Whether lengths are metres."""
         return self.mode != "none" and not isinstance(self.estimate, MeasurementFailure)
 
+    @property
+    def unit_name(self) -> str | None:
+        """``m`` or, with mode none, ``camera heights``; None where metres were not found."""
+        if self.mode == "none":
+            return "camera heights"
+        return "m" if self.is_metric else None
+
     def in_unit_of(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
         """The same times an estimate in this unit; unchanged where that failed."""
         if isinstance(other, MeasurementFailure):

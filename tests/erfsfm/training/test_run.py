@@ -27,6 +27,8 @@ from torch import Tensor
 import erfsfm.training.run
 from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
+from erfsfm.data.discovery import discover
+from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.lock import FolderLock
@@ -299,15 +301,43 @@ def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list
     monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", on_validation_epoch_end)
 
 
+@pytest.mark.parametrize(
+    ("networks", "steps"),
+    [
+        ("both", {".": 2, "best_pose": 3, "last": 4}),
+        ("pose", {".": 3, "best_pose": 3, "last": 4}),
+        ("depth", {".": 2, "last": 4}),
+    ],
+)
 def test_best_depth_and_best_pose_are_kept_apart(
-    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    networks: str,
+    steps: dict[str, int],
 ) -> None:
-    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4])
+    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4] if networks != "pose" else [0.3] * 4)
     scripted_validation(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
-    config = configure(small, [world, held_out], training={"validate_every": 1})
+    (recording,) = discover(world)
+    ManyViewTeacher(tmp_path / "measured", (32, 64), 2).drive(recording).keep_poses(np.stack([np.eye(4)] * 10))
+    teacher: dict[str, Any] = {"views": "many", "rotation_weight": 1.0, "cache": tmp_path / "measured"}
+    training = {"validate_every": 1, "networks": networks}
+    config = configure(small, [world, held_out], training=training, teacher=teacher if networks == "pose" else {})
     output = train(config, tmp_path / "run", device="cpu")
-    steps = {name: load_model(output / name).record.step for name in (".", "best_pose", "last")}
-    assert steps == {".": 2, "best_pose": 3, "last": 4}
+    written = [name for name in (".", "best_pose", "last") if (output / name / "model.yaml").exists()]
+    assert {name: load_model(output / name).record.step for name in written} == steps
+
+
+@pytest.mark.parametrize("validate_every", [3, 100])
+def test_the_last_step_is_validated(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, validate_every: int
+) -> None:
+    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.3, 0.3, 0.1])
+    config = configure(small, [world, held_out], training={"validate_every": validate_every})
+    record = load_model(train(config, tmp_path / "run", device="cpu")).record
+    assert record.step == 4 and record.metrics["abs_rel"] == 0.1
 
 
 @pytest.mark.parametrize(("patience", "end"), [(0, 8), (1, 3), (2, 6), (4, 8)])

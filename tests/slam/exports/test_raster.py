@@ -143,13 +143,23 @@ def test_a_run_from_above(make_recorded: Callable[..., RunFolder], sheet: Ply, t
     assert (described["width"], described["height"]) == (10, 15)
 
 
-def test_camera_heights_have_no_place_on_earth(make_recorded: Callable[..., RunFolder], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("mode", "value", "unit"),
+    [
+        ("none", 1.0, "camera heights"),
+        ("gps", None, "camera heights"),
+        ("camera-height", None, "the networks' own unit"),
+    ],
+)
+def test_without_metres_there_is_no_place_on_earth(
+    make_recorded: Callable[..., RunFolder], tmp_path: Path, mode: str, value: float | None, unit: str
+) -> None:
     folder = make_recorded()
-    folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "value": 1.0}})
-    with pytest.raises(RunError, match="needs metres"):
+    folder.write_metrics(folder.metrics() | {"scale": {"mode": mode, "value": value}})
+    with pytest.raises(RunError, match=f"needs metres.* in {unit}"):
         export(folder, "raster", tmp_path / "r", options=ExportOptions(origin=parse_origin("49,8,0")))
     written = export(folder, "raster", tmp_path / "r", options=ExportOptions(resolution=0.5))
-    assert yaml.safe_load((written / "raster.yaml").read_text())["unit"] == "camera heights"
+    assert yaml.safe_load((written / "raster.yaml").read_text())["unit"] == unit
 
 
 @pytest.mark.parametrize("text", ["", "49", "49,8", "91,8,0", "49,181,0", "49,8,north", "49,8,inf"])

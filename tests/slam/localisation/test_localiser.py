@@ -5,15 +5,18 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.readers.camera_file import CameraFile
 from slam.config import LoopsConfig, dump_yaml, load_config
 from slam.errors import RunError, SequenceError
-from slam.frames import Frame, Image
+from slam.frames import Frame, Image, Intrinsics
 from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
 from slam.localisation.localiser import Localiser, image_numbers, localise
 from slam.localisation.tables import localisation_json, localisation_table, write_localisations
@@ -135,6 +138,34 @@ def test_another_size_of_the_same_camera_is_found_too() -> None:
         Localiser(places(), CONFIG).locate("cut", twice[:, :300])
 
 
+def bent(image: Image, camera: CameraFile) -> Image:
+    """An image of a pinhole as a lens of the same K takes it."""
+    K = Intrinsics.of(camera.pinhole).K
+    pixels = street(630).intrinsics.pixel_grid().reshape(-1, 1, 2)
+    seen = cv2.undistortPoints(pixels, K, np.array(camera.distortion), P=K).reshape(*image.shape[:2], 2)
+    return np.asarray(cv2.remap(image, seen.astype(np.float32), None, cv2.INTER_LINEAR), np.uint8)
+
+
+@pytest.mark.parametrize("where", ["images", ".", None])
+def test_images_of_a_lens_need_its_camera_file(run: RunFolder, tmp_path: Path, where: str | None) -> None:
+    """It is looked for where ``run`` looks."""
+    run.write(PLACES, replace(places(), intrinsics=replace(places().intrinsics, undistorted=True)).write)
+    pinhole = places().intrinsics
+    keys = {name: getattr(pinhole, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    lens = CameraFile.model_validate(keys | {"fps": 10, "model": "opencv", "distortion": (-0.2, 0.0, 0.0, 0.0)})
+    (tmp_path / "album" / "images").mkdir(parents=True)
+    save(tmp_path / "album" / "images" / "25.png", bent(street(630).frame(25).image, lens))
+    if where is None:
+        with pytest.raises(SequenceError, match=r"undistorted its images, and .*album has no camera\.yaml: give its"):
+            list(localise(tmp_path / "album", run))
+        return
+    (tmp_path / "album" / where / "camera.yaml").write_text(lens.model_dump_json(exclude_none=True))
+    for images in ("", "images", "images/25.png"):
+        (found,) = localise(tmp_path / "album" / images, run)
+        assert found.T_world_camera is not None, found.reason
+        assert np.linalg.norm(found.T_world_camera[:3, 3] / UNIT - reference()[25, :3, 3]) < 0.5
+
+
 @pytest.mark.parametrize("model", ["pinhole", "opencv"])
 def test_a_camera_of_another_size_is_refused_image_by_image(run: RunFolder, album: Path, model: str) -> None:
     lens = "distortion: [-0.1, 0, 0, 0]" if model == "opencv" else "distortion: []"
@@ -179,13 +210,16 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
 
 
-def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, album: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("scale", [{"mode": "none", "value": 1.0}, {"mode": "gps", "value": None}])
+def test_where_the_truth_is_known_errors_and_success_are_said(
+    run: RunFolder, album: Path, tmp_path: Path, scale: dict[str, Any]
+) -> None:
     stamps = np.arange(60.0)
     run.write_trajectory("reference", Trajectory(stamps, reference()))
     scaled = reference().copy()
     scaled[:, :3, 3] *= UNIT
     run.write_trajectory("trajectory_optimised", Trajectory(stamps, scaled))
-    run.write_metrics(run.metrics() | {"scale": {"mode": "none", "value": 1.0}})
+    run.write_metrics(run.metrics() | {"scale": scale})
     rows = reference()[[10, 25, 40, 50, 50]]
     rows[1, 0, 3] += 3.0  # a wrong truth
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))
@@ -234,6 +268,8 @@ def test_the_run_of_an_earlier_release_serves_still(run: RunFolder, album: Path)
     )
     assert "max_blocks" in stored and "peak_frames" in stored
     run.write_text("config.yaml", stored)
+    with np.load(run.path / PLACES) as content:
+        np.savez(run.path / PLACES, **{name: content[name] for name in content.files if name != "undistorted"})
     (found,) = localise(album, run, numbers=range(1, 2))
     assert found.T_world_camera is not None
 

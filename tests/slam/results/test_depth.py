@@ -36,7 +36,7 @@ def with_depth(tmp_path) -> RecordedSequence:
 
 
 def test_stored_depth_is_read_and_compared(tmp_path) -> None:
-    quality = DepthQuality(with_depth(tmp_path), "camera-height")
+    quality = DepthQuality(with_depth(tmp_path), is_metric=True)
     quality.add(keyframe())
     summary = quality.summary(is_refined=True)
     assert summary["network"]["abs_rel"] == 0
@@ -53,7 +53,7 @@ def test_an_excerpt_reads_the_frame_of_its_base(tmp_path) -> None:
 def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(tmp_path, caplog) -> None:
     sequence = with_depth(tmp_path)
     (tmp_path / "000002.png").write_bytes(b"x")
-    quality = DepthQuality(sequence, "camera-height")
+    quality = DepthQuality(sequence, is_metric=True)
     for _ in range(2):
         quality.add(keyframe())
     assert quality.summary(True)["network_reason"] == "the true depth of 2 keyframes cannot be read"
@@ -61,19 +61,19 @@ def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(tmp_path, 
 
 
 def test_every_missing_number_has_its_reason(tmp_path) -> None:
-    def reasons(unit: str, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True):
-        quality = DepthQuality(sequence, unit)
+    def reasons(metric: bool, sequence: RecordedSequence, *keyframes: KeyframeDepth, is_refined: bool = True):
+        quality = DepthQuality(sequence, metric)
         for one in keyframes:
             quality.add(one)
         summary = quality.summary(is_refined)
         return summary.get("network_reason"), summary.get("refined_reason")
 
     known = with_depth(tmp_path)
-    assert "mapping.enabled" in reasons("reference", known)[0]
-    assert "no true depth" in reasons("reference", recorded(), keyframe())[1]
-    assert "scale.mode none" in reasons("none", known, keyframe())[0]
-    assert reasons("reference", known, keyframe(False)) == (None, "no keyframe has a neighbour at a useful distance")
-    assert reasons("reference", known, keyframe(False), is_refined=False) == (None, "depth.refine is none")
+    assert "mapping.enabled" in reasons(True, known)[0]
+    assert "no true depth" in reasons(True, recorded(), keyframe())[1]
+    assert "not in metres" in reasons(False, known, keyframe())[0]
+    assert reasons(True, known, keyframe(False)) == (None, "no keyframe has a neighbour at a useful distance")
+    assert reasons(True, known, keyframe(False), is_refined=False) == (None, "depth.refine is none")
 
 
 def test_the_nearest_lidar_point_of_a_pixel_counts() -> None:

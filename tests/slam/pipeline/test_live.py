@@ -193,7 +193,7 @@ def test_a_first_stamp_that_is_no_number_is_refused() -> None:
 
 
 class Failing(OraclePredictor):
-    """An oracle that fails at one frame, at its depth or at the snippet that ends with it, however often it is asked."""
+    """An oracle that fails at one frame, at its depth or at the snippet that ends with it, each time."""
 
     def __init__(self, frame: int, question: str) -> None:
         assert drive().reference is not None

@@ -110,6 +110,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=request.source,
+        camera=request.calibration,
         weights=request.weights,
         output=request.output,
         seed=request.seed,

@@ -31,7 +31,7 @@ class StreamedSequence(GrowingSequence):
                 f"{name} gives images of {source.width} x {source.height} and the camera file is for {camera.width} x "
                 f"{camera.height}: give the calibration of this camera at this size"
             )
-        undistortion = None if camera.model == "pinhole" else Undistortion(camera)
+        undistortion = Undistortion(camera) if camera.is_distorted else None
         super().__init__(self.intrinsics_of(camera), camera.height_or(None), name=name)
         self.reader = Reader(source, most_wait_s, _as_they_are if undistortion is None else undistortion.apply)
         self.arrivals: dict[int, Arrival] = {}
@@ -39,7 +39,7 @@ class StreamedSequence(GrowingSequence):
     @staticmethod
     def intrinsics_of(camera: CameraFile) -> Intrinsics:
         """Of the images without distortion."""
-        return Intrinsics.of(camera.pinhole) if camera.model == "pinhole" else Undistortion(camera).intrinsics
+        return Undistortion(camera).intrinsics if camera.is_distorted else Intrinsics.of(camera.pinhole)
 
     def frames(self) -> Iterator[Frame]:
         """Every frame as it is taken."""
@@ -57,7 +57,7 @@ def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFil
         SequenceError: there is none.
     """
     if given is not None:
-        return explicit_camera(given, source)
+        return explicit_camera(given, source, source.fps)
     path = Path(camera)
     places = (path, path.absolute().parent) if path.is_dir() else (path.absolute().parent,) if path.is_file() else ()
     if not places:

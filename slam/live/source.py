@@ -114,11 +114,11 @@ class VideoSource:
         """
         self._name = name
         self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
-        self.fps = DEFAULT_FPS
         self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
         # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
         source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"
         self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(source)
+        self.fps = float(self._is_file and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
         self._first = self._next()
         if self._first is None:
             raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")

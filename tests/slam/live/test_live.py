@@ -28,6 +28,7 @@ from slam.frames import Image
 from slam.live.messages import emitters
 from slam.live.reader import Reader
 from slam.live.run import LiveRequest, run_live
+from slam.live.sequence import calibration_of
 from slam.live.source import FolderSource, VideoSource, open_source
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
@@ -42,7 +43,8 @@ def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "images").mkdir()
     for path in images:
         shutil.copy(path, folder / "images" / path.name)
-    shutil.copy(kitti_root / "camera.yaml", folder / "camera.yaml")
+    camera, no_lens = (kitti_root / "camera.yaml").read_text(), "model: opencv\ndistortion: [0, 0, 0, 0]"
+    (folder / "camera.yaml").write_text(camera.replace("model: pinhole", no_lens))
     return folder
 
 
@@ -239,7 +241,7 @@ def test_the_viewer_is_shown_the_drive(
 
 def test_a_video_plays_at_its_own_speed(video: Path) -> None:
     source = VideoSource(str(video), 1.0)
-    source.fps = 20.0
+    assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
     assert (source.width, source.height) == (32, 24)
@@ -282,9 +284,9 @@ def test_a_port_that_does_not_exist_is_refused() -> None:
 def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
     output, target, messages = tmp_path / "run", tmp_path / "images", []
     target.mkdir()
-    shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
     command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "60"]
+    command += ["--calibration", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -296,4 +298,7 @@ def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: P
     last = json.loads(rest.splitlines()[-1])
     assert last["type"] == "trajectory" and last["ended"] == "it was interrupted"
     assert len(last["stamps"]) == FRAMES == messages[-1]["frame"] + 1
-    assert json.loads((output / "metrics.json").read_text())["status"] == "ok"
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["status"] == "ok"
+    recording = {"dataset": str(target), "camera": str(street / "camera.yaml")}
+    assert metrics["provenance"]["recording"] == recording

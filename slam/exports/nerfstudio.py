@@ -21,6 +21,7 @@ from slam.results.folder import RunFolder
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.excerpt import frame_range
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory
 
@@ -91,13 +92,30 @@ def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) 
     wanted, found = ((c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (camera, sequence.intrinsics))
     if not np.allclose(wanted, found, atol=_SAME_PIXEL):
         raise RunError(f"{sequence.name} has another camera than {folder.path}: give the data set of the run")
-    stamps, rows = np.asarray(sequence.stamps), list[int | None]()
-    for stamp in trajectory.stamps:
-        nearest = int(np.argmin(np.abs(stamps - stamp)))
-        rows.append(nearest if abs(stamps[nearest] - stamp) < _SAME_STAMP_S else None)
-    if all(row is None for row in rows):
+    return sequence, _rows(folder, trajectory, sequence)
+
+
+def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list[int | None]:
+    """Frames by their stamps; by their order where the recording continues another and its stamps were shifted."""
+    metrics, stamps = folder.metrics(), np.asarray(sequence.stamps)
+    first, _ = lookup(metrics, "sequence", "continued_at")
+    if first:
+        named, _ = lookup(metrics, "provenance", "recording", "frames")
+        start, stop = frame_range(named or ":", len(stamps))
+        added = trajectory.stamps[first:]
+        last = stamps[start:stop][-len(added) :]
+        if len(last) != len(added) or np.abs(last - added).max() >= _SAME_STAMP_S:
+            if stop - start != len(added):
+                raise RunError(
+                    f"{sequence.name} has {stop - start} frames, but {folder.path} goes on with {len(added)} at frame "
+                    f"{first}: give the data set of its last part, as it was"
+                )
+            return [None] * first + list(range(start, stop))
+    nearest = [int(np.argmin(np.abs(stamps - stamp))) for stamp in trajectory.stamps]
+    same = np.abs(stamps[nearest] - trajectory.stamps) < _SAME_STAMP_S
+    if not same.any():
         raise RunError(f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run")
-    return sequence, rows
+    return [row if found else None for row, found in zip(nearest, same, strict=True)]
 
 
 def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:

@@ -131,10 +131,8 @@ class ShardDraws(IterableDataset[dict[str, Tensor]]):
     ) -> TeacherStructure | None:
         """What the teacher measured, if there is one."""
         config = self._config
-        if not config.teacher.weights:
-            return None
         if config.teacher.views == "two":
-            return self._structures.structure(images, K)
+            return self._structures.structure(images, K) if config.teacher.weights else None
         sources = config.network.sources
         T_source_target = snippet_motion(clip.T_world_camera, first - clip.first, sources)
         if config.training.networks == "pose":

@@ -99,11 +99,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self, snippet: Snippet, images: list[NDArray[np.uint8]], K: NDArray[np.float32]
     ) -> TeacherStructure | None:
         """What the teacher measured, if there is one."""
-        if not self._config.teacher.weights:
-            return None
-        if self._many_views is None:
-            return self._structures.structure(images, K)
-        return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
+        if self._many_views is not None:
+            return self._many_views.structure(snippet.recording, snippet.first, self._config.network.sources)
+        return self._structures.structure(images, K) if self._config.teacher.weights else None
 
 
 class ValidationSnippets(Dataset[dict[str, Tensor]]):

@@ -50,11 +50,11 @@ def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, ev
     """
     if any(root.glob("????_??_??/*_sync")):
         raise DataError(f"{root} holds KITTI raw drives: name their frames with --split eigen or --split FILE")
-    recordings = [r for r in discover(root) if r.depth is not None]
+    recordings = [r for r in discover(root) if any(r.depth or ())]
     if not recordings:
         raise DataError(f"no true depth in {root}: wanted sequences/NN/depth_2 (erfsfm-slam simulate --depth)")
     leak = refuse_leak(networks, [r.frames_name for r in recordings], allow_leak)
-    frames = [(r, i) for r in recordings for i in range(0, len(r), every) if r.depth and r.depth[i]]
+    frames = [(r, i) for r in recordings for i in np.flatnonzero([file is not None for file in r.depth or ()])[::every]]
     truths = [r.true_depth(i) for r, i in frames]
     sizes = {t.shape for t in truths if t is not None}
     if len(sizes) > 1:
@@ -63,7 +63,7 @@ def depth_protocol(networks: PoseDepthNetworks, root: Path, allow_leak: bool, ev
     rows: dict[str, list[DepthErrors]] = {"networks": [], "median depth map": []}
     for (recording, index), truth in zip(frames, truths):
         assert truth is not None
-        image = recording.image(index, recording.camera.height, recording.camera.width)
+        image = recording.image(index, *truth.shape)  # of a pack the images are smaller
         for name, guess in (("networks", networks.depth(image)), ("median depth map", typical)):
             errors = depth_errors(guess, truth, CAP_M)
             if errors is not None:

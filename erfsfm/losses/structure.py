@@ -26,9 +26,12 @@ class Bounds:
     most: Tensor
 
     def strided(self, step: int) -> Bounds:
-        """Every ``step``-th pixel, from the middle of each block."""
-        middle = step // 2
-        return Bounds(self.least[..., middle::step, middle::step], self.most[..., middle::step, middle::step])
+        """Every ``step``-th pixel, from the middle of each block; the last blocks may be cut off."""
+        rows, columns = (
+            torch.arange(step // 2, size + step // 2, step, device=self.least.device).clamp(max=size - 1)
+            for size in self.least.shape[-2:]
+        )
+        return Bounds(self.least[..., rows[:, None], columns], self.most[..., rows[:, None], columns])
 
     def log_scale(self, disparity: Tensor) -> Tensor:
         """Mean of log disparity minus log measured ``(B, 1, 1, 1)``, over pixels with narrow bounds; 0 without any."""

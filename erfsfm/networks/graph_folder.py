@@ -6,7 +6,6 @@ import hashlib
 import logging
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -52,10 +51,9 @@ def kept_graph(made_from: str, make: Callable[[], bytes]) -> bytes:
     return graph
 
 
-@cache
 def _code() -> str:
-    """Digest of the files that define networks."""
-    digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    """Digest of the files from which graphs are made: networks, their geometry, and the parts that inference runs."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for file in sorted([*package.glob("networks/*.py"), *package.glob("geometry/*.py"), package / "inference.py"]):
         digest.update(file.read_bytes())
     return digest.hexdigest()

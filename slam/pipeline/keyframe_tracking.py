@@ -95,6 +95,7 @@ class KeyframeTracking:
         tracks, first = np.unique(tracks, return_index=True)
         place = lost.keyframes[found.nearest].index
         odometry.relocalise(frame, depth, found.T_camera_map, tracks, corners[found.corners[first]], place)
+        self._places = None  # the new keyframe changes the map
 
     def decide(self, seen: Observations) -> None:
         """End the tracking where the first steps are those of a vehicle."""

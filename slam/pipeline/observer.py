@@ -236,6 +236,7 @@ class Observer:
         except Exception as error:
             # callers may continue after this: the frame becomes a gap, with one entry in ``roads`` as all frames
             self._tasks.clear()
+            self._recent = ()
             self._seen.unusable[pending.frame.index] = f"it could not be measured ({error})"
             if len(self._seen.roads) == pending.frame.index:
                 self._seen.roads.append(MeasurementFailure(str(error)))

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
+from erfsfm.training.pack import pack
 
 
 class Oracle:
@@ -48,6 +50,17 @@ def test_depth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     assert networks["scale"] == pytest.approx(np.mean([6.0, 5.5, 5.0]) / 3, abs=1e-3)
     assert networks["scale_spread"] == pytest.approx(np.std([6.0, 5.5, 5.0]) / 5.5, abs=1e-3)
     assert median["method"] == "median depth map"
+
+
+def test_depth_of_a_pack(tmp_path: Path, write_root: Callable[..., Path], small: dict[str, dict[str, object]]) -> None:
+    """It holds smaller images than depth maps, and depth of the middle of each snippet alone."""
+    roots = [write_root(tmp_path / "seen", frames=3, seed=1)]
+    roots += [write_root(tmp_path / "held_out", frames=11, depth=True, seed=500, step=STEP)]
+    data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3}
+    pack(ExperimentConfig.model_validate(small | {"data": data}), tmp_path / "pack", megabytes=5)
+    networks, _ = depth_protocol(Oracle(STEP), tmp_path / "pack", allow_leak=False)
+    assert networks["images"] == 3
+    assert networks["abs_rel"] == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["00", "kitti_odometry/00"])

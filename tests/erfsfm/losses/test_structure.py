@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -19,6 +21,16 @@ ZERO = torch.zeros(1, 1, 1, 1)
 def test_distance_from_an_interval_is_a_log_ratio(disparity, expected):
     distance = outside(torch.full((1, 1, 4, 4), disparity), bounds(0.2, 0.3), ZERO)
     assert distance.item() == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(128, 416), (94, 310), (75, 248)])
+def test_every_level_of_the_networks_has_its_bounds(size):
+    rows = torch.arange(size[0], dtype=torch.float32)[:, None].expand(1, 1, *size)
+    for level in range(4):
+        strided = Bounds(rows, rows).strided(2**level).least
+        assert strided.shape[2:] == tuple(math.ceil(length / 2**level) for length in size)
+        blocks = strided[0, 0, :, -1] // 2**level
+        assert blocks.tolist() == list(range(len(blocks))), "one of each block"
 
 
 def test_the_scale_is_removed_first():

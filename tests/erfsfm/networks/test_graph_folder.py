@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor, nn
 
+from erfsfm.networks import graph_folder
 from erfsfm.networks.graph_folder import folder, kept_graph
 from erfsfm.networks.onnx_graph import OnnxGraph
 
+NO_CODE = shutil.ignore_patterns("weights", "__pycache__")
 IMAGE = torch.ones(1, 3, 4, 4)
 
 
@@ -49,6 +52,15 @@ def test_a_damaged_graph_is_made_again() -> None:
         file.write_bytes(content)
         assert kept_graph("one", lambda: b"graph") == b"graph"
     assert kept_graph("one", lambda: b"another") == b"graph"
+
+
+@pytest.mark.parametrize("changed", ["networks/blocks.py", "geometry/alignment.py", "inference.py"])
+def test_a_graph_of_older_code_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str) -> None:
+    package = shutil.copytree(Path(graph_folder.__file__).parents[1], tmp_path / "code", ignore=NO_CODE)
+    monkeypatch.setattr(graph_folder, "__file__", str(package / "networks" / "graph_folder.py"))
+    assert kept_graph("one", lambda: b"old") == b"old" == kept_graph("one", lambda: b"new")
+    (package / changed).write_text("# changed")
+    assert kept_graph("one", lambda: b"new") == b"new"
 
 
 def test_the_oldest_graphs_are_deleted() -> None:

@@ -148,7 +148,11 @@ def test_processes_and_workers_share_a_pass_without_overlap(
     assert [drawn(rank, done) for rank in range(nodes)] == [each[10:] for each in seen], "a resume goes on"
 
 
-def test_samples_are_those_of_the_originals(config: ExperimentConfig, pack: Path) -> None:
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_samples_are_those_of_the_originals(config: ExperimentConfig, pack: Path, weight: float) -> None:
+    """The motion that warps the images is there without a term of the teacher, too."""
+    weights = dict.fromkeys(("structure_weight", "translation_weight"), weight)
+    config = config.model_copy(update={"teacher": config.teacher.model_copy(update=weights)})
     on_shards = on_pack(config, pack)
     assert in_shards(*split_recordings(on_shards.data))
     assert config.teacher.cache is not None

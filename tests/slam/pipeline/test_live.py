@@ -192,13 +192,13 @@ def test_a_first_stamp_that_is_no_number_is_refused() -> None:
     assert len(slam) == 0
 
 
-class FailsOnce(OraclePredictor):
-    """An oracle that fails at one frame, at its depth or at the snippet that ends with it."""
+class Failing(OraclePredictor):
+    """An oracle that fails at one frame, at its depth or at the snippet that ends with it, each time."""
 
     def __init__(self, frame: int, question: str) -> None:
         assert drive().reference is not None
         super().__init__(drive().reference, lambda k: np.full((96, 312), 10.0), NOISE, FACTOR)
-        self._fails = {(question, frame)}
+        self._fails = question, frame
 
     def depth(self, frame: Frame) -> DepthMap:
         self._fail("depth", frame.index)
@@ -209,8 +209,7 @@ class FailsOnce(OraclePredictor):
         return super().snippet(frames)
 
     def _fail(self, question: str, index: int) -> None:
-        if (question, index) in self._fails:
-            self._fails.clear()
+        if (question, index) == self._fails:
             raise RuntimeError(f"out of memory at frame {index}")
 
 
@@ -220,7 +219,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
     question: str, following: str, tmp_path: Path
 ) -> None:
     """Whoever catches the error goes on: one row a frame, whether the next image is usable or not."""
-    predictor = FailsOnce(8, question)
+    predictor = Failing(8, question)
     config = load_config(None, [*SETTINGS, "geometry.enabled=true", "loops.enabled=false"])
     with Slam(predictor, drive().intrinsics, config, drive().camera_height_m, update_frames=100) as slam:
         failed = []
@@ -248,7 +247,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
 
 
 def test_a_failure_at_the_last_frame_is_raised_once() -> None:
-    slam = Slam(FailsOnce(8, "snippet"), drive().intrinsics, load_config(None, SETTINGS), drive().camera_height_m)
+    slam = Slam(Failing(8, "snippet"), drive().intrinsics, load_config(None, SETTINGS), drive().camera_height_m)
     with slam:
         feed(slam, 0, 9)
         with pytest.raises(RuntimeError, match="out of memory at frame 8"):

@@ -168,7 +168,7 @@ def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
 
 def _match_stamps(a: Trajectory, b: Trajectory) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of a and b whose stamps are each other's nearest, within the tolerance."""
-    nearest_b, nearest_a = _nearest(a.stamps, b.stamps), _nearest(b.stamps, a.stamps)
+    nearest_b, nearest_a = nearest_stamps(a.stamps, b.stamps), nearest_stamps(b.stamps, a.stamps)
     rows_a = np.arange(len(a))
     mutual = nearest_a[nearest_b] == rows_a
     # Slack, because the tolerance itself is a difference of rounded stamps.
@@ -177,8 +177,8 @@ def _match_stamps(a: Trajectory, b: Trajectory) -> tuple[NDArray[np.intp], NDArr
     return rows_a[chosen], nearest_b[chosen]
 
 
-def _nearest(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.intp]:
-    """For each stamp the row of the nearest of the increasing candidates."""
+def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.intp]:
+    """For each stamp ``(N,)`` the row of the nearest of the increasing candidates; of two as near the earlier one."""
     after = np.clip(np.searchsorted(candidates, stamps), 1, max(len(candidates) - 1, 1))
     if len(candidates) == 1:
         return np.zeros(len(stamps), dtype=np.intp)

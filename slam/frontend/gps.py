@@ -19,6 +19,7 @@ from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate
 from slam.geodesy import GpsTrack, LocalFrame
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
+from slam.trajectory import nearest_stamps
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ def positions_at_frames(
     fixes: GpsFixes, T_enu_world: FloatArray, T_world_camera: FloatArray, stamps: FloatArray
 ) -> list[MeasuredPosition]:
     """Every fix at the frame nearest in time, moved there by the camera's own motion."""
-    frames = np.abs(stamps[None, :] - fixes.stamps[:, None]).argmin(axis=1)
+    frames = nearest_stamps(fixes.stamps, stamps)
     T_enu_camera = T_enu_world @ T_world_camera
     moved = antenna_positions(T_enu_camera, fixes.lever_arm)[frames] - fixes.antenna(T_enu_camera, stamps)
     rows = zip(frames.tolist(), fixes.points + moved, fixes.widening * fixes.sigmas, strict=True)

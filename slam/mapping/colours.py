@@ -14,6 +14,7 @@ _GREY = 128
 _NEARNESS = 4  # power of the distance that a view's weight falls with
 _SAME_SURFACE = 0.05  # largest relative difference of depth
 _SAME_VOXELS = 1.5  # or so many voxels
+_NEAREST_VOXELS = 0.5  # least depth of a point that a view may show
 _EXPOSURE_PRIOR = 0.01  # of equal exposures, over the information in the brightness of two views
 
 
@@ -48,7 +49,8 @@ class Painter:
         submap = self._store.read(number)
         own = view - int(np.searchsorted(self._store.submap_of_view, number))
         T_camera_world = invert(self._store.T_world_views[view])
-        ahead = np.flatnonzero(points_world @ T_camera_world[2, :3] + T_camera_world[2, 3] > 0.1)
+        depth_of_points = points_world @ T_camera_world[2, :3] + T_camera_world[2, 3]
+        ahead = np.flatnonzero(depth_of_points > _NEAREST_VOXELS * self._voxel)
         x, y, z = apply(T_camera_world, points_world[ahead]).T
         fx, fy, cx, cy = submap.camera
         depth, image = submap.depths[own], submap.images[own]

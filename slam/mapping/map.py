@@ -96,7 +96,7 @@ class TsdfMap:
         self._size = (intrinsics.height, intrinsics.width)
         self._intrinsics = intrinsics
         self._filters = DepthFilters(config, intrinsics)
-        self._views = ViewChooser(self._filters)
+        self._views = ViewChooser(self._filters, config.depth_max_m)
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
         remove_submaps(self._folder)  # of a run that was killed here

@@ -1,4 +1,4 @@
-"""Views that colour a submap: of every two metres the sharpest keyframe."""
+"""Views that colour a submap: the sharpest keyframe of every stretch of a tenth of the fused depth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.mapping.filters import DepthFilters, DepthView, sampled
 from slam.se3 import FloatArray, invert, rotation_angle
 
-_STEP_M = 2.0
+_STEP = 0.1  # of the largest fused depth
 _STEP_DEG = 10.0
 _STRIDE = 7  # of the pixels that compare the brightness of two views
 _SAME_SURFACE = 0.05  # relative difference of depth
@@ -30,9 +30,9 @@ class _Candidate:
 class ViewChooser:
     """Chooses the views of one submap after the other."""
 
-    def __init__(self, filters: DepthFilters) -> None:
-        """Of the camera of these filters."""
-        self._filters = filters
+    def __init__(self, filters: DepthFilters, depth_max_m: float) -> None:
+        """Of the camera of these filters; ``depth_max_m`` is the largest fused depth."""
+        self._filters, self._step_m = filters, _STEP * depth_max_m
         self._chosen: list[DepthView] = []
         self._steps: list[float] = []
         self._begin: FloatArray | None = None
@@ -41,7 +41,7 @@ class ViewChooser:
 
     def add(self, view: DepthView, kept: DepthMap) -> None:
         """A fused frame with the depth that passed the filters."""
-        if self._begin is not None and _far(view.T_world_camera, self._begin):
+        if self._begin is not None and self._is_far(view.T_world_camera, self._begin):
             self._close()
         if self._begin is None:
             self._begin = view.T_world_camera
@@ -72,6 +72,11 @@ class ViewChooser:
             self._last = view
         self._begin = self._best = None
 
+    def _is_far(self, T_world_camera: FloatArray, T_world_other: FloatArray) -> bool:
+        T_other_camera = invert(T_world_other) @ T_world_camera
+        turned = float(rotation_angle(T_other_camera[:3, :3]))
+        return float(np.linalg.norm(T_other_camera[:3, 3])) >= self._step_m or turned >= np.deg2rad(_STEP_DEG)
+
     def _brightness_step(self, view: DepthView, before: DepthView) -> float:
         """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
         u, v, z = self._filters.projected(view, before)
@@ -81,12 +86,6 @@ class ViewChooser:
         if usable.sum() < _LEAST_SHARED:
             return float("nan")
         return float(np.median(np.log(here[usable]) - np.log(there[usable])))
-
-
-def _far(T_world_camera: FloatArray, T_world_other: FloatArray) -> bool:
-    T_other_camera = invert(T_world_other) @ T_world_camera
-    turned = float(rotation_angle(T_other_camera[:3, :3]))
-    return float(np.linalg.norm(T_other_camera[:3, 3])) >= _STEP_M or turned >= np.deg2rad(_STEP_DEG)
 
 
 def _grey(image: Image) -> FloatArray:

@@ -73,10 +73,14 @@ class KeyframeDepths:
             )
 
     def fitted(self, mapping: MappingConfig) -> MappingConfig:
-        """Settings whose lengths are for this scene as those in metres are for a street, by the median depth."""
+        """Settings whose lengths are for this scene as those in metres are for a street, by the median of known depth.
+
+        Where no depth is known they stay as they are.
+        """
         some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
-        median = np.median([np.median(self._of_network(self._keyframes[n])) for n in np.unique(some)])
-        return mapping.in_unit(float(median) / _STREET_DEPTH_M)
+        depths = [self._of_network(self._keyframes[n]) for n in np.unique(some)]
+        medians = [np.median(depth[np.isfinite(depth)]) for depth in depths if np.isfinite(depth).any()]
+        return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
     def at(self, n: int) -> KeyframeDepth:
         """The n-th keyframe."""

@@ -34,7 +34,8 @@ class Tracker:
     """Poses from the measurements of the last ``window`` frames; those before are left as they are.
 
     Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
-    the last one was. Where keyframes measure the camera, only their unit is solved again.
+    the last one was. Where keyframes measure the camera, only their unit is solved again; where they have lost it, only
+    what follows the last frame that they located.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Tracker:
         self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
         self._was_bridged = False
+        self._located = 0  # the last frame whose pose is by keyframes
 
     @property
     def T_world_camera(self) -> FloatArray:
@@ -98,6 +100,7 @@ class Tracker:
         T_before_frame = self._T_previous_newest
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
+            self._located = index
         elif motion is not None:
             T_before_frame = motion.relative_pose.T_from_to.copy()
         if T_before_frame is not self._T_previous_newest:
@@ -106,7 +109,7 @@ class Tracker:
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
 
     def _solve(self, observer: Observer, count: int) -> None:
-        """Poses of the window by its own measurements, from its first one on."""
+        """Poses of the window by its own measurements, from its first one on, or from the last that keyframes gave."""
         first = max(count - self._window, 0)
         window = recent(observer.seen, first)
         if not window.snippets:
@@ -118,6 +121,8 @@ class Tracker:
             self._unit = float(np.median(measured.scale.per_frame))
             return
         self._unit = float(measured.scale.per_frame[-1])
-        T_world_camera = self._T_world_camera[first] @ measured.T_odometry
-        self._T_world_camera[first:] = list(T_world_camera)
-        self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]
+        kept = max(first, self._located)
+        T_window_camera = measured.T_odometry[kept - first :]
+        T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])
+        self._T_world_camera[kept + 1 :] = list(T_world_window @ T_window_camera[1:])
+        self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]

@@ -9,9 +9,10 @@ from typing import Any
 from slam.errors import EmptyMapError
 from slam.evaluation.double_walls import double_wall_share
 from slam.frames import Sequence
+from slam.mapping.map import TsdfMap
 from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
-from slam.mapping.surface import positions
+from slam.mapping.surface import MapSurface, positions
 from slam.pipeline.batch import Progress, SlamResult
 from slam.results.double_walls import AT_LOOPS, double_walls_at_loops
 from slam.results.folder import RunFolder
@@ -41,11 +42,19 @@ def write_map(
     with result.stopwatch.stage("mesh"):
         surface.write_mesh(folder.path / "map_mesh.ply")
         surface.write_cloud(folder.path / "map_cloud.ply")
-    walls = {"double_wall_share": double_wall_share(surface.meshes())}
-    walls |= double_walls_at_loops(result.map, result.loops, result.odometry, result.optimised)
+    walls = _double_walls(surface, result.map, result)
     remove_submaps(folder.path / SUBMAPS)
     errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, sequence)
     return asdict(result.map.statistics()) | walls | errors
+
+
+def _double_walls(surface: MapSurface, tsdf_map: TsdfMap, result: SlamResult) -> dict[str, Any]:
+    """Their distances are metres; without these a reason."""
+    if not result.scale.is_metric:
+        reason = "lengths are not in metres"
+        return null("double_wall_share", reason) | null(AT_LOOPS, reason)
+    at_loops = double_walls_at_loops(tsdf_map, result.loops, result.odometry, result.optimised)
+    return {"double_wall_share": double_wall_share(surface.meshes())} | at_loops
 
 
 def _no_map(reason: str) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_stamps
 from slam.sequences.undistortion import calibrated
+from slam.trajectory import nearest_stamps
 
 _CAMERA = "ring_front_center"
 _IMAGES, _SCANS = f"sensors/cameras/{_CAMERA}", "sensors/lidar"
@@ -113,7 +114,7 @@ def _scans(folder: Path, stamps: FloatArray) -> dict[int, ScanReader]:
     if not paths:
         return {}
     known = np.array([_stamp(path) for path in paths])
-    nearest = np.abs(stamps[None] - known[:, None]).argmin(axis=1)
+    nearest = nearest_stamps(known, stamps)
     close = np.abs(stamps[nearest] - known) <= _SCAN_DELAY_S
     return {int(nearest[k]): partial(_points, paths[k]) for k in np.flatnonzero(close)}
 

@@ -22,6 +22,7 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_short_gaps, require_stamps
 from slam.sequences.undistortion import calibrated
+from slam.trajectory import nearest_stamps
 
 _CAMERA, _LIDAR = "CAM_FRONT", "LIDAR_TOP"
 _TABLES = "v1.0-*"
@@ -127,7 +128,7 @@ def _scans(
 ) -> tuple[FloatArray, dict[int, ScanReader]]:
     """``T_camera_lidar`` and the scan of each frame that has one."""
     known = np.array([row["timestamp"] / _MICROSECONDS for row in lidar.rows])
-    nearest = np.abs(known[None] - stamps[:, None]).argmin(axis=1)
+    nearest = nearest_stamps(stamps, known)
     close = np.abs(known[nearest] - stamps) <= _SCAN_DELAY_S
     paths = {int(k): root / lidar.rows[nearest[k]]["filename"] for k in np.flatnonzero(close)}
     scans: dict[int, ScanReader] = {

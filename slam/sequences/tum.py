@@ -21,7 +21,7 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near
 from slam.sequences.recording import RecordedSequence, Source, require_stamps
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import read_trajectory
+from slam.trajectory import nearest_stamps, read_trajectory
 
 INDEX_FILE = "rgb.txt"
 _DEPTH_INDEX = "depth.txt"
@@ -110,10 +110,11 @@ def _depth_maps(folder: Path, stamps: FloatArray) -> DepthMaps | None:
     """The registered depth maps of ``depth.txt`` whose stamps are within 20 ms of an image's."""
     if not (folder / _DEPTH_INDEX).exists():
         return None
-    known, paths = _read_index(folder / _DEPTH_INDEX)
-    nearest = np.abs(known[None] - stamps[:, None]).argmin(axis=1)
+    unordered, paths = _read_index(folder / _DEPTH_INDEX)
+    known, rows = np.unique(unordered, return_index=True)
+    nearest = nearest_stamps(stamps, known)
     close = np.abs(known[nearest] - stamps) <= _MAX_DEPTH_DELAY_S
-    return DepthMaps({int(k): paths[nearest[k]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
+    return DepthMaps({int(k): paths[rows[nearest[k]]] for k in np.flatnonzero(close)}, _DEPTH_PER_METRE)
 
 
 def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:

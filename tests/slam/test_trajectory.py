@@ -1,6 +1,7 @@
 """Trajectory files in and out, what is wrong with them in one line, and the matching of two."""
 
 import logging
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from slam.trajectory import (
     Trajectory,
     associate,
     matching_tolerance_s,
+    nearest_stamps,
     read_trajectory,
     write_kitti,
     write_tum,
@@ -206,3 +208,22 @@ def test_a_single_row_is_matched() -> None:
     assert associate(one, reference)[1].stamps.tolist() == [0.2]
     assert associate(reference, one)[0].stamps.tolist() == [0.2]
     assert len(associate(one, one)[0]) == 1
+
+
+@pytest.mark.parametrize("candidates", [[2.0], [1.0, 2.0], [0.0, 1.0, 1.5, 4.0]])
+def test_the_nearest_stamp_is_the_earlier_of_two_as_near(candidates: list[float]) -> None:
+    stamps, known = np.array([3.0, -1.0, 0.5, 1.25, 2.75, 9.0, 1.0]), np.array(candidates)
+    nearest = np.abs(known[None] - stamps[:, None]).argmin(axis=1)
+    np.testing.assert_array_equal(nearest_stamps(stamps, known), nearest)
+
+
+def test_scans_of_a_long_drive_are_matched_in_little_memory() -> None:
+    """Half an hour of both at 10 Hz; each with each would take 2.6 GB."""
+    frames = 0.1 * np.arange(18_000)
+    tracemalloc.start()
+    try:
+        nearest = nearest_stamps(frames + 0.04, frames)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(nearest, np.arange(18_000))

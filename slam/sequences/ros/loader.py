@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
@@ -35,6 +34,7 @@ from slam.sequences.ros.messages import (
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
 from slam.sequences.undistortion import calibrated
+from slam.trajectory import nearest_stamps
 
 logger = logging.getLogger(__name__)
 
@@ -214,7 +214,7 @@ def _scans(
             logger.warning("%s is not used: no static transform from its frame to the camera's %s", topic, camera)
             continue
         clouds = StampedMessages(bag, topic)
-        nearest: NDArray[np.intp] = np.abs(stamps[None] - clouds.stamps[:, None]).argmin(axis=1)
+        nearest = nearest_stamps(clouds.stamps, stamps)
         close = np.abs(stamps[nearest] - clouds.stamps) <= _SCAN_DELAY_S
         where = f"a cloud of {topic} in {bag.path}"
         read: dict[int, ScanReader] = {

@@ -26,15 +26,17 @@ def _street(z: float) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def street_map() -> StreetMap:
-    """A map of 18 frames, 1 m apart, with images of one grey level each."""
+    """A map of 18 frames, 1 m apart, with images of one grey level each; its unit has ``per_metre`` to a metre."""
 
     def make(
         folder: Path | None = None,
         grey: Callable[[int], float] = lambda k: 128.0,
         hidden: bool = False,
+        per_metre: float = 1.0,
         **config: float,
     ) -> TsdfMap:
-        tsdf_map = TsdfMap(MappingConfig(**{"depth_max_m": 20.0, **config}), CAMERA, folder)
+        settings = MappingConfig(**{"depth_max_m": 20.0, **config}).in_unit(per_metre)
+        tsdf_map = TsdfMap(settings, CAMERA, folder)
         for k in range(18):
             depth = _street(float(k))
             if hidden:  # a hole of the road, 1 m wide, at z = 20
@@ -43,8 +45,8 @@ def street_map() -> StreetMap:
                 depth = np.where(on_road, 0, depth).astype(np.float32)
             noise = np.random.default_rng(k).normal(0, 2, (CAMERA.height, CAMERA.width, 1))
             image = np.clip(grey(k) + noise, 0, 255).astype(np.uint8).repeat(3, axis=2)
-            T_world_camera = se3.make(np.eye(3), np.array([0.0, 0.0, float(k)]))
-            tsdf_map.integrate(depth, image, T_world_camera, frame=k)
+            T_world_camera = se3.make(np.eye(3), np.array([0.0, 0.0, per_metre * k]))
+            tsdf_map.integrate(np.float32(per_metre) * depth, image, T_world_camera, frame=k)
         return tsdf_map
 
     return make

@@ -19,6 +19,13 @@ def test_exposure_is_evened_out(street_map):
     assert 0.4 < changing.mean() < 0.75
 
 
+@pytest.mark.parametrize("per_metre", [0.125, 8.0])
+def test_a_map_in_another_unit_has_the_same_colours(street_map, per_metre):
+    metres, other = street_map().mesh(), street_map(per_metre=per_metre).mesh()
+    np.testing.assert_allclose(other.vertices_world, per_metre * metres.vertices_world, rtol=1e-6)
+    np.testing.assert_array_equal(other.colours, metres.colours)
+
+
 def test_brightness_steps_become_small_gains():
     steps = np.array([np.nan, 0.4, -0.4, np.nan, 0.2])
     brightness = evened(steps)

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam import Slam
 from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.visual.motion import Motion
@@ -12,7 +13,7 @@ from slam.pipeline.observations import Observations
 from slam.pipeline.observer import Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
-from slam.se3 import from_rotation_vector
+from slam.se3 import chain, from_rotation_vector
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
 assert _SPEC is not None
@@ -89,3 +90,19 @@ def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: 
     assert late == {22, 26, 30, 34, 38} | {keyframe.index for keyframe in keyframes if keyframe.index >= 20}
     assert [snippet.target for snippet in closed.gaps.trusted if snippet.target > 18] == [22, 26, 30, 34]
     assert len(closed.gaps.trusted[0].sources) == 4 and not closed.interpolated
+
+
+def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:
+    """Although the networks see another motion."""
+    truth, blank = room.walk(40), range(27, 40)
+    straight = chain(from_rotation_vector(np.zeros((39, 3)), np.tile([0.0, 0.0, 0.1], (39, 1))))
+    oracle = OraclePredictor(straight, lambda k: room.depth_map(truth[k]))
+    with Slam(oracle, room.INTRINSICS, KEYFRAMES_ALONE) as slam:
+        for k, T in enumerate(truth):
+            image = room.frame(k, T).image
+            slam.add_frame(np.zeros_like(image) if k in blank else image, 0.1 * k)
+            if k == blank[0] - 1:
+                before = slam.trajectory().T_world_camera
+        after = slam.trajectory().T_world_camera
+    np.testing.assert_array_equal(after[: len(before)], before)
+    assert np.linalg.norm(after[-1, :3, 3] - before[-1, :3, 3]) > 0.0

@@ -1,13 +1,23 @@
 """Double walls of two passes, by the trajectories before and after a loop was closed."""
 
-import numpy as np
+from pathlib import Path
+from types import SimpleNamespace
 
-from slam.config import MappingConfig
+import numpy as np
+import pytest
+
+from slam.config import MappingConfig, ScaleMode
 from slam.frames import Intrinsics, RelativePose
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.loops.closure import LoopClosures
 from slam.loops.verification import Loop
 from slam.mapping.map import TsdfMap
 from slam.results.double_walls import double_walls_at_loops
+from slam.results.folder import RunFolder
+from slam.results.map import write_map
+from slam.runtime.timing import Stopwatch
 from slam.trajectory import Trajectory
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
@@ -52,3 +62,29 @@ def test_without_a_loop_between_submaps_there_is_a_reason() -> None:
     found = double_walls_at_loops(fused(closed), loops((3, 5)), passes(1.0), closed)
     assert found["double_wall_share_at_loops"] is None
     assert "no loop joins" in found["double_wall_share_at_loops_reason"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "estimate", "is_metric"),
+    [
+        ("camera-height", ScaleEstimate(1.0, 0.0, 9), True),
+        ("none", ScaleEstimate(1.0, 0.0, 9), False),
+        ("gps", MeasurementFailure("the track is too short"), False),
+    ],
+)
+def test_without_metres_there_are_no_double_walls(
+    tmp_path: Path, mode: ScaleMode, estimate: ScaleEstimate | MeasurementFailure, is_metric: bool
+) -> None:
+    closed = passes(0.0)
+    result = SimpleNamespace(
+        map=fused(closed),
+        loops=loops((3, PASS + 3)),
+        odometry=passes(1.0),
+        optimised=closed,
+        scale=Scale(mode, estimate, np.ones(2 * PASS), {}),
+        stopwatch=Stopwatch(),
+    )
+    numbers = write_map(RunFolder(tmp_path), result, SimpleNamespace(reference=None))
+    for name in ("double_wall_share", "double_wall_share_at_loops"):
+        assert (numbers[name] is not None) == is_metric
+        assert numbers.get(f"{name}_reason") == (None if is_metric else "lengths are not in metres")

@@ -77,11 +77,13 @@ def test_needs_a_camera_file(folder: Path) -> None:
         open_sequence(folder, None, None, None)
 
 
-def test_registered_depth_maps_belong_to_the_images_of_their_stamps(folder: Path) -> None:
+@pytest.mark.parametrize("rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")])
+def test_registered_depth_maps_belong_to_the_images_of_their_stamps(folder: Path, rows: tuple[str, str]) -> None:
     sequence = open_sequence(folder)
     assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == []
     cv2.imwrite(str(folder / "near.png"), np.full((4, 6), 10_000, dtype=np.uint16))
-    (folder / "depth.txt").write_text("# timestamp filename\n100.035 near.png\n100.30 near.png\n")
+    cv2.imwrite(str(folder / "far.png"), np.full((4, 6), 20_000, dtype=np.uint16))
+    (folder / "depth.txt").write_text("\n".join(["# timestamp filename", *rows]))
     sequence = open_sequence(folder)
     assert isinstance(sequence, RecordedSequence) and sequence.true_depth_frames() == [0, 1]
     np.testing.assert_array_equal(sequence.true_depth(1), np.full((4, 6), 2.0))

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 
 from erfsfm.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.readers.pinhole import Pinhole
 from slam.run import run_slam
 from slam.sequences.catalogue import open_sequence
 
@@ -60,7 +61,7 @@ def test_the_same_frames_give_the_same_trajectories(
     files = sorted((kitti_root / "sequences/sim/image_2").iterdir())[:FRAMES]
     stamps = [FIRST_NS + k * STEP_NS for k in range(FRAMES)]
     simulated = open_sequence(kitti_root).intrinsics
-    known = read_camera_file(kitti_root / "camera.yaml").model_dump() | vars(simulated)
+    known = read_camera_file(kitti_root / "camera.yaml").model_dump() | vars(Pinhole.of(simulated))
     camera = CameraFile.model_validate(known | {"model": "opencv", "distortion": BENT, "camera_height_m": "unknown"})
     recordings = {
         "plain": write_plain(tmp_path / "plain", files, stamps, camera),

@@ -64,7 +64,8 @@ class DataConfig(Section):
     )
     validation: list[str] = Field(
         default_factory=lambda: ["simulated/500-599"],
-        description="recordings used for validation alone; named ones must be among the data",
+        description="recordings or frames (kitti_odometry/00[290:300]) used for validation alone; named ones must be "
+        "among the data",
     )
     split: str | None = Field(
         default=None,

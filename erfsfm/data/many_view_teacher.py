@@ -65,6 +65,11 @@ class DriveLabels:
         """Poses of all frames."""
         return self.folder / "poses.npy"
 
+    @property
+    def weights_file(self) -> Path:
+        """Name of the weights that gave the poses; packs and what older versions measured have none."""
+        return self.folder / "slam_weights.txt"
+
     def label_file(self, target: int) -> Path:
         """Least and most inverse depth of one frame, as measured."""
         return self.folder / f"{self.size[1]}x{self.size[0]}" / f"{target:06d}.npz"
@@ -113,7 +118,23 @@ class DriveLabels:
             cv2.imwrite(str(placed), image[..., ::-1])
             return placed
 
-        self.keep_poses(drive_poses(recording.frames_name, len(recording), camera, put_image, weights))
+        T_world_camera = drive_poses(recording.frames_name, len(recording), camera, put_image, weights)
+        write_atomically(self.weights_file, lambda path: path.write_text(weights))
+        self.keep_poses(T_world_camera)
+
+    def require_weights(self, weights: str) -> None:
+        """Refuse poses by other weights.
+
+        Raises:
+            TrainingError: the poses that are kept are of others.
+        """
+        both = self.poses_file.is_file() and self.weights_file.is_file()
+        known = self.weights_file.read_text() if both else weights
+        if known != weights:
+            raise TrainingError(
+                f"{self.folder} keeps poses of {self.recording.frames_name} by the weights '{known}', and those by "
+                f"'{weights}' are wanted: name another folder for the measurements, or the same weights"
+            )
 
     def keep_poses(self, T_world_camera: NDArray[np.float64]) -> None:
         """Write the poses ``(N, 4, 4)`` of all frames."""
@@ -213,9 +234,11 @@ class ManyViewTeacher:
         """Compute what is not there yet, in as many processes as there are cores.
 
         Raises:
-            TrainingError: a drive has no trajectory or no scale.
+            TrainingError: a drive has no trajectory or no scale, or poses by other weights.
         """
         drives = [self.drive(recording) for recording in recordings]
+        for drive in drives:
+            drive.require_weights(weights)
         without = [drive for drive in drives if not drive.poses_file.is_file()]
         for done, drive in enumerate(without):
             progress("teacher: poses", done, len(without))

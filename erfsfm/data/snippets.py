@@ -26,7 +26,7 @@ from erfsfm.data.splits import overlapping
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.errors import DataError
-from erfsfm.readers.frame_range import FrameRange
+from erfsfm.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.teacher.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    never = [*map(str, held_out), *config.exclude, *split.test_recordings]
+    never = [*config.exclude, *split.test_recordings]
     found = [recording for root in config.roots for recording in discover(root)]
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):
@@ -188,7 +188,7 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
         forbidden = [*never, *scenes] if recording.name.startswith("kitti_raw/") else never
         for part in _chosen(recording, ranges, listed):
             if not overlapping([part.frames_name], forbidden):
-                training.append(part)
+                training += _rest(part, held_out)
     if not training:
         names = _some([recording.name for recording in found])
         raise DataError(
@@ -227,6 +227,16 @@ def _parts(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording
     same = [frames.counted_in(recording.name) for frames in ranges]
     parts = [recording.within(frames.start, frames.stop) for frames in same if frames is not None]
     return [part for part in parts if part is not None]
+
+
+def _rest(recording: Recording, ranges: Sequence[FrameRange]) -> list[Recording]:
+    """The parts of a recording before, between and after frame ranges."""
+    rest = [recording]
+    for frames in (each.counted_in(recording.name) for each in ranges):
+        if frames is not None:
+            sides = [(part.within(0, frames.start), part.within(frames.stop, EVERYTHING)) for part in rest]
+            rest = [part for pair in sides for part in pair if part is not None]
+    return rest
 
 
 def _require_begun(found: Sequence[Recording], ranges: Sequence[FrameRange]) -> None:

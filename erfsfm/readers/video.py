@@ -82,7 +82,9 @@ class VideoFrames:
         return self._next
 
     def _decode(self, index: int) -> Image:
-        if not 0 <= index - self._next <= _SKIPPED_FRAMES and not self._seek(index):
+        ahead = index - self._next
+        unseen = index >= len(self._times_ms)  # so that no seek could be checked
+        if not (ahead >= 0 and (unseen or ahead <= _SKIPPED_FRAMES)) and not self._seek(index):
             self._rewind()
         while self._next <= index:
             if not self._grab():

@@ -106,6 +106,11 @@ def test_poses_alone_need_no_label(recording, teacher, tmp_path):
     assert not seen.least.any() and np.isinf(seen.most).all()
 
 
+def test_poses_by_other_weights_are_refused(recording, teacher):
+    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:40\] by the weights 'sim', and .* 'default'"):
+        teacher.prepare([recording], 4, "default", lambda *_: None)
+
+
 def test_a_damaged_label_is_one_line(recording, teacher):
     path = teacher.drive(recording).label_file(18)
     whole = path.read_bytes()

@@ -20,6 +20,7 @@ from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherCo
 from erfsfm.data.discovery import discover
 from erfsfm.data.samples import as_tensors
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
+from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
@@ -382,11 +383,21 @@ def test_validation_recordings_only_validate(tmp_path: Path, write_root: Callabl
     assert validation == ["simulated/500[0:2]", "simulated/599[0:2]"]
 
 
-def test_validation_of_held_back_frames(kitti: Path) -> None:
-    config = DataConfig(
-        roots=[kitti], ranges={"kitti_odometry/00": "0:4"}, validation=["kitti_odometry/00[4:]", "kitti_odometry/09"]
-    )
-    assert names(config) == (["kitti_odometry/00[0:4]"], ["kitti_odometry/00[4:6]", "kitti_odometry/09[0:6]"])
+@pytest.mark.parametrize(
+    ("ranges", "held_out", "left"),
+    [
+        ({"kitti_odometry/00": "0:4"}, "kitti_odometry/00[4:]", ["0:4"]),
+        ({}, "kitti_odometry/00[2:4]", ["0:2", "4:6"]),
+        ({}, "kitti_raw/2011_10_03_drive_0027_sync[:2]", ["2:6"]),
+        ({"kitti_odometry/00": "1:5"}, "kitti_odometry/00[3:4]", ["1:3", "4:5"]),
+    ],
+)
+def test_validation_of_held_back_frames(kitti: Path, ranges: dict[str, str], held_out: str, left: list[str]) -> None:
+    """The frames around them train."""
+    training, validation = names(DataConfig(roots=[kitti], ranges=ranges, validation=[held_out, "kitti_odometry/09"]))
+    assert training == [f"kitti_odometry/00[{span}]" for span in left]
+    assert len(validation) == 2 and validation[1] == "kitti_odometry/09[0:6]"
+    assert not overlapping(training, validation)
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,6 +53,27 @@ def test_uncounted_video(tmp_path: Path) -> None:
     assert len(frames) == FRAMES
     for index in [70, 3, 60, 89, 0]:
         assert decoded(frames.read(index)) == index
+
+
+def test_an_uncounted_video_is_decoded_once_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called, opened = [], cv2.VideoCapture
+
+    class Watched:
+        """A subclass of OpenCV's own would crash."""
+
+        def __init__(self, path: str) -> None:
+            self._capture = opened(path)
+
+        def __getattr__(self, name: str) -> Any:
+            called.append(name)
+            return getattr(self._capture, name)
+
+    path = write_video(tmp_path / "a.avi")
+    monkeypatch.setattr(cv2, "VideoCapture", Watched)
+    frames = VideoFrames(path, counted_frames=10)
+    wanted = range(0, FRAMES, 40)
+    assert [decoded(frames.read(index)) for index in wanted] == list(wanted)
+    assert called.count("grab") == wanted[-1] + 1
 
 
 def test_a_seek_to_another_frame_is_detected(tmp_path: Path) -> None:

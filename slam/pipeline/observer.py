@@ -16,7 +16,7 @@ from slam.errors import MissingFrameError, SequenceError
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import interpolate_gaps
-from slam.frontend.image_gate import GateState, ImageGate
+from slam.frontend.image_gate import GateState, ImageGate, Verdict
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
 from slam.frontend.segments import find_cuts
@@ -145,19 +145,20 @@ class Observer:
             self._leave_out(index, str(frame))
             return
         self._unread = 0
+        verdict: Verdict = "new"
         if self._config.gaps.enabled:
             with self._stopwatch.stage("read"):
                 verdict = self._gate.check(frame)
             if isinstance(verdict, MeasurementFailure):
                 self._leave_out(index, verdict.reason)
                 return
-            if verdict == "repeated":
-                self._seen.repeat(index, self._gate.was_moving)
         pending = self._submit_networks(frame)
         try:
             self._process_pending()
         finally:
             self._pending = pending
+            if verdict == "repeated":  # what is measured of the frame before does not know it
+                self._seen.repeat(index, self._gate.was_moving)
 
     def flush(self) -> None:
         """Finish every frame so far."""

@@ -51,8 +51,9 @@ KEYFRAMES_ALONE = SlamConfig(
 
 
 def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
-    """Before their map begins, and over a gap."""
-    truth, blank = room.walk(40), (24, 25)
+    """Before their map begins, over a gap, and beside repeated images."""
+    truth, blank, repeated = room.walk(40), (24, 25), (32, 33)
+    truth[[*repeated]] = truth[31]
     oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
     with Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch()) as observer:
         for k, T in enumerate(truth):
@@ -61,9 +62,9 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
         closed = observer.closed()
     started = min(closed.window.segments)
     assert started < 10 and len(closed.window.segments) == 40 - len(blank) - started
-    late = [ends for ends in closed.steps.motions if ends[0] > 19]
-    assert late == [(23, 26)]
-    assert set(closed.interpolated) == set(blank)
+    late = [motion.ends for motion in observer.seen.motions if motion.ends[0] > 19]
+    assert late == [(23, 26), (31, 32), (32, 33), (33, 34)]
+    assert set(closed.interpolated) == {*blank, *repeated}
 
 
 @pytest.mark.parametrize("interrupted", [(), (19,), (20,), (21,), (22,)])

@@ -32,7 +32,8 @@ class DepthErrors:
         Args:
             depth: estimate ``(H, W)``; where it is not positive or not finite nothing is compared.
             truth: z-depth ``(h, w)`` of any size, 0 where unknown; each pixel is compared with the nearest estimate.
-            relative_sigma: sigma of the estimate over it, ``(H, W)``.
+            relative_sigma: sigma of the estimate over it, ``(H, W)``; infinite where nothing was measured, which is not
+                compared.
         """
         v, u = np.nonzero((truth >= LEAST_M) & (truth <= LARGEST_M))
         if len(v) == 0:
@@ -45,7 +46,7 @@ class DepthErrors:
         (height, width), (true_height, true_width) = depth.shape, truth.shape
         at = (2 * v + 1) * height // (2 * true_height), (2 * u + 1) * width // (2 * true_width)
         sigma = np.full(len(v), np.nan) if relative_sigma is None else relative_sigma[at]
-        known = np.isfinite(depth[at]) & (depth[at] > 0)
+        known = np.isfinite(depth[at]) & (depth[at] > 0) & ~np.isinf(sigma)
         self._depths.append(np.stack([depth[at], truth[v, u], sigma])[:, known].astype(np.float32))
         if len(self._depths) > _MOST_FRAMES:
             self._depths, self._step = self._depths[::2], 2 * self._step

@@ -87,8 +87,9 @@ def scale_by_gps(
     if usable.sum() < MIN_FRAMES:
         longest = float(by_gps.max(initial=0))
         return MeasurementFailure(
-            f"the camera moves too little: a tenth of the fixes span {longest:.1f} m at most, and {least:.1f} m, five "
-            "sigmas, are needed; gps.sigma_m may be smaller for a good receiver"
+            f"the camera moves too little: {int(usable.sum())} stretches of a tenth of the fixes span over "
+            f"{least:.1f} m, five sigmas, and move in the images; {MIN_FRAMES} are needed, and the longest spans "
+            f"{longest:.1f} m; gps.sigma_m may be smaller for a good receiver"
         )
     ratios = by_gps[usable] / by_camera[usable]
     value = float(np.median(ratios))

@@ -189,7 +189,7 @@ class SlamPipeline:
         by_lidar = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
         unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
         scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
-        factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors else [])
+        factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors and scale.is_metric else [])
         return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))
 
     def close_maps(self, seen: ClosedObservations) -> ClosedObservations:
@@ -332,10 +332,10 @@ class SlamPipeline:
         self, measured: Measurements, loops: LoopClosures
     ) -> tuple[PoseGraph, FloatArray, Location | MeasurementFailure | None]:
         """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
-        graph, T_odometry = PoseGraph(self._config.pose_graph), measured.T_odometry
+        graph, T_odometry, unit = PoseGraph(self._config.pose_graph), measured.T_odometry, measured.scale.estimate
         graph.add_relative(*measured.factors, *(loop.measured for loop in loops.accepted))
         positioning = self._positioning(measured.scale.mode)
-        location = None if positioning is None else positioning.locate(T_odometry)
+        location = None if positioning is None else positioning.locate(T_odometry, unit)
         if positioning is not None and isinstance(location, Location):
             positioning.add_factors(graph, location, T_odometry)
         with self._watch.stage("graph"):
@@ -343,7 +343,7 @@ class SlamPipeline:
             while graph.drop_contradicted_loops():
                 T_optimised = graph.optimise(T_odometry)
         if positioning is not None and isinstance(location, Location):
-            location = positioning.relocated(location, graph, T_optimised)
+            location = positioning.relocated(graph, T_optimised, unit)
         return graph, T_optimised, location
 
     def _trajectory(self, T_world_camera: FloatArray) -> Trajectory:

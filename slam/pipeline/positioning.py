@@ -45,9 +45,15 @@ class Positioning:
         """Metres per unit of an odometry ``(N, 4, 4)``."""
         return gps.scale_by_gps(self._fixes, T_odometry, self._stamps)
 
-    def locate(self, T_odometry: FloatArray) -> Location | MeasurementFailure:
-        """Where an odometry ``(N, 4, 4)`` in metres lies on the earth; a failure is logged."""
-        T_enu_world = gps.align(self._fixes, T_odometry, self._stamps)
+    def locate(
+        self, T_world_camera: FloatArray, scale: ScaleEstimate | MeasurementFailure
+    ) -> Location | MeasurementFailure:
+        """Where a trajectory ``(N, 4, 4)`` lies on the earth; a failure, be it that of its scale, is logged."""
+        T_enu_world: FloatArray | MeasurementFailure
+        if isinstance(scale, MeasurementFailure):
+            T_enu_world = scale
+        else:
+            T_enu_world = gps.align(self._fixes, T_world_camera, self._stamps)
         if isinstance(T_enu_world, MeasurementFailure):
             logger.warning("the GPS track is not used: %s", T_enu_world.reason)
             return T_enu_world
@@ -59,6 +65,10 @@ class Positioning:
             positions = gps.positions_at_frames(self._fixes, location.T_enu_world, T_odometry, self._stamps)
             graph.add_positions(positions, location.T_enu_world)
 
-    def relocated(self, location: Location, graph: PoseGraph, T_optimised: FloatArray) -> Location | MeasurementFailure:
+    def relocated(
+        self, graph: PoseGraph, T_optimised: FloatArray, scale: ScaleEstimate | MeasurementFailure
+    ) -> Location | MeasurementFailure:
         """The location of the optimised trajectory ``(N, 4, 4)``."""
-        return Location(location.fixes, graph.T_fixed_world) if self._config.factors else self.locate(T_optimised)
+        if self._config.factors:
+            return Location(self._fixes, graph.T_fixed_world)
+        return self.locate(T_optimised, scale)

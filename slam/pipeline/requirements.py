@@ -33,6 +33,11 @@ def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_
             f"{setting} needs LiDAR scans of neighbouring frames and their calibration; {sequence.name} has none: "
             "leave the setting out or give a sequence with scans"
         )
+    if config.lidar.factors and mode == "none":
+        raise SlamError(
+            f"lidar.factors=true is in metres, and lengths of {sequence.name} are in camera heights: "
+            "choose scale.mode=lidar or give a camera height"
+        )
     if mode == "reference" and sequence.reference is None:
         raise SlamError(
             f"scale mode reference needs true poses; {sequence.name} has none: choose camera-height or none"

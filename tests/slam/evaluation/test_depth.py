@@ -51,10 +51,13 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     truth = np.full((4, 4), 10, np.float32)
     depth = np.full((4, 4), 11, np.float32)
     depth[0], depth[1] = 0, np.nan
+    sigma = np.full((4, 4), 0.1)
+    depth[2], sigma[2] = 30, np.inf
     errors = DepthErrors()
-    errors.add(depth, truth)
+    errors.add(depth, truth, sigma)
     summary = errors.summary()
     assert summary is not None and summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
+    assert (summary["coverage"]["50"], summary["coverage"]["90"]) == (0.0, 1.0)
     nothing = DepthErrors()
     nothing.add(np.zeros((4, 4), np.float32), truth)
     assert nothing.summary() is None

@@ -58,7 +58,7 @@ class LevelRoad:
         return Frame(index, float(self.stamps[index]), self._image)
 
     def has_scan(self, index: int) -> bool:
-        return False
+        return self.T_camera_lidar is not None
 
     def scan(self, index: int) -> FloatArray:
         raise AssertionError("no scans")
@@ -170,6 +170,14 @@ def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setti
             begin()
         assert "\n" not in str(refused.value)
     assert drive.frames_read == 0
+
+
+def test_lidar_factors_need_metres() -> None:
+    drive = LevelRoad(turning(30))
+    drive.camera_height_m, drive.T_camera_lidar = None, np.eye(4)
+    pipeline = SlamPipeline(drive, OraclePredictor(turning(30), road), load_config(None, ["lidar.factors=true"]))
+    with pytest.raises(SlamError, match=r"lidar\.factors=true is in metres.*choose scale\.mode=lidar"):
+        pipeline.require_possible()
 
 
 def test_what_can_work_is_not_refused() -> None:

@@ -114,6 +114,16 @@ def test_a_camera_that_stands_is_not_located() -> None:
     assert isinstance(result.scale.estimate, MeasurementFailure)
 
 
+def test_fixes_in_metres_are_no_factors_of_lengths_that_are_not(caplog: pytest.LogCaptureFixture) -> None:
+    """Long enough for the heading, too short for the scale."""
+    gps = track(np.random.default_rng(0), 0.0)
+    result = run(gps, "gps.sigma_m=5", "gps.correlation_s=0")
+    assert isinstance(result.location, MeasurementFailure)
+    assert "0 stretches of a tenth of the fixes span over 25.0 m" in result.location.reason
+    assert caplog.text.count("the GPS track is not used") == 1
+    assert result.optimised.length_m == pytest.approx(result.odometry.length_m, rel=1e-6)
+
+
 @pytest.mark.parametrize("ends", ["[20,80]", "[2.0s,8s]", "[8.04s,20]"])
 def test_a_known_distance_gives_metres(ends: str) -> None:
     apart = float(np.linalg.norm(path()[80, :3, 3] - path()[20, :3, 3]))

@@ -28,6 +28,7 @@ from erfsfm.errors import DataError, TrainingError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.camera import Camera
 from erfsfm.multiview import Grey
+from erfsfm.readers.video import VideoFrames
 from erfsfm.teacher.drive_poses import drive_poses
 from erfsfm.teacher.many_views import NEIGHBOURS, label
 from erfsfm.teacher.structure import TeacherStructure
@@ -106,19 +107,20 @@ class DriveLabels:
 
     def measure_poses(self, weights: str) -> None:
         """Run the SLAM system on the drive and keep its poses."""
-        recording, camera = self.recording, self.recording.camera
+        recording = self.recording
+        # in order and at full size, which `Video` is not made for
+        frames = None if recording.video is None else VideoFrames(recording.video.path, counted_frames=0)
 
         def put_image(index: int, path: Path) -> Path:
-            if recording.video is None:
+            if frames is None:
                 placed = path.with_suffix(recording.images[index].suffix)
                 placed.symlink_to(recording.images[index].resolve())
                 return placed
             placed = path.with_suffix(".png")
-            image = recording.image(index, camera.height, camera.width)
-            cv2.imwrite(str(placed), image[..., ::-1])
+            cv2.imwrite(str(placed), frames.read(recording.start + index)[..., ::-1])
             return placed
 
-        T_world_camera = drive_poses(recording.frames_name, len(recording), camera, put_image, weights)
+        T_world_camera = drive_poses(recording.frames_name, len(recording), recording.camera, put_image, weights)
         write_atomically(self.weights_file, lambda path: path.write_text(weights))
         self.keep_poses(T_world_camera)
 

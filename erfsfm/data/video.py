@@ -11,13 +11,15 @@ import numpy as np
 from erfsfm.readers.images import Image, resize_image
 from erfsfm.readers.video import VideoFrames
 
+_kept: dict[Path, Image] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
+
 
 class Video:
     """A video file with random access to downscaled frames.
 
     Training reads frames in any order, and a seek in compressed video is slow. Hence the first access decodes the file
     from its beginning to its end, and all frames are kept, downscaled, in a temporary file that the system pages in and
-    out: 160 kB a frame at 416x128. Each process has its own.
+    out: 160 kB a frame at 416x128. Each process has its own, which a video that is sent to it does not carry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -30,7 +32,7 @@ class Video:
         frames = VideoFrames(path, counted_frames=sys.maxsize)
         self._length = len(frames)
         self.height, self.width = frames.height, frames.width
-        self._frames: Image | None = None
+        _kept.pop(path, None)  # of a file that lay there before
 
     def __len__(self) -> int:
         return self._length
@@ -41,9 +43,10 @@ class Video:
         Raises:
             DataError: the file breaks off or is damaged before its end.
         """
-        if self._frames is None or self._frames.shape[1:3] != (height, width):
-            self._frames = self._keep(height, width)
-        return np.array(self._frames[index])
+        frames = _kept.get(self.path)
+        if frames is None or frames.shape[1:3] != (height, width):
+            frames = _kept[self.path] = self._keep(height, width)
+        return np.array(frames[index])
 
     def _keep(self, height: int, width: int) -> Image:
         frames = VideoFrames(self.path, counted_frames=0)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import logging
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.data import many_view_teacher
 from erfsfm.data import video as module
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.recordings import Recording
 from erfsfm.data.video import Video
 from erfsfm.errors import DataError
+from erfsfm.geometry.camera import Camera
 from erfsfm.readers.video import VideoFrames
 
 FRAMES, SIZE = 40, (48, 32)
@@ -54,7 +60,34 @@ def test_the_file_is_decoded_once_a_size(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(opened) == 1
     assert small[0].shape == (16, 24, 3)
     assert video.image(9, 32, 48).shape == (32, 48, 3)
+    sent = pickle.dumps(video)
+    assert len(sent) < 1000, "without its frames"
+    assert number(pickle.loads(sent).image(9, 32, 48)) == 9
     assert len(opened) == 2
+
+
+def test_a_file_that_was_replaced_is_decoded_again(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.avi", codec="MJPG")
+    assert number(Video(path).image(11, 32, 48)) == 11
+    path.write_bytes(write(tmp_path / "b.avi", 12, "MJPG").read_bytes())
+    with pytest.raises(IndexError):
+        Video(path).image(12, 32, 48)
+
+
+def test_the_teacher_gets_the_frames_of_a_part_as_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    video = Video(write(tmp_path / "a.mp4"))
+    whole = Recording("folder/a", (video.path,) * len(video), Camera(48, 32, 40.0, 40.0, 23.5, 15.5), video)
+    numbers: list[int] = []
+
+    def drive_poses(name: str, count: int, camera: Camera, put_image: Callable[..., Path], weights: str) -> np.ndarray:
+        images = [cv2.imread(str(put_image(index, tmp_path / f"{index}"))) for index in range(count)]
+        numbers.extend(number(image) for image in images if image is not None)
+        return np.tile(np.eye(4), (count, 1, 1))
+
+    monkeypatch.setattr(many_view_teacher, "drive_poses", drive_poses)
+    teacher = ManyViewTeacher(tmp_path / "measured", (16, 24), stride=2, measures="poses")
+    teacher.prepare([whole.part(20, 24)], 2, "sim", lambda *_: None)
+    assert numbers == [20, 21, 22, 23]
 
 
 def test_a_video_that_was_cut_off(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

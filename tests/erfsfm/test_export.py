@@ -46,7 +46,14 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("depth", "pose"), zip(DEPTH, POSE), ids=DEPTH)
-@pytest.mark.parametrize("settings", [{}, {"normalisation": "batch", "sources": 2, "height": 47, "width": 78}], ids=str)
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"normalisation": "batch", "sources": 2, "height": 47, "width": 78},
+    ],
+    ids=str,
+)
 def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:
     model = fresh(depth=depth, pose=pose, **settings)
     written = export_onnx(model, tmp_path / "net.onnx")

@@ -23,7 +23,7 @@ from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import frame_range
 from slam.storage.files import write_atomically
-from slam.trajectory import Trajectory
+from slam.trajectory import Trajectory, nearest_stamps
 
 logger = logging.getLogger(__name__)
 
@@ -111,11 +111,11 @@ def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list
                     f"{first}: give the data set of its last part, as it was"
                 )
             return [None] * first + list(range(start, stop))
-    nearest = [int(np.argmin(np.abs(stamps - stamp))) for stamp in trajectory.stamps]
+    nearest = nearest_stamps(trajectory.stamps, stamps)
     same = np.abs(stamps[nearest] - trajectory.stamps) < _SAME_STAMP_S
     if not same.any():
         raise RunError(f"{sequence.name} has no frame at the times of {folder.path}: give the data set of the run")
-    return [row if found else None for row, found in zip(nearest, same, strict=True)]
+    return [row if found else None for row, found in zip(nearest.tolist(), same, strict=True)]
 
 
 def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:

@@ -78,8 +78,8 @@ class KeyframeDepths:
         Where no depth is known they stay as they are.
         """
         some = np.linspace(0, len(self._keyframes) - 1, _SOME).round().astype(int)
-        depths = [self._of_network(self._keyframes[n]) for n in np.unique(some)]
-        medians = [np.median(depth[np.isfinite(depth)]) for depth in depths if np.isfinite(depth).any()]
+        depths = (self._of_network(self._keyframes[n]) for n in np.unique(some))
+        medians = [np.median(known) for depth in depths if (known := depth[np.isfinite(depth)]).size]
         return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
     def at(self, n: int) -> KeyframeDepth:

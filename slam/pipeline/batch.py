@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -231,16 +232,14 @@ class SlamPipeline:
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
-        ahead = read_ahead(depths.at, moved)
-        for done in range(len(moved)):
-            with self._watch.stage("depth refinement"):
-                keyframe = next(ahead)
-            if compare is not None:
-                compare(keyframe)
-            with self._watch.stage("map"):
-                pose, number = T_world_camera[keyframe.index], keyframe.index
-                tsdf_map.integrate(keyframe.best, keyframe.image, pose, keyframe.relative_sigma, number)
-            self._progress("map", done + 1, len(moved))
+        with closing(read_ahead(depths.at, moved)) as ahead:
+            for done, keyframe in enumerate(self._watch.each("depth refinement", ahead), 1):
+                if compare is not None:
+                    compare(keyframe)
+                with self._watch.stage("map"):
+                    pose, number = T_world_camera[keyframe.index], keyframe.index
+                    tsdf_map.integrate(keyframe.best, keyframe.image, pose, keyframe.relative_sigma, number)
+                self._progress("map", done, len(moved))
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
@@ -276,8 +275,8 @@ class SlamPipeline:
             self._seed,
             state,
         )
-        with observer:
-            read = read_ahead(partial(read_frame, self._sequence), range(first, total))
+        ahead = read_ahead(partial(read_frame, self._sequence), range(first, total))
+        with observer, closing(ahead) as read:
             for index, frame in enumerate(self._watch.each("read", frames or read), first):
                 observer.add(index, frame)
                 if watch is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -13,8 +13,11 @@ T = TypeVar("T")
 _CORES = 2
 
 
-def read_ahead(read: Callable[[int], T], numbers: Sequence[int]) -> Iterator[T]:
-    """The result of ``read`` for each number, computed in another thread while the one before is used."""
+def read_ahead(read: Callable[[int], T], numbers: Sequence[int]) -> Generator[T, None, None]:
+    """The result of ``read`` for each number, computed in another thread while the one before is used.
+
+    The thread ends with the numbers, or when the generator is closed.
+    """
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead") as ahead:
         waiting: deque[Future[T]] = deque()
         for number in numbers:

@@ -233,7 +233,6 @@ def test_threads_end_where_a_run_fails() -> None:
 
     with pytest.raises(RuntimeError, match="out of memory"):
         run(LevelRoad(turning(30)), depth_of=fails)
-    gc.collect()
     assert threads() == set()
 
 

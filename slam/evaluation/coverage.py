@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, f
+from scipy.special import chdtri, fdtri
 
 from slam.errors import SlamError
 from slam.frames import RelativePose
@@ -67,8 +67,8 @@ def squared_bound(probability: float, student_t_dof: float) -> float:
     quantile of Fisher's F. For normal errors (infinite ``student_t_dof``): a quantile of chi-square.
     """
     if math.isinf(student_t_dof):
-        return float(chi2.ppf(probability, 6))
-    return float(6 * (student_t_dof - 2) / student_t_dof * f.ppf(probability, 6, student_t_dof))
+        return float(chdtri(6, 1.0 - probability))
+    return float(6 * (student_t_dof - 2) / student_t_dof * fdtri(6, student_t_dof, probability))
 
 
 def _ratios(inside: Mapping[str, NDArray[np.bool_]], chosen: NDArray[np.bool_]) -> dict[str, float]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 LEAST_M, LARGEST_M = 1.0, 80.0
 COVERAGES = (50, 90, 95)
@@ -71,6 +71,6 @@ class DepthErrors:
             numbers |= {"coverage": None, "coverage_reason": "the network states no noise of its depth"}
         else:
             errors = np.log(ratio) / sigma
-            levels = {str(level): float((errors < norm.ppf(0.5 + level / 200)).mean()) for level in COVERAGES}
+            levels = {str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES}
             numbers["coverage"] = levels
         return numbers | {"frames": len(self._depths)}

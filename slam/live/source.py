@@ -16,11 +16,11 @@ import numpy as np
 from erfsfm.errors import DataError
 from erfsfm.files import open_written
 from erfsfm.readers.images import IMAGE_SUFFIXES, is_image, natural_key, read_image
-from erfsfm.readers.video import VIDEO_SUFFIXES
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Image
 from slam.sequences.camera_file import DEFAULT_FPS
 
+_DESCRIBED_STREAMS = (".sdp", ".m3u8")
 _POLL_S = 0.01
 _WRITING_S = 1.0  # that an image may take to be written
 
@@ -120,7 +120,7 @@ class VideoSource:
             SequenceError: it cannot be opened or gives no image.
         """
         self._name = name
-        self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
+        self._is_file = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
         # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
         source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"

@@ -135,7 +135,8 @@ class _Rows:
         """Poses ``(K, 4, 4)`` and units ``(K,)`` of all keyframes in the world of the first of some joined maps."""
         T, scales = self.T_map_camera.copy(), np.ones(len(self.keyframes))
         done = {int(members[0])}
-        across = sorted(loops, key=lambda loop: -loop.inliers)
+        across = [loop for loop in loops if len(set(self.maps[list(loop.rows)])) == 2]
+        across.sort(key=lambda loop: -loop.inliers)
         while len(done) < len(members):
             loop = next(loop for loop in across if len(done & set(self.maps[list(loop.rows)].tolist())) == 1)
             known, new = loop.rows

@@ -59,7 +59,7 @@ class Tracker:
         self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
         self._was_bridged = False
-        self._located = 0  # the last frame whose pose is by keyframes
+        self._settled = 0  # the last frame whose pose is by keyframes, or by the whole drive
 
     @property
     def T_world_camera(self) -> FloatArray:
@@ -81,6 +81,7 @@ class Tracker:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
         self._T_world_camera, self._unit = list(T_world_camera), float(scale.per_frame[-1])
         self.unit_name = scale.unit_name
+        self._settled = max(len(T_world_camera) - 1, 0)
         if len(T_world_camera) > 1:
             self._T_previous_newest = invert(T_world_camera[-2]) @ T_world_camera[-1]
 
@@ -100,7 +101,7 @@ class Tracker:
         T_before_frame = self._T_previous_newest
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
-            self._located = index
+            self._settled = index
         elif motion is not None:
             T_before_frame = motion.relative_pose.T_from_to.copy()
         if T_before_frame is not self._T_previous_newest:
@@ -109,7 +110,7 @@ class Tracker:
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]
 
     def _solve(self, observer: Observer, count: int) -> None:
-        """Poses of the window by its own measurements, from its first one on, or from the last that keyframes gave."""
+        """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""
         first = max(count - self._window, 0)
         window = recent(observer.seen, first)
         if not window.snippets:
@@ -121,7 +122,7 @@ class Tracker:
             self._unit = float(np.median(measured.scale.per_frame))
             return
         self._unit = float(measured.scale.per_frame[-1])
-        kept = max(first, self._located)
+        kept = max(first, self._settled)
         T_window_camera = measured.T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])
         self._T_world_camera[kept + 1 :] = list(T_world_window @ T_window_camera[1:])

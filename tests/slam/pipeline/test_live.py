@@ -74,6 +74,15 @@ def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_r
     np.testing.assert_array_equal(live.T_world_camera, batch.optimised.T_world_camera)
 
 
+def test_poses_of_the_whole_drive_stay_when_more_frames_come() -> None:
+    slam = started(load_config(None, SETTINGS), update_frames=10, sweep_frames=0)
+    feed(slam, 0, 32)
+    slam.close_loops()
+    before = slam.trajectory().T_world_camera
+    feed(slam, 32, 41)
+    np.testing.assert_array_equal(slam.trajectory().T_world_camera[:32], before)
+
+
 def test_the_trajectory_grows_with_the_frames() -> None:
     slam = started(load_config(None, SETTINGS), update_frames=10)
     with pytest.raises(SlamError, match="before the first frame"):

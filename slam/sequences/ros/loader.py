@@ -34,7 +34,7 @@ from slam.sequences.ros.messages import (
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_stamps
+from slam.trajectory import nearest_pairs
 
 logger = logging.getLogger(__name__)
 
@@ -204,20 +204,19 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
 def _scans(
     bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray
 ) -> tuple[FloatArray | None, dict[int, ScanReader]]:
-    """``T_camera_lidar``, and the nearest cloud of each frame within 50 ms, of the first LiDAR whose mount is known."""
+    """``T_camera_lidar`` and clouds of the first LiDAR whose mount is known.
+
+    A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
+    """
     for topic in bag.topics(POINT_CLOUD):
         T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
             continue
         clouds = StampedMessages(bag, topic)
-        nearest = nearest_stamps(clouds.stamps, stamps)
-        close = np.abs(stamps[nearest] - clouds.stamps) <= _SCAN_DELAY_S
+        pairs = zip(*nearest_pairs(stamps, clouds.stamps, _SCAN_DELAY_S))
         where = f"a cloud of {topic} in {bag.path}"
-        read: dict[int, ScanReader] = {
-            int(nearest[k]): partial(_points, clouds, int(k), where) for k in np.flatnonzero(close)
-        }
-        return T_camera_lidar, read
+        return T_camera_lidar, {int(frame): partial(_points, clouds, int(cloud), where) for frame, cloud in pairs}
     return None, {}
 
 

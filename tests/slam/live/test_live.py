@@ -256,6 +256,22 @@ def test_a_video_plays_at_its_own_speed(video: Path, suffix: str) -> None:
     assert (source.width, source.height) == (32, 24)
 
 
+def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Numbers without zeros in front; hidden files are no images, and one that comes too late is named."""
+
+    def take(number: int) -> None:
+        cv2.imwrite(str(tmp_path / f"frame_{number}.png"), np.full((20, 30, 3), number, np.uint8))
+
+    (tmp_path / "._frame_0.png").write_bytes(b"of another system")
+    take(8)
+    images = (int(image[0, 0, 0]) for _, image in FolderSource(tmp_path, 0.1).images(Event()))
+    assert next(images) == 8
+    for number in (10, 7, 9):
+        take(number)
+    assert [next(images), next(images)] == [9, 10]
+    assert "frame_7.png came after frame_8.png, before which its name belongs; it is left out" in caplog.text
+
+
 def test_sources_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="no image comes from"):
         VideoSource(str(tmp_path / "none.mp4"), 1.0)

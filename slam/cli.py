@@ -75,8 +75,13 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
-    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
-    seed: Seed = 0,
+    gps: Annotated[
+        Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA; default: that of the run to continue")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or as the run to continue"),
+    ] = None,
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:

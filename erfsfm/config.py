@@ -33,7 +33,9 @@ class NetworkConfig(Section):
         default="relu", description="leaky: leaky ReLU, for narrow decoders in which all ReLUs may die"
     )
     sources: Literal[2, 4] = Field(default=4, description="source frames of a snippet; with the target it has one more")
-    masks: bool = Field(default=False, description="explainability masks from a second head of the pose network")
+    masks: bool = Field(
+        default=False, description="explainability masks from a second head of the pose network; needs loss.mask_weight"
+    )
     alignment: Literal["none", "images"] = Field(
         default="none", description="images: outside training the pose network's rotations are measured in the images"
     )
@@ -253,6 +255,12 @@ class ExperimentConfig(Section):
     def _parts_agree(self) -> Self:
         if self.loss.mask_weight > 0 and not self.network.masks:
             raise ValueError("loss.mask_weight needs network.masks: true")
+        both_by_images = self.training.networks == "both" and self.loss.photometric_weight > 0
+        if self.network.masks and self.loss.mask_weight == 0 and both_by_images:
+            raise ValueError(
+                "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
+                "have the least loss, and nothing else is learned"
+            )
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")
         if self.training.minutes > 0 and self.training.processes > 1:

@@ -80,7 +80,7 @@ def run(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or as the run to continue"),
+        typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or that of the old run"),
     ] = None,
     device: Device = "auto",
     as_json: Json = False,

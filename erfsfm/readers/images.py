@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
 _TWELVE_BITS = 4096
+_NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -31,7 +33,7 @@ def list_images(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    paths = [path for path in folder.iterdir() if _is_image(path)]
+    paths = [path for path in folder.iterdir() if is_image(path)]
     doubles = [stem for stem, count in Counter(p.stem for p in paths).items() if count > 1]
     if doubles:
         raise DataError(f"{folder} has image {min(doubles)} in two formats: keep one file a frame")
@@ -40,13 +42,21 @@ def list_images(folder: Path) -> list[Path]:
 
 def has_images(folder: Path) -> bool:
     """Whether a folder holds an image file, without listing all of it."""
-    return folder.is_dir() and any(_is_image(path) for path in folder.iterdir())
+    return folder.is_dir() and any(is_image(path) for path in folder.iterdir())
 
 
-def natural_key(path: Path) -> list[tuple[int, str]]:
-    """A sort key that compares runs of digits as numbers; ``img2`` comes before ``img10``."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+def is_image(path: Path) -> bool:
+    """Whether a file is an image by its name, and not hidden."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def natural_key(path: Path) -> list[tuple[Decimal, str]]:
+    """A sort key that compares numbers in names: ``img2`` before ``img10``, the stamp ``7.12.png`` before ``7.5.png``.
+
+    A point belongs to a number that ends the name and stands alone: not in ``cam0.12.png``.
+    """
+    texts_and_numbers = enumerate(_NUMBER.split(path.name))
+    return [(Decimal(part if place % 2 else 0), part) for place, part in texts_and_numbers]
 
 
 def read_image(path: Path) -> Image:
@@ -117,10 +127,6 @@ def resize_image(image: Image, height: int, width: int) -> Image:
     shrinks = image.shape[0] >= height and image.shape[1] >= width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, (width, height), interpolation=method))
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def _file_bytes(path: Path) -> bytes:

@@ -100,7 +100,8 @@ class SelfSupervision(lightning.LightningModule):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
             raise TrainingError(
                 f"the loss at step {self.global_step} is not finite ({parts}): lower training.learning_rate or set "
-                "training.gradient_clip, then continue with --resume; the weights so far are in last/"
+                "training.gradient_clip, then continue with --resume, or start again where the last checkpoint is bad "
+                "already; the weights so far are in last/"
             )
         if result.disparities:
             self._refuse_constant(result.disparities[0].detach())
@@ -166,7 +167,17 @@ class SelfSupervision(lightning.LightningModule):
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimiser, lambda step: learning_rate_factor(training.schedule, self._progress(step))
         )
+        self._rates = list(schedule.base_lrs)
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_train_start(self) -> None:
+        """Learn at the configured rates: a resumed run has those of its checkpoint until here."""
+        schedule: Any = self.lr_schedulers()
+        schedule.base_lrs = self._rates
+        factor = learning_rate_factor(self.config.training.schedule, self._progress(schedule.last_epoch))
+        for group, rate in zip(schedule.optimizer.param_groups, self._rates, strict=True):
+            group["initial_lr"] = rate
+            group["lr"] = rate * factor
 
     def _progress(self, step: int) -> float:
         """Fraction of the run that is done, by steps or by time, whichever is farther."""

@@ -52,7 +52,7 @@ class OutputFolder:
 
         Raises:
             TrainingError: nothing to resume, or a damaged checkpoint; one line.
-            ConfigError: the run began with another network or optimiser; one line.
+            ConfigError: the run began with another network, or with what the optimiser's state does not fit; one line.
         """
         written = self.path / CONFIG
         for needed in (self.checkpoint, written):
@@ -64,11 +64,13 @@ class OutputFolder:
         begun = load_experiment(written)
         if begun.network != config.network:
             raise ConfigError(f"the networks of {written} differ from this configuration: resume with the same one")
-        if begun.training.optimiser != config.training.optimiser:
-            raise ConfigError(
-                f"{written} began with training.optimiser {begun.training.optimiser}, whose state another cannot take "
-                f"over; got {config.training.optimiser}: resume with the same one, or start again from its weights"
-            )
+        for key in ("optimiser", "networks", "frozen_stages"):
+            before, now = getattr(begun.training, key), getattr(config.training, key)
+            if before != now:
+                raise ConfigError(
+                    f"{written} began with training.{key} {before}; got {now}, which cannot take over the optimiser's "
+                    "state: resume with the same, or start again from its weights"
+                )
         return steps
 
     def write_config(self, config: ExperimentConfig) -> None:

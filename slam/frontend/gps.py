@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 _LEAST_FIXES = 3
 _CHORDS = 10  # the path is divided into about so many chords to compare lengths
 _LEAST_MOTION_SIGMAS = 5.0
+_GOOD_CHORD_SIGMAS = 20.0  # fixes with sigmas of 2.5 and 5 m lengthen such a chord by 1 %
 _UP_SIGMA = 0.2  # radians between the camera's own up and that of the earth
 _ROUNDS = 30
 _HUBER_K = 1.345
@@ -78,19 +79,36 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
 def scale_by_gps(
     fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray
 ) -> ScaleEstimate | MeasurementFailure:
-    """Chords by GPS over those of the estimate: the median, so that drift and outliers count little."""
+    """Chords by GPS over those of the estimate: the median, so that drift and outliers count little.
+
+    Errors of fixes lengthen a chord by about their variance over its length. So chords are a tenth of the fixes, or
+    several of them where these span less than 20 sigmas, and are chosen by the camera's lengths: choosing by GPS would
+    prefer chords that errors lengthen.
+    """
     estimated = fixes.antenna(T_world_camera_unscaled, stamps)
-    span = max(len(estimated) // _CHORDS, 1)
-    by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))
-    least = _LEAST_MOTION_SIGMAS * float(np.median(fixes.sigmas[:, 0]))
-    usable = (by_camera > 0) & (by_gps > least)
+    sigma = float(np.median(fixes.sigmas[:, 0]))
+    least = _LEAST_MOTION_SIGMAS * sigma
+
+    def chords(span: int) -> tuple[FloatArray, FloatArray]:
+        by_gps, by_camera = (np.linalg.norm(p[span:] - p[:-span], axis=1) for p in (fixes.points, estimated))
+        return by_gps, by_camera
+
+    tenth = max(len(estimated) // _CHORDS, 1)
+    spans = range(tenth, max(len(estimated) // 2, tenth) + 1, tenth)
+    longest = max(spans, key=lambda span: float(np.median(chords(span)[1])))
+    by_gps, by_camera = chords(longest)
+    metres = by_gps.sum() / max(by_camera.sum(), np.finfo(float).tiny)
+    lengths = metres * chords(tenth)[1]
+    usable = lengths > least
     if usable.sum() < MIN_FRAMES:
-        longest = float(by_gps.max(initial=0))
         return MeasurementFailure(
             f"the camera moves too little: {int(usable.sum())} stretches of a tenth of the fixes span over "
             f"{least:.1f} m, five sigmas, and move in the images; {MIN_FRAMES} are needed, and the longest spans "
-            f"{longest:.1f} m; gps.sigma_m may be smaller for a good receiver"
+            f"{lengths.max():.1f} m; gps.sigma_m may be smaller for a good receiver"
         )
+    good = _GOOD_CHORD_SIGMAS * sigma
+    by_gps, by_camera = chords(next((s for s in spans if metres * np.median(chords(s)[1]) >= good), longest))
+    usable = metres * by_camera > least
     ratios = by_gps[usable] / by_camera[usable]
     value = float(np.median(ratios))
     return ScaleEstimate(value, mad_sigma(np.log(ratios / value)), int(usable.sum()))

@@ -15,13 +15,12 @@ import numpy as np
 
 from erfsfm.errors import DataError
 from erfsfm.files import open_written
-from erfsfm.readers.images import read_image
-from erfsfm.readers.video import VIDEO_SUFFIXES
+from erfsfm.readers.images import IMAGE_SUFFIXES, is_image, natural_key, read_image
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Image
 from slam.sequences.camera_file import DEFAULT_FPS
 
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp")
+_DESCRIBED_STREAMS = (".sdp", ".m3u8")
 _POLL_S = 0.01
 _WRITING_S = 1.0  # that an image may take to be written
 
@@ -41,7 +40,7 @@ class Source(Protocol):
 
 
 class FolderSource:
-    """A folder that another program fills; image ``k`` in order of names was taken at ``k / fps``."""
+    """A folder that another program fills; image ``k`` in natural order was taken at ``k / fps``."""
 
     def __init__(self, folder: Path, wait_s: float) -> None:
         """Wait up to ``wait_s`` for the first image.
@@ -50,53 +49,61 @@ class FolderSource:
             SequenceError: none came, or it cannot be read.
         """
         self._folder, self.fps = folder, DEFAULT_FPS
+        self._past: set[str] = set()
         deadline = time.monotonic() + wait_s
-        while not (names := self._names()):
+        while not (waiting := self._waiting()):
             if time.monotonic() > deadline:
-                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {', '.join(_IMAGES)}")
+                suffixes = ", ".join(IMAGE_SUFFIXES)
+                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {suffixes}")
             time.sleep(_POLL_S)
-        first = self._read(names[0], deadline)
+        first = self._read(waiting[0], deadline)
         self.height, self.width = first.shape[:2]
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
-        """Every usable image, in order of names; a name before the last one that was read is left out."""
-        count, last = 0, ""
+        """Every usable image, in natural order; one that comes after its successor is left out with a warning."""
+        count, last = 0, Path()
         while not stopped.is_set():
-            fresh = [name for name in self._names() if name > last]
-            for name in fresh[:1]:
-                image = self._usable(name)
-                if image is not None:
-                    yield count / self.fps, image
-                count, last = count + 1, name
-            if not fresh:
+            waiting = self._waiting()
+            for path in waiting[:1]:
+                if natural_key(path) < natural_key(last):
+                    logger.warning("%s came after %s, before which its name belongs; it is left out", path, last.name)
+                else:
+                    image = self._usable(path)
+                    if image is not None:
+                        yield count / self.fps, image
+                    count, last = count + 1, path
+                self._past.add(path.name)
+            if not waiting:
                 time.sleep(_POLL_S)
 
-    def _usable(self, name: str) -> Image | None:
+    def _usable(self, path: Path) -> Image | None:
         """An image of the size of the first once it is whole; others are named in a warning."""
         try:
-            image = self._read(name, time.monotonic() + _WRITING_S)
+            image = self._read(path, time.monotonic() + _WRITING_S)
         except SequenceError as error:
             logger.warning("%s; it is left out", error)
             return None
         height, width = image.shape[:2]
         if (height, width) == (self.height, self.width):
             return image
-        logger.warning("%s is %d x %d, not %d x %d; it is left out", name, width, height, self.width, self.height)
+        logger.warning("%s is %d x %d, not %d x %d; it is left out", path, width, height, self.width, self.height)
         return None
 
-    def _names(self) -> list[str]:
+    def _waiting(self) -> list[Path]:
+        """Images that were not read yet, in natural order."""
         try:
-            return sorted(path.name for path in self._folder.iterdir() if path.suffix.lower() in _IMAGES)
+            fresh = [path for path in self._folder.iterdir() if path.name not in self._past]
         except OSError as error:
             raise SequenceError(f"{self._folder} cannot be read any more: {error.strerror or error}") from error
+        return sorted(filter(is_image, fresh), key=natural_key)
 
     @sequence_errors()
-    def _read(self, name: str, deadline: float) -> Image:
+    def _read(self, path: Path, deadline: float) -> Image:
         """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
         while True:
-            is_newest = self._names()[-1:] == [name]
+            is_newest = self._waiting()[-1:] == [path]
             try:
-                return read_image(self._folder / name)
+                return read_image(path)
             except DataError:
                 if time.monotonic() > deadline or not is_newest:
                     raise
@@ -113,7 +120,7 @@ class VideoSource:
             SequenceError: it cannot be opened or gives no image.
         """
         self._name = name
-        self._is_file = Path(name).is_file() and Path(name).suffix.lower() in VIDEO_SUFFIXES
+        self._is_file = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
         # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
         source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 MISSING = "–"
 NOT_RECORDED = "not recorded"
 METRES = "metres"
+CAMERA_HEIGHTS = "camera heights"
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,11 @@ def failure(metrics: Mapping[str, Any]) -> str:
 def unit_of_lengths(metrics: Mapping[str, Any]) -> str:
     """``metres``, ``camera heights``, or ``the networks' own unit`` where no road was found."""
     mode, value = (lookup(metrics, "scale", key)[0] for key in ("mode", "value"))
-    if mode == "none":
-        return "camera heights"
-    if mode is None or value is not None:
-        return METRES
-    return "camera heights" if mode in ("gps", "known", "reference") else "the networks' own unit"
+    if value is None and mode in ("none", "camera-height", "lidar"):
+        return "the networks' own unit"
+    if mode == "none" or (value is None and mode is not None):
+        return CAMERA_HEIGHTS
+    return METRES
 
 
 def is_metric(metrics: Mapping[str, Any]) -> bool:
@@ -96,16 +97,16 @@ def is_metric(metrics: Mapping[str, Any]) -> bool:
 
 def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
     """Notes on the unit of length of a run."""
-    mode, _ = lookup(metrics, "scale", "mode")
+    mode, unit = lookup(metrics, "scale", "mode")[0], unit_of_lengths(metrics)
     notes = []
-    if mode == "none":
+    if mode == "none" and unit == CAMERA_HEIGHTS:
         notes.append(
             "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
             "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres."
         )
-    elif not is_metric(metrics):
+    elif unit != METRES:
         reason = lookup(metrics, "scale", "value")[1]
-        notes.append(f"No scale was found ({reason}): lengths are in {unit_of_lengths(metrics)}, not in metres.")
+        notes.append(f"No scale was found ({reason}): lengths are in {unit}, not in metres.")
     return notes
 
 

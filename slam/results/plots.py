@@ -17,6 +17,7 @@ from erfsfm.figure_file import require_figure, save_figure
 from slam.errors import RunError
 from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.frames import DepthMap, Image
+from slam.results.comparison import METRES, unit_of_lengths
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.map_picture import AerialView
 from slam.trajectory import Trajectory, associate
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-CAMERA_HEIGHTS = "camera heights"
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -251,11 +251,9 @@ def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, 
 
 
 def length_unit(run: RunFolder) -> str:
-    """The unit of a run's trajectories and map: metres, or camera heights under scale mode none."""
-    scale = run.metrics().get("scale") or {}
-    if scale.get("mode") == "none":
-        return CAMERA_HEIGHTS
-    return "m" if scale.get("value") is not None else "unscaled"
+    """The unit of a run's trajectories and map, for the axes of a plot."""
+    unit = unit_of_lengths(run.metrics())
+    return "m" if unit == METRES else unit
 
 
 def _figure(

@@ -101,6 +101,7 @@ def test_the_last_override_counts() -> None:
         ("network.height=0", "network.height"),
         ("loss.reduction=median", "loss.reduction"),
         ("loss.mask_weight=0.2", "network.masks"),
+        ("network.masks=true", "needs a loss.mask_weight above 0"),
         ("data.weights={simulated: -1}", "data.weights"),
         ("training.seed=-1", "training.seed"),
         ("training=3", "'training'"),

@@ -56,9 +56,9 @@ class Scale:
 
     @property
     def unit_name(self) -> str | None:
-        """``m`` or, with mode none, ``camera heights``; None where metres were not found."""
+        """``m``, with mode none ``camera heights`` or, where none was found, that of the networks; else None."""
         if self.mode == "none":
-            return "camera heights"
+            return "the networks' own unit" if isinstance(self.estimate, MeasurementFailure) else "camera heights"
         return "m" if self.is_metric else None
 
     def in_unit_of(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
@@ -123,7 +123,7 @@ def find_scale(
         spread = mad_sigma(misfit[np.isfinite(misfit)])
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(by_planes, MeasurementFailure):
-        logger.warning("no scale (%s): lengths stay in the networks' unit", by_planes.reason)
+        logger.warning("no scale (%s): lengths stay in the networks' own unit", by_planes.reason)
     return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame))
 
 

@@ -193,7 +193,7 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
         body = bag.first(topic).child_frame_id
         T_body_camera = mounted.between(body, camera)
         if T_body_camera is None:
-            logger.warning("%s is not used: no static transform from its %s to the camera's %s", topic, body, camera)
+            logger.warning("%s is not used: no static transform from its %r to the camera's %r", topic, body, camera)
             continue
         found = StampedMessages(bag, topic)
         messages = (found.read(k) for k in range(len(found)))
@@ -211,7 +211,7 @@ def _scans(
     for topic in bag.topics(POINT_CLOUD):
         T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
-            logger.warning("%s is not used: no static transform from its frame to the camera's %s", topic, camera)
+            logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
             continue
         clouds = StampedMessages(bag, topic)
         nearest = nearest_stamps(clouds.stamps, stamps)

@@ -26,7 +26,9 @@ class StaticTransforms:
         }
 
     def between(self, a: str, b: str) -> FloatArray | None:
-        """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them."""
+        """``T_a_b`` ``(4, 4)`` of two frames; None where no static transforms join them, or where one has no name."""
+        if not (frame_name(a) and frame_name(b)):
+            return None
         (root_a, T_root_a), (root_b, T_root_b) = (self._from_root(frame_name(frame)) for frame in (a, b))
         return invert(T_root_a) @ T_root_b if root_a == root_b else None
 

@@ -103,6 +103,21 @@ def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
     assert has_images(tmp_path) and not has_images(tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1700000000.001911", "1700000000.1008093", "1700000000.2", "1700000000.3000495", "1700000001.0"],
+        ["left_9.5", "left_10.125", "left_10.5"],
+        ["cam0.2", "cam0.10", "cam1.3"],
+        ["2024.1.2", "2024.1.10"],
+    ],
+)
+def test_a_stamp_is_one_number_in_natural_order(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    assert [path.stem for path in list_images(tmp_path)] == names
+
+
 def test_two_formats_of_one_image(tmp_path: Path) -> None:
     for name in ("0.png", "0.jpg"):
         (tmp_path / name).write_bytes(b"")

@@ -319,7 +319,9 @@ def test_masks_weigh_the_error_and_are_regularised_towards_one(batch: SnippetBat
 
 def test_masks_of_another_size_are_refused(batch: SnippetBatch) -> None:
     with pytest.raises(ConfigError, match=r"network\.masks"):
-        evaluate_objective(FixedDepth(0.3), FixedPose(true_poses(), shrink=8), batch, experiment(masks=True))
+        evaluate_objective(
+            FixedDepth(0.3), FixedPose(true_poses(), shrink=8), batch, experiment(masks=True, mask_weight=0.1)
+        )
 
 
 def test_consistency_by_hand(batch: SnippetBatch, plane) -> None:

@@ -636,11 +636,26 @@ def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
         train(config.model_copy(update={"network": network}), output, resume=True, device="cpu")
 
 
-def test_resume_with_another_optimiser(cut: tuple[ExperimentConfig, Path]) -> None:
+@pytest.mark.parametrize(
+    ("key", "begun", "other"), [("optimiser", "adam", "muon"), ("networks", "both", "depth"), ("frozen_stages", 0, 2)]
+)
+def test_resume_with_what_the_optimisers_state_does_not_fit(
+    cut: tuple[ExperimentConfig, Path], key: str, begun: object, other: object
+) -> None:
     config, output = cut
-    training = config.training.model_copy(update={"optimiser": "muon"})
-    with pytest.raises(ConfigError, match=r"began with training\.optimiser adam"):
+    training = config.training.model_copy(update={key: other})
+    with pytest.raises(ConfigError, match=rf"began with training\.{key} {begun}; got {other}"):
         train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
+    assert load_experiment(output / "config.yaml") == config
+
+
+def test_resume_with_another_learning_rate(cut: tuple[ExperimentConfig, Path]) -> None:
+    config, output = cut
+    training = config.training.model_copy(update={"learning_rate": 1e-12, "steps": 6})
+    state = torch.load(output / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    train(config.model_copy(update={"training": training}), output, resume=True, device="cpu")
+    for name, value in load_model(output).pose_net.state_dict().items():
+        torch.testing.assert_close(value, state[f"pose_net.{name}"], rtol=0, atol=1e-9)
 
 
 class Malicious:

@@ -147,6 +147,7 @@ def test_a_run_from_above(make_recorded: Callable[..., RunFolder], sheet: Ply, t
     ("mode", "value", "unit"),
     [
         ("none", 1.0, "camera heights"),
+        ("none", None, "the networks' own unit"),
         ("gps", None, "camera heights"),
         ("camera-height", None, "the networks' own unit"),
     ],

@@ -30,6 +30,7 @@ from slam.live.reader import Reader
 from slam.live.run import LiveRequest, run_live
 from slam.live.sequence import calibration_of
 from slam.live.source import FolderSource, VideoSource, open_source
+from slam.results.comparison import unit_notes
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -86,19 +87,25 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     assert folder.metrics()["status"] == "ok"
 
 
-def test_without_a_road_there_is_no_unit(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
+def test_without_a_road_there_are_no_metres_and_no_camera_heights(
+    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None
+) -> None:
     target, messages = tmp_path / "images", []
     target.mkdir()
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
     at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
-    settings = (*SETTINGS, *at_the_horizon)
+    settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
     request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
     folder = run_live(request, messages.append)
     assert folder.metrics()["scale"]["value"] is None
     *poses, last = messages
-    assert [(each["state"], each["unit"], each["scale"]) for each in poses] == len(poses) * [("starting", None, None)]
-    assert last["unit"] is None
+    assert last["unit"] == unit
+    starting, known = ("starting", None, False), ("tracking", unit, True)
+    said = [(each["state"], each["unit"], each["scale"] is not None) for each in poses]
+    assert set(said) == ({starting} if unit is None else {starting, known})
+    assert ["networks' own unit" in note for note in unit_notes(folder.metrics())] == [True]
 
 
 def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
@@ -239,12 +246,30 @@ def test_the_viewer_is_shown_the_drive(
         assert place in content, place
 
 
-def test_a_video_plays_at_its_own_speed(video: Path) -> None:
+@pytest.mark.parametrize("suffix", [".avi", ".m4v"])
+def test_a_video_plays_at_its_own_speed(video: Path, suffix: str) -> None:
+    video = video.rename(video.with_suffix(suffix))
     source = VideoSource(str(video), 1.0)
     assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
     stamps = [stamp for stamp, _ in source.images(Event())]
     np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
     assert (source.width, source.height) == (32, 24)
+
+
+def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Numbers without zeros in front; hidden files are no images, and one that comes too late is named."""
+
+    def take(number: int) -> None:
+        cv2.imwrite(str(tmp_path / f"frame_{number}.png"), np.full((20, 30, 3), number, np.uint8))
+
+    (tmp_path / "._frame_0.png").write_bytes(b"of another system")
+    take(8)
+    images = (int(image[0, 0, 0]) for _, image in FolderSource(tmp_path, 0.1).images(Event()))
+    assert next(images) == 8
+    for number in (10, 7, 9):
+        take(number)
+    assert [next(images), next(images)] == [9, 10]
+    assert "frame_7.png came after frame_8.png, before which its name belongs; it is left out" in caplog.text
 
 
 def test_sources_that_are_not_there(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ class BagWriter:
             plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
             self.path, self.writer = path, Writer2(path, version=9, storage_plugin=plugin)
         self.connections: dict[str, Any] = {}
+        self.camera_frame = "camera"
         self.writer.open()
 
     def make(self, kind: str, **fields: Any) -> Any:
@@ -64,7 +65,7 @@ class BagWriter:
         padded = np.pad(rows, ((0, 0), (0, 3)))
         message = self.make(
             "sensor_msgs/msg/Image",
-            header=self.header(stamp_ns, "camera"),
+            header=self.header(stamp_ns, self.camera_frame),
             height=pixels.shape[0],
             width=pixels.shape[1],
             encoding=encoding,
@@ -81,7 +82,7 @@ class BagWriter:
         roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
         message = self.make(
             "sensor_msgs/msg/CameraInfo",
-            header=self.header(FIRST_NS, "camera"),
+            header=self.header(FIRST_NS, self.camera_frame),
             height=camera.height,
             width=camera.width,
             distortion_model=model,

@@ -184,7 +184,19 @@ def test_truth_of_an_unknown_mount_is_not_used(new_bag: NewBag, caplog: pytest.L
     bag.write("/vicon/rig", FIRST_NS, bag.stamped_transform(FIRST_NS, "w", "rig", bag.transform((0, 0, 0))))
     with caplog.at_level(logging.WARNING):
         assert open_sequence(bag.close()).reference is None
-    assert "/vicon/rig is not used: no static transform from its rig to the camera's camera" in caplog.text
+    assert "/vicon/rig is not used: no static transform from its 'rig' to the camera's 'camera'" in caplog.text
+
+
+def test_frames_without_a_name_are_not_taken_for_the_camera(
+    new_bag: NewBag, caplog: pytest.LogCaptureFixture
+) -> None:
+    bag = new_bag()
+    bag.camera_frame = ""
+    drive(bag)
+    bag.write("/ground_truth", FIRST_NS, bag.stamped_transform(FIRST_NS, "", "", bag.transform((0, 0, 0))))
+    with caplog.at_level(logging.WARNING):
+        assert open_sequence(bag.close()).reference is None
+    assert "/ground_truth is not used: no static transform from its '' to the camera's ''" in caplog.text
 
 
 def test_damaged_bags_are_named_in_one_line(new_bag: NewBag, kind: str) -> None:

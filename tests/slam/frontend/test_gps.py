@@ -1,0 +1,61 @@
+"""The scale by GPS fixes whose errors are large beside short tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.config import GpsConfig
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.gps import fixes_of, scale_by_gps
+from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.geodesy import GpsTrack, LocalFrame
+from slam.se3 import FloatArray
+
+SPEED, HZ = 1.4, 10.0
+CONFIG = GpsConfig()
+
+
+def scale(positions: FloatArray, seed: int) -> ScaleEstimate | MeasurementFailure:
+    """Of an exact walk in metres, with a fix a second whose errors last as long as the configuration says."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(len(positions)) / HZ
+    sigmas = np.array([CONFIG.sigma_m, CONFIG.sigma_m, CONFIG.vertical_sigma_m])
+    seconds = np.arange(0.0, stamps[-1])
+    errors = rng.normal(size=(len(seconds), 3)) * sigmas
+    kept = np.exp(-1.0 / CONFIG.correlation_s)
+    for k in range(1, len(errors)):
+        errors[k] = kept * errors[k - 1] + np.sqrt(1.0 - kept**2) * errors[k]
+    enu = np.column_stack([np.interp(seconds, stamps, positions[:, k]) for k in (0, 2, 1)]) * [1.0, 1.0, -1.0]
+    track = GpsTrack(seconds, LocalFrame(np.array([48.0, 11.0, 500.0])).places(enu + errors), np.ones(len(seconds)))
+    T_world_camera = np.tile(np.eye(4), (len(positions), 1, 1))
+    T_world_camera[:, :3, 3] = positions
+    fixes = fixes_of(track, stamps, CONFIG)
+    assert not isinstance(fixes, MeasurementFailure)
+    return scale_by_gps(fixes, T_world_camera, stamps)
+
+
+def straight(length_m: float) -> FloatArray:
+    way = np.arange(0.0, length_m, SPEED / HZ)
+    return np.column_stack([0.3 * way, np.zeros_like(way), np.sqrt(1.0 - 0.09) * way])
+
+
+def circles(radius_m: float, laps: int) -> FloatArray:
+    """The last fixes of two laps are where the middle ones are."""
+    turned = np.arange(0.0, 2.0 * np.pi * laps, SPEED / HZ / radius_m)
+    return radius_m * np.column_stack([np.cos(turned), np.zeros_like(turned), np.sin(turned)])
+
+
+@pytest.mark.parametrize(
+    "walk", [straight(150.0), straight(300.0), circles(30.0, 2)], ids=["150 m", "300 m", "two laps"]
+)
+def test_errors_of_fixes_do_not_lengthen_the_scale(walk: FloatArray) -> None:
+    found = [scale(walk, seed) for seed in range(12)]
+    values = [each.value for each in found if isinstance(each, ScaleEstimate)]
+    assert len(values) == 12
+    assert np.mean(values) == pytest.approx(1.0, abs=0.025)
+
+
+def test_a_track_under_the_documented_length_gives_no_scale() -> None:
+    found = [scale(straight(112.0), seed) for seed in range(12)]
+    assert all(isinstance(each, MeasurementFailure) and "moves too little" in each.reason for each in found)

@@ -93,7 +93,7 @@ def find_scale(
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in measured.lidar_steps}
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
-        height = _height_by_lidar(metres, measured.road_steps) or camera_height_m
+        height = _height_by_lidar(metres, measured) or camera_height_m
     unit = 1.0 if height is None else height
     absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in measured.road_steps.items()}
     if mode == "lidar":
@@ -124,6 +124,9 @@ def find_scale(
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(by_planes, MeasurementFailure):
         logger.warning("no scale (%s): lengths stay in the networks' own unit", by_planes.reason)
+    if mode == "lidar" and height is None and not metres:
+        estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
+        logger.warning("no metres (%s)", estimate.reason)
     return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame))
 
 
@@ -137,9 +140,16 @@ def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: Flo
     }
 
 
-def _height_by_lidar(metres: Mapping[Ends, float], road_steps: Mapping[Ends, RoadStep]) -> float | None:
-    """The camera's height from steps measured by both LiDAR and road; None where there are none."""
-    heights = [metres[ends] / road.length_heights for ends, road in road_steps.items() if ends in metres]
+def _height_by_lidar(metres: Mapping[Ends, float], measured: LengthMeasurements) -> float | None:
+    """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
+    roads = measured.road_steps
+    heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
+    if not heights:
+        heights = [
+            metres[ends] / motion.length_unscaled * plane.height_unscaled
+            for ends, motion in measured.motions.items()
+            if ends in metres and isinstance(plane := measured.planes[ends[0]], GroundPlane)
+        ]
     return float(np.median(heights)) if heights else None
 
 

@@ -96,6 +96,20 @@ def test_without_any_road_lengths_stay_unscaled():
     assert_lengths(scale, {ends: UNIT * length for ends, length in TRUE_M.items()}, rtol=1e-6)
 
 
+@pytest.mark.parametrize("height_m", [0.35, 1.65, 3.2])
+def test_lidar_gives_metres_where_no_road_step_and_no_height_is_known(height_m: float) -> None:
+    scale = find("lidar", measured(road=False, bias=height_m / HEIGHT_M, lidar=20), None)
+    assert scale.is_metric
+    assert_lengths(scale, {ends: metres(ends) for ends in SINGLE}, 0.01)
+
+
+def test_without_a_lidar_step_and_a_height_nothing_is_in_metres() -> None:
+    scale = find("lidar", measured(lidar=0), None)
+    assert not scale.is_metric
+    assert isinstance(scale.estimate, MeasurementFailure)
+    assert "height of the camera is unknown" in scale.estimate.reason
+
+
 def test_lidar_measures_its_steps_and_the_height_for_the_others():
     """The camera is really 2 m high; the height given is missing or wrong."""
     for given in (None, HEIGHT_M):

@@ -33,6 +33,9 @@ app = typer.Typer(
 DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
+DefaultSeed = Annotated[
+    int | None, typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or that of the old run")
+]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 
 
@@ -75,8 +78,8 @@ def run(
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
     ] = None,
-    gps: Annotated[Path | None, typer.Option(help="GPS track of the drive, CSV or NMEA")] = None,
-    seed: Seed = 0,
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None,
+    seed: DefaultSeed = None,
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,11 @@ from slam.errors import ConfigError, RunError
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
 from slam.pipeline.journal import read_journal
+from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.results.output import UNFINISHED
+
+logger = logging.getLogger(__name__)
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
 _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
@@ -41,6 +45,22 @@ def provenance_to_resume(continues: Path, output: Path | None, recording: Mappin
     return dict(provenance) if not recording or recording == provenance["recording"] else None
 
 
+def inputs_to_continue(folder: Path, gps: Path | None, seed: int | None) -> tuple[Path | None, int]:
+    """GPS track and seed for the frames that follow a run: as given, else its own.
+
+    Raises:
+        RunError: its track is not there any more.
+    """
+    provenance = RunFolder(folder).metrics().get("provenance")
+    track, _ = lookup(provenance, "recording", "gps")
+    if gps is None and track is not None:
+        gps = Path(track)
+        if not gps.exists():
+            raise RunError(f"{folder} was run with the GPS track {gps}, which is not there: give it with --gps FILE")
+        logger.info("the GPS track of %s holds for the frames that follow: %s", folder, gps)
+    return gps, (lookup(provenance, "seed")[0] or 0) if seed is None else seed
+
+
 def settings_to_resume(folder: Path, config: str | Path | None, overrides: Sequence[str]) -> SlamConfig:
     """The configuration of a run that goes on, changed where the pass over the frames does not depend on it.
 
@@ -61,7 +81,7 @@ def settings_to_continue(folder: Path, config: str | Path | None, overrides: Seq
     """
     if config is not None:
         raise ConfigError(f"the configuration of {folder} is used to continue it: leave out --config")
-    own = load_config(RunFolder.open(folder).require("config.yaml"))
+    own = load_config(RunFolder(folder).require("config.yaml"))
     settings = load_config(folder / "config.yaml", overrides)
     # another path may lead to the same source, or to more files of it: its identity is compared later
     depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})

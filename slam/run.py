@@ -18,6 +18,7 @@ from erfsfm.lock import FolderLock
 from erfsfm.signals import raising_on_termination
 from slam.config import SlamConfig, load_config
 from slam.continuation import (
+    inputs_to_continue,
     provenance_to_resume,
     require_other_output,
     settings_to_continue,
@@ -53,7 +54,7 @@ class RunOptions(TypedDict, total=False):
     overrides: Sequence[str]
     frames: str | None
     output: str | Path | None
-    seed: int
+    seed: int | None
     device: str
     progress: Progress | None
     command: str
@@ -77,7 +78,7 @@ class RunRequest:
         overrides: ``section.key=value`` each.
         frames: ``A:B``, half-open.
         output: the run folder itself; None makes ``results/<stamp>_<sequence>``.
-        seed: of everything random.
+        seed: of everything random; None is 0, or that of the run to continue.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: called with (stage, done, total).
         command: recorded in the metrics.
@@ -86,7 +87,7 @@ class RunRequest:
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
             configuration is used, and the new folder has the whole drive. A run that did not end goes on in its own
             folder, with its recording, weights and seed.
-        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``.
+        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``; None is that of the run to continue.
     """
 
     dataset: str | Path | None = None
@@ -97,7 +98,7 @@ class RunRequest:
     overrides: Sequence[str] = ()
     frames: str | None = None
     output: Path | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**31)] | None = None
     device: str = "auto"
     progress: Progress | None = None
     command: str = "slam.run_slam"
@@ -151,6 +152,8 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
                 "end goes on without, in its own folder"
             )
         require_other_output(request.continues, request.output)
+        gps, seed = inputs_to_continue(request.continues, request.gps, request.seed)
+        request = replace(request, gps=gps, seed=seed)
     job = _prepare(request)
     return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
 
@@ -161,7 +164,7 @@ def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tup
     files = {name: Path(named[name]) if name in named else None for name in ("dataset", "camera", "gps")}
     words = {name: named.get(name) for name in ("sequence", "frames")}
     weights = provenance["weights"] if request.weights == "default" else request.weights
-    seed = request.seed or provenance["seed"]
+    seed = provenance["seed"] if request.seed is None else request.seed
     same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
     job = _prepare(same, place)
     logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
@@ -194,7 +197,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
             "same --weights and depth.source"
         )
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
-    rest = get_or_compute, checkpoint, request.seed, None if request.gps is None else read_gps(request.gps)
+    rest = get_or_compute, checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
@@ -203,10 +206,16 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:
     if resumes is not None:
-        return settings_to_resume(resumes, request.config, request.overrides)
-    if request.continues is not None:
-        return settings_to_continue(request.continues, request.config, request.overrides)
-    return load_config(request.config, request.overrides)
+        settings = settings_to_resume(resumes, request.config, request.overrides)
+    elif request.continues is not None:
+        settings = settings_to_continue(request.continues, request.config, request.overrides)
+    else:
+        settings = load_config(request.config, request.overrides)
+    kind, colon, path = settings.depth.source.partition(":")
+    if not colon:
+        return settings
+    depth = settings.depth.model_copy(update={"source": f"{kind}:{_from_anywhere(path)}"})
+    return settings.model_copy(update={"depth": depth})
 
 
 def _frame_numbers(recording: FrameSequence, first: int) -> FrameNumbers:
@@ -220,13 +229,14 @@ def provenance_of(
     request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence, source: DepthSource | None
 ) -> Provenance:
     """What goes into a run: networks, depth, and the options that name the recording."""
+    is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here
     return Provenance(
         version=__version__,
         commit=commit(),
         command=request.command,
-        seed=request.seed,
+        seed=request.seed or 0,
         device=str(networks.device),
-        weights=str(request.weights),
+        weights=_from_anywhere(request.weights) if is_folder else str(request.weights),
         weights_sha256=networks.sha256,
         weights_licence=networks.record.licence,
         trained_on=networks.record.trained_on,
@@ -238,9 +248,15 @@ def provenance_of(
 
 
 def _recording(request: RunRequest) -> dict[str, str]:
-    """The options that name the recording; files by their whole paths, for it may be opened from another folder."""
+    """The options that name the recording."""
     files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
     named = {name: Path(path) for name, path in files.items() if path is not None}
-    places = {name: str(path.absolute() if path.exists() else path) for name, path in named.items()}
+    places = {name: _from_anywhere(path) for name, path in named.items()}
     words = {"sequence": request.sequence, "frames": request.frames}
     return places | {name: word for name, word in words.items() if word is not None}
+
+
+def _from_anywhere(name_or_path: str | Path) -> str:
+    """A file or folder by its whole path, for the run may be opened from another folder; a name as it is."""
+    path = Path(name_or_path)
+    return str(path.absolute() if path.exists() else name_or_path)

@@ -23,12 +23,14 @@ class Recording(_Part):
     dataset: str | None = None
     sequence: str | None = None
     camera: str | None = None
+    gps: str | None = None
     frames: str | None = None
 
 
 class ProvenanceRecord(_Part):
     """What ran."""
 
+    seed: Count | None = None
     weights: str | None = None
     weights_sha256: str | None = None
     weights_licence: str | None = None

@@ -53,7 +53,7 @@ def open_argoverse(log: Path, asked: Path | None) -> RecordedSequence:
         lens = _row(_read(log / _INTRINSICS), _CAMERA)
         keys = {"width": lens["width_px"], "height": lens["height_px"], "fps": _FPS}
         focal = {key: lens[f"{key}_px"] for key in ("fx", "fy", "cx", "cy")}
-        own = camera_of(keys | focal, str(log / _INTRINSICS))
+        own = partial(camera_of, keys | focal, str(log / _INTRINSICS))
         mount = _row(_read(log / _EXTRINSICS), _CAMERA)
         (T_ego_camera,) = _poses({key: [value] for key, value in mount.items()})
         driven = _read(log / _POSES)

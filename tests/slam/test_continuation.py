@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from slam import run_slam
@@ -89,6 +91,33 @@ def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
         assert (output / name).read_bytes() == (whole / name).read_bytes(), name
     assert metrics["map"] == RunFolder(whole).metrics()["map"]
     assert {path.name for path in output.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+def test_it_goes_on_from_another_folder_and_says_once_that_it_did_not_end(
+    kitti_root: Path,
+    tiny_weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    shutil.copytree(tiny_weights, here / "mine")
+    shutil.copytree(kitti_root / "sequences/sim/image_2", here / "depth")
+    there.mkdir()
+    monkeypatch.chdir(here)
+
+    def end(self: batch.SlamPipeline, *_: object) -> None:
+        raise RunError("ended")
+
+    overrides = [*OVERRIDES, "depth.source=png:depth", "mapping.enabled=false"]
+    for image in (here / "depth").iterdir():
+        cv2.imwrite(str(image), np.full((64, 208), 2560, np.uint16))
+    with monkeypatch.context() as patched, pytest.raises(RunError, match="ended"):
+        patched.setattr(batch.SlamPipeline, "estimate", end)
+        run_slam(kitti_root, "sim", weights="mine", frames="0:6", overrides=overrides, output=there / "run")
+    monkeypatch.chdir(there)
+    assert run_slam(continues="run").metrics()["provenance"]["weights"] == str(here / "mine")
+    assert len([record for record in caplog.records if "files that are there are whole" in record.message]) == 1
 
 
 def test_it_can_be_killed_again_or_have_kept_nothing_yet(

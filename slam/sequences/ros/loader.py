@@ -17,7 +17,7 @@ from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
 from slam.frames import Image
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import explicit_camera, own_camera
+from slam.sequences.camera_file import own_camera
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near
 from slam.sequences.recording import RecordedSequence, ScanReader, Source
@@ -141,10 +141,7 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stored = BagImages(bag, topic)
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    if asked is not None:
-        camera = explicit_camera(asked, stored, fps)
-    else:
-        camera = own_camera(_calibration(bag, topic, fps), None, stored, path.absolute().parent)
+    camera = own_camera(partial(_calibration, bag, topic, fps), asked, stored, path.absolute().parent)
     images, intrinsics = calibrated(stored, camera, f"{topic} in {path}")
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)

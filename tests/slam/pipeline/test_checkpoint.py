@@ -71,6 +71,24 @@ def test_every_file_has_the_bytes_of_a_run_in_one_go(whole: RunFolder, go_on: Ca
     assert metrics["map"]["points"] == wanted["map"]["points"] > 0
 
 
+def test_the_seed_and_the_gps_track_of_the_run_hold(kitti_root: Path, tmp_path: Path) -> None:
+    track = tmp_path / "gps.csv"
+    rows = [f"{0.1 * k:.1f},{49 + 1e-5 * k:.6f},8.4,100" for k in range(14)]
+    track.write_text("\n".join(["stamp,latitude,longitude,altitude", *rows]))
+    options: dict[str, Any] = {"overrides": ["output.report=false", "mapping.enabled=false", "gps.sigma_m=0.1"]}
+    options |= {"gps": track, "seed": 7}
+    once = run(kitti_root, tmp_path / "once", None, **options)
+    before = run(kitti_root, tmp_path / "before", "0:8", **options).path
+    continued = run(kitti_root, tmp_path / "after", "8:", overrides=(), continues=before)
+    assert (continued.path / "graph.g2o").read_bytes() == (once.path / "graph.g2o").read_bytes()
+    metrics, wanted = continued.metrics(), once.metrics()
+    assert metrics["gps"]["fixes"] == wanted["gps"]["fixes"] == 14
+    assert (metrics["provenance"]["seed"], metrics["provenance"]["recording"]["gps"]) == (7, str(track))
+    track.unlink()
+    with pytest.raises(RunError, match=r"gps\.csv, which is not there: give it with --gps FILE"):
+        run(kitti_root, tmp_path / "none", "8:", overrides=(), continues=before)
+
+
 def test_three_runs_in_a_row_give_the_graph_of_one(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
     """One of them is of a single frame."""
     settings = ["output.report=false", "mapping.enabled=false"]

@@ -188,9 +188,7 @@ def test_truth_of_an_unknown_mount_is_not_used(new_bag: NewBag, caplog: pytest.L
     assert "/vicon/rig is not used: no static transform from its 'rig' to the camera's 'camera'" in caplog.text
 
 
-def test_frames_without_a_name_are_not_taken_for_the_camera(
-    new_bag: NewBag, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_without_a_name_are_not_taken_for_the_camera(new_bag: NewBag, caplog: pytest.LogCaptureFixture) -> None:
     bag = new_bag()
     bag.camera_frame = ""
     drive(bag)

@@ -92,6 +92,8 @@ def train(
     if not resume:
         seen = merge([*seen, *_start_from(module, config)])
     keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks)
+    if resume:
+        module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if config.training.nodes > 1:

@@ -58,7 +58,9 @@ class FolderSource:
         count, last = 0, Path()
         while not stopped.is_set():
             waiting = self._waiting()
-            for path in waiting[:1]:
+            for path in waiting:
+                if stopped.is_set():
+                    return
                 if natural_key(path) < natural_key(last):
                     logger.warning("%s came after %s, before which its name belongs; it is left out", path, last.name)
                 else:
@@ -107,13 +109,14 @@ class FolderSource:
     @sequence_errors()
     def _read(self, path: Path, deadline: float) -> Image:
         """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
+        is_written = False
         while True:
-            is_newest = self._waiting()[-1:] == [path]
             try:
                 return read_image(path)
             except DataError:
-                if time.monotonic() > deadline or not is_newest:
+                if time.monotonic() > deadline or is_written:
                     raise
+                is_written = self._waiting()[-1:] != [path]
                 time.sleep(_POLL_S)
 
 

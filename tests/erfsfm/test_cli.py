@@ -210,6 +210,7 @@ def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Ca
     assert {row["weights"] for row in rows} == {"untrained"}
 
 
+@pytest.mark.slow
 def test_receptive_fields_of_the_papers_networks(run: Run, tmp_path: Path) -> None:
     options = ["--fidelity", "paper", "--height", "48", "--width", "64", "--json"]
     code, out, _ = run("receptive-field", *options, "--output", tmp_path / "field.png")

@@ -73,8 +73,8 @@ class Absent(nn.Module):
             CheckpointError: always.
         """
         raise CheckpointError(
-            f"{self._folder} holds no {self.kind} network: it was converted from one checkpoint alone; convert both "
-            "together"
+            f"{self._folder} holds no {self.kind} network: the other one alone was trained or converted; use weights "
+            "that have both"
         )
 
     def state_dict(self, *_args: Any, **_options: Any) -> Any:

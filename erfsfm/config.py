@@ -193,7 +193,10 @@ class TrainingConfig(Section):
         description="GPUs of a machine, or processes on its CPU; batch normalisation is synchronised on GPUs alone",
     )
     nodes: int = Field(default=1, ge=1, description="machines, on each of which the same command is started")
-    networks: TrainedNetworks = Field(default="both", description="trained networks; the other one keeps its weights")
+    networks: TrainedNetworks = Field(
+        default="both",
+        description="trained networks; the other one keeps its initial weights, and is not written without any",
+    )
     frozen_stages: int = Field(
         default=0, ge=0, le=7, description="first stages of a lite0 encoder that keep their weights, the stem being one"
     )

@@ -147,7 +147,9 @@ def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, 
                 "time stamps are compared row by row: give each frame a row, or use TUM files for both"
             )
         return estimate, reference
-    rows_estimate, rows_reference = _match_stamps(estimate, reference)
+    # Slack, because the tolerance itself is a difference of rounded stamps.
+    within_s = matching_tolerance_s(estimate, reference) * (1.0 + 1e-6)
+    rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
     if not rows_estimate.size:
         raise TrajectoryError(
             f"no time stamps match within {matching_tolerance_s(estimate, reference):.3g} s: the estimate "
@@ -166,14 +168,11 @@ def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
     return 0.5 * min(periods, default=0.02)
 
 
-def _match_stamps(a: Trajectory, b: Trajectory) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of a and b whose stamps are each other's nearest, within the tolerance."""
-    nearest_b, nearest_a = nearest_stamps(a.stamps, b.stamps), nearest_stamps(b.stamps, a.stamps)
+def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart."""
+    nearest_b, nearest_a = nearest_stamps(a, b), nearest_stamps(b, a)
     rows_a = np.arange(len(a))
-    mutual = nearest_a[nearest_b] == rows_a
-    # Slack, because the tolerance itself is a difference of rounded stamps.
-    close = np.abs(b.stamps[nearest_b] - a.stamps) <= matching_tolerance_s(a, b) * (1.0 + 1e-6)
-    chosen = mutual & close
+    chosen = (nearest_a[nearest_b] == rows_a) & (np.abs(b[nearest_b] - a) <= within_s)
     return rows_a[chosen], nearest_b[chosen]
 
 

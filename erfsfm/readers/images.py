@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -110,14 +111,18 @@ def image_size(path: Path) -> tuple[int, int]:
     return height, width
 
 
-def first_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Height and width of the first image that can be read; where none can, raises as `read_image` of the first."""
+def first_readable(files: Sequence[Path]) -> tuple[Path, Image]:
+    """The first image that can be read, and its file; where none can, raises as `read_image` of the first."""
     for file in files:
-        try:
-            return image_size(file)
-        except DataError:
-            continue
-    return image_size(files[0])
+        with suppress(DataError):
+            return file, read_image(file)
+    return files[0], read_image(files[0])
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Height and width of the first image that can be read; raises as `first_readable`."""
+    height, width = first_readable(files)[1].shape[:2]
+    return height, width
 
 
 def resize_image(image: Image, height: int, width: int) -> Image:

@@ -106,9 +106,14 @@ def by_name(paths: list[Path]) -> NumberedFiles:
     names = [(match["prefix"], int(match["number"])) for match in matches if match is not None]
     numbers = [number for _, number in names]
     if len(names) < len(paths) or len({prefix for prefix, _ in names}) != 1 or _typical_step(numbers) != 1:
-        return NumberedFiles(tuple(paths), tuple(range(len(paths))))
+        return in_order(paths)
     frames = _numbered(paths, numbers)
     return NumberedFiles(frames.paths, frames.rows)
+
+
+def in_order(paths: list[Path]) -> NumberedFiles:
+    """Files, at least one, one after the other whatever their names are: photos, not a recording."""
+    return NumberedFiles(tuple(paths), tuple(range(len(paths))))
 
 
 def by_table(listed: list[Path], table: Path) -> NumberedFiles:

@@ -74,8 +74,9 @@ def refine(
     for _ in range(STEPS):
         step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
         change += step
-    measured = information > 1 / LEAST_PRIOR_SIGMA**2
-    change[fit < LEAST_FIT] = 0
+    unexplained = fit < LEAST_FIT
+    measured = (information > 1 / LEAST_PRIOR_SIGMA**2) & ~unexplained
+    change[unexplained] = 0
     if road is not None:
         moving = _under_road(1 / (inverse * np.exp(change)), K, road) & ~_under_road(depth, K, road)
         moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 import erfsfm
-from erfsfm.checkpoint import Model, ModelRecord, commit, read_record, save_model
+from erfsfm.checkpoint import KINDS, Absent, Model, ModelRecord, commit, read_record, save_model
 from erfsfm.config import TrainedNetworks
 from erfsfm.data.splits import merge
 from erfsfm.errors import TrainingError
@@ -63,7 +63,8 @@ class WeightKeeper(Callback):
             self.save(module, trainer.global_step)
         self._best |= improved
         training = module.config.training
-        if training.patience and trainer.global_step - self._best_step >= training.patience * training.validate_every:
+        since = trainer.global_step - self._best_step
+        if training.patience and self._best_step and since >= training.patience * training.validate_every:
             trainer.should_stop = True
             logger.info(
                 "stopped at step %d: no validation since step %d was better", trainer.global_step, self._best_step
@@ -81,7 +82,7 @@ class WeightKeeper(Callback):
     def save(self, module: SelfSupervision, step: int) -> None:
         """Write ``last/``, and the folders whose metric is the best so far.
 
-        Without validation the last is the best.
+        Where validation measures nothing, or there is none, the last is the best.
 
         Raises:
             TrainingError: weights are NaN or infinite; nothing is written.
@@ -97,7 +98,7 @@ class WeightKeeper(Callback):
         model = self._model(module, step)
         save_model(self._output / "last", model)
         folders = set(self._improved(module.validation_metrics))
-        if not self.validates or not (self._output / "model.yaml").is_file():
+        if not self.validates or math.isinf(self._best[self._output]):
             folders.add(self._output)
         for folder in folders:
             save_model(folder, model)
@@ -105,6 +106,7 @@ class WeightKeeper(Callback):
     def _model(self, module: SelfSupervision, step: int) -> Model:
         record = ModelRecord(
             network=module.config.network,
+            networks=module.known,
             trained_on=self._seen,
             licence=licence_of(self._seen),
             step=step,
@@ -113,7 +115,10 @@ class WeightKeeper(Callback):
             commit=commit(),
             command=self._command,
         )
-        return Model(record, module.depth_net, module.pose_net)
+        depth_net, pose_net = (
+            module.network(kind) if module.known in ("both", kind) else Absent(kind, self._output) for kind in KINDS
+        )
+        return Model(record, depth_net, pose_net)
 
     def _measures(self, metrics: dict[str, float]) -> dict[Path, float]:
         """The metric by which each folder's weights are chosen; less is better."""
@@ -142,7 +147,7 @@ def _all_finite(module: SelfSupervision) -> bool:
 def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:
     """The metric of a validation: error of depth, of poses where these alone are trained; less is better.
 
-    Without ground truth it is the photometric error.
+    Without ground truth it is the photometric error, which needs both networks; else infinite.
     """
     value = metrics.get("snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf))
     return value if math.isfinite(value) else math.inf

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Self
 
 import lightning
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
-from erfsfm.config import ExperimentConfig
+from erfsfm.config import ExperimentConfig, TrainedNetworks
 from erfsfm.errors import TrainingError
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
@@ -24,6 +24,7 @@ from erfsfm.losses.structure import Bounds
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
 from erfsfm.networks.lite0_pose import Lite0PoseNet
+from erfsfm.networks.presets import NetworkKind
 from erfsfm.training.feature_memory import FeatureMemory, features_recur
 from erfsfm.training.muon import Muon, is_matrix
 from erfsfm.training.objective import PoseFunction, SnippetBatch, evaluate_objective, to_network_range
@@ -50,6 +51,7 @@ class SelfSupervision(lightning.LightningModule):
         geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
+        self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self._choose_trained()
         self._features: FeatureMemory | None = None
         if isinstance(self.pose_net, Lite0PoseNet) and features_recur(config):
@@ -71,14 +73,18 @@ class SelfSupervision(lightning.LightningModule):
                 # depthwise convolutions are a quarter faster so
                 network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def take_imagenet(self) -> None:
-        """Start pretrained encoders from ImageNet's weights.
+    def network(self, kind: NetworkKind) -> nn.Module:
+        """The network of that kind."""
+        return self.depth_net if kind == "depth" else self.pose_net
+
+    def take_imagenet(self, kinds: Sequence[NetworkKind]) -> None:
+        """Start the pretrained encoders of these networks from ImageNet's weights.
 
         Raises:
             ConfigError: they are not installed.
         """
-        for network in (self.depth_net, self.pose_net):
-            encoder = getattr(network, "encoder", None)
+        for kind in kinds:
+            encoder = getattr(self.network(kind), "encoder", None)
             if isinstance(encoder, Lite0Encoder):
                 encoder.take_imagenet()
 
@@ -190,27 +196,44 @@ class SelfSupervision(lightning.LightningModule):
         self._validation = {}
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        """Photometric error of every snippet; depth and pose errors where ground truth is known."""
+        """Photometric error of every snippet; depth and pose errors where ground truth is known.
+
+        Nothing is measured of a network that was never trained.
+        """
         target, sources = to_network_range(batch["target"]), to_network_range(batch["sources"])
         disparity = self.depth_net(target).float()
         vectors = self.pose_net(target, list(sources.unbind(dim=1))).float()
         T_source_target = pose_vector_to_matrix(vectors)
-        with torch.autocast(self.device.type, enabled=False):
-            self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
-        self._note("disparity_spread", float(disparity.std() / disparity.mean()))
-        if "depth" in batch:
-            truth = batch["depth"][0].cpu().numpy()
-            resized = torch.nn.functional.interpolate(disparity, truth.shape, mode="bilinear")
-            errors = depth_errors((1 / resized)[0, 0].cpu().numpy(), truth)
-            if errors is not None:
-                self._note("abs_rel", errors.abs_rel)
-                self._note("depth_scale", errors.scale)
-        if "T_source_target" in batch and len(T_source_target[0]) == 4:
+        if self.known == "both":
+            with torch.autocast(self.device.type, enabled=False):
+                self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
+        if self.known != "pose":
+            self._note_depth(disparity, batch.get("depth"))
+        if self.known != "depth" and "T_source_target" in batch:
             predicted = snippet_from_network(T_source_target[0].double().cpu().numpy())[None]
             true = snippet_from_network(batch["T_source_target"][0].cpu().numpy())[None]
-            errors_pose = snippet_errors(predicted, true)
-            self._note("snippet_ate", errors_pose.ate_mean)
-            self._note("snippet_re", errors_pose.re_mean)
+            errors = snippet_errors(predicted, true)
+            self._note("snippet_ate", errors.ate_mean)
+            self._note("snippet_re", errors.re_mean)
+
+    def _note_depth(self, disparity: Tensor, true_depth: Tensor | None) -> None:
+        self._note("disparity_spread", float(disparity.std() / disparity.mean()))
+        if true_depth is None:
+            return
+        truth = true_depth[0].cpu().numpy()
+        resized = torch.nn.functional.interpolate(disparity, truth.shape, mode="bilinear")
+        errors = depth_errors((1 / resized)[0, 0].cpu().numpy(), truth)
+        if errors is not None:
+            self._note("abs_rel", errors.abs_rel)
+            self._note("depth_scale", errors.scale)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Note which networks were trained."""
+        checkpoint["known"] = self.known
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Networks that were trained; older checkpoints do not tell."""
+        self.known = checkpoint.get("known", "both" if self.config.initial_weights else self.known)
 
     def on_validation_epoch_end(self) -> None:
         """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""

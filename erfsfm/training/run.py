@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from erfsfm.checkpoint import load_model
+from erfsfm.checkpoint import KINDS, load_model
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shard_draws import ShardDraws, in_shards
@@ -37,6 +37,7 @@ from erfsfm.signals import Terminated, raising_on_termination
 from erfsfm.threads import single_threaded_opencv
 from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
+from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import OutputFolder
 from erfsfm.training.processes import rank_of
 from erfsfm.training.progress import ProgressLine
@@ -183,21 +184,31 @@ def _fit(
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:
     """Load initial weights, also of another variant or half the width; returns what they were trained on."""
     name, wanted = config.initial_weights, config.network
-    if not name:
-        if config.pretrained == "imagenet":
-            module.take_imagenet()
+    model = load_model(name) if name else None
+    loaded = [kind for kind in KINDS if model is not None and model.record.networks in ("both", kind)]
+    if config.training.networks == "depth" and "pose" not in loaded and needs_poses(config):
+        raise ConfigError(
+            "training.networks: depth warps images by the motion of a pose network that was trained before, and there "
+            "is none: name weights that have one as initial_weights, or set teacher.views=many, or "
+            "loss.photometric_weight=0"
+        )
+    if config.pretrained == "imagenet":
+        module.take_imagenet([kind for kind in KINDS if kind not in loaded])
+    if model is None:
         return []
-    model = load_model(name)
     free = {key: getattr(wanted, key) for key in ("depth", "pose", "depth_width", "pose_width", "alignment")}
     try:
         if model.record.network.model_copy(update=free) != wanted:
             raise ConfigError("only presets, widths and alignment may differ")
-        take_over(module.depth_net, model.depth_net.state_dict())
-        take_over(module.pose_net, model.pose_net.state_dict())
+        for kind in loaded:
+            trained = model.depth_net if kind == "depth" else model.pose_net
+            take_over(module.network(kind), trained.state_dict())
     except ConfigError as error:
         raise ConfigError(
             f"initial_weights '{name}' are of another network, {model.record.network.model_dump()}: {error}"
         ) from error
+    if model.record.networks != module.known:
+        module.known = "both"
     return model.record.trained_on
 
 

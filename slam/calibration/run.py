@@ -13,7 +13,7 @@ from erfsfm.figure_file import require_figure
 from erfsfm.readers.camera_file import CameraFile, read_camera_file
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images
-from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.readers.numbering import in_order
 from erfsfm.readers.video import VideoFrames
 from slam.calibration.board import Board
 from slam.calibration.picture import write_picture
@@ -114,8 +114,7 @@ def _open(recording: Path) -> tuple[ImageSource, float | None]:
     folder = image_folder(recording)
     if folder is None:
         raise DataError(f"no images in {recording}: give a folder of png, jpg or bmp images, or a video")
-    paths = tuple(list_images(folder))
-    return ImageFiles(NumberedFiles(paths, tuple(range(len(paths))))), None
+    return ImageFiles(in_order(list_images(folder))), None
 
 
 def _rounded(value: float) -> float:

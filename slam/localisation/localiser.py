@@ -14,7 +14,7 @@ from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile
 from erfsfm.readers.folder import image_folder
 from erfsfm.readers.images import list_images, read_image
-from erfsfm.readers.numbering import by_name
+from erfsfm.readers.numbering import in_order
 from erfsfm.threads import take_working_memory
 from slam.config import LoopsConfig, load_stored
 from slam.errors import RunError, SequenceError
@@ -242,7 +242,7 @@ def _camera_file(explicit: Path | None, images: Path, paths: list[Path]) -> Came
         folder = images if images.is_dir() else images.parent
         return beside(paths[0].parent, folder, folder.absolute().parent)
     if is_field_of_view(explicit):
-        return explicit_camera(explicit, ImageFiles(by_name(paths)))
+        return explicit_camera(explicit, ImageFiles(in_order(paths)))
     return read_explicit(explicit)
 
 

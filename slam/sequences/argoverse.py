@@ -23,7 +23,7 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_stamps
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_stamps
+from slam.trajectory import nearest_pairs
 
 _CAMERA = "ring_front_center"
 _IMAGES, _SCANS = f"sensors/cameras/{_CAMERA}", "sensors/lidar"
@@ -53,7 +53,7 @@ def open_argoverse(log: Path, asked: Path | None) -> RecordedSequence:
         lens = _row(_read(log / _INTRINSICS), _CAMERA)
         keys = {"width": lens["width_px"], "height": lens["height_px"], "fps": _FPS}
         focal = {key: lens[f"{key}_px"] for key in ("fx", "fy", "cx", "cy")}
-        own = camera_of(keys | focal, str(log / _INTRINSICS))
+        own = partial(camera_of, keys | focal, str(log / _INTRINSICS))
         mount = _row(_read(log / _EXTRINSICS), _CAMERA)
         (T_ego_camera,) = _poses({key: [value] for key, value in mount.items()})
         driven = _read(log / _POSES)
@@ -114,9 +114,8 @@ def _scans(folder: Path, stamps: FloatArray) -> dict[int, ScanReader]:
     if not paths:
         return {}
     known = np.array([_stamp(path) for path in paths])
-    nearest = nearest_stamps(known, stamps)
-    close = np.abs(stamps[nearest] - known) <= _SCAN_DELAY_S
-    return {int(nearest[k]): partial(_points, paths[k]) for k in np.flatnonzero(close)}
+    pairs = zip(*nearest_pairs(stamps, known, _SCAN_DELAY_S))
+    return {int(frame): partial(_points, paths[sweep]) for frame, sweep in pairs}
 
 
 def _points(path: Path) -> FloatArray:

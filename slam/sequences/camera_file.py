@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -84,11 +85,11 @@ def read_explicit(path: Path) -> CameraFile:
     return read_camera_file(path)
 
 
-def own_camera(own: CameraFile, asked: Path | None, images: Sized, *folders: Path) -> CameraFile:
+def own_camera(own: Callable[[], CameraFile], asked: Path | None, images: Sized, *folders: Path) -> CameraFile:
     """The camera of a recording with a calibration of its own.
 
     Args:
-        own: that calibration.
+        own: reads that calibration; not called where the user gave another.
         asked: what the user gave in its place.
         images: the images.
         folders: where a ``camera.yaml`` may lie; it gives the height of the camera alone.
@@ -97,9 +98,9 @@ def own_camera(own: CameraFile, asked: Path | None, images: Sized, *folders: Pat
         SequenceError: if a camera file is wrong.
     """
     if asked is not None:
-        return explicit_camera(asked, images, own.fps)
-    height = beside(*folders)
-    return own if height is None else own.model_copy(update={"camera_height_m": height.camera_height_m})
+        return explicit_camera(asked, images)
+    camera, height = own(), beside(*folders)
+    return camera if height is None else camera.model_copy(update={"camera_height_m": height.camera_height_m})
 
 
 @sequence_errors()

@@ -54,8 +54,8 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
     listed = [folder / "data" / row[-1].strip() for row in rows]
     files = by_table(listed, table)
     stored = ImageFiles(files)
-    sensor = _read_sensor(folder / "sensor.yaml")
-    camera = own_camera(sensor.camera(), asked, stored, body, body.parent)
+    sensor = folder / "sensor.yaml"
+    camera = own_camera(lambda: _read_sensor(sensor).camera(), asked, stored, body, body.parent)
     images, intrinsics = calibrated(stored, camera, str(folder))
     stamps = require_stamps(stamps[: files.first + len(files)], table, files)
     require_short_gaps(files, stamps)
@@ -66,18 +66,31 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
         intrinsics=intrinsics,
         stamps=stamps,
         sources=(Source(f"euroc/{name}"),),
-        T_any_camera=_true_poses(body / _TRUTH, stamps, sensor.T_body_sensor),
+        T_any_camera=_true_poses(body / _TRUTH, stamps, sensor),
         camera_height_m=camera.height_or(None),
     )
 
 
 @dataclass(frozen=True)
 class _Sensor:
-    """A ``sensor.yaml``: the pose of the sensor in the body, and the other keys."""
+    """The keys of a ``sensor.yaml``."""
 
     path: Path
-    T_body_sensor: FloatArray
     keys: dict[str, Any]
+
+    def T_body_sensor(self) -> FloatArray:
+        """The pose of the sensor in the body ``(4, 4)``.
+
+        Raises:
+            SequenceError: there is none.
+        """
+        try:
+            T_body_sensor = np.array(self.keys["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
+        except (KeyError, TypeError, ValueError) as error:
+            raise SequenceError(f"{self.path} needs T_BS with data of 4 x 4 numbers: {error!r}") from error
+        if not se3.is_se3(T_body_sensor, _RIGID_TOLERANCE):
+            raise SequenceError(f"{self.path} has a T_BS that is no rotation and translation: restore the file")
+        return T_body_sensor
 
     def camera(self) -> CameraFile:
         """The calibration of a camera.
@@ -110,18 +123,14 @@ def _read_sensor(path: Path) -> _Sensor:
         keys = parse_yaml(text.partition("\n")[2] if text.startswith("%") else text)
     except (OSError, UnicodeDecodeError, ErfsfmError) as error:
         raise SequenceError(f"cannot read {path}, the calibration of an EuRoC sensor: {error}") from error
-    keys = keys if isinstance(keys, dict) else {}
-    try:
-        T_body_sensor = np.array(keys["T_BS"]["data"], dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError) as error:
-        raise SequenceError(f"{path} needs T_BS with data of 4 x 4 numbers: {error!r}") from error
-    if not se3.is_se3(T_body_sensor, _RIGID_TOLERANCE):
-        raise SequenceError(f"{path} has a T_BS that is no rotation and translation: restore the file")
-    return _Sensor(path, T_body_sensor, keys)
+    return _Sensor(path, keys if isinstance(keys, dict) else {})
 
 
-def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> FloatArray | None:
-    """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth."""
+def _true_poses(folder: Path, stamps: FloatArray, camera: Path) -> FloatArray | None:
+    """``T_any_camera`` at the images' stamps, NaN where unknown; None without ground truth.
+
+    ``camera`` is the ``sensor.yaml`` that says where the camera sits.
+    """
     table = folder / "data.csv"
     if not table.exists():
         return None
@@ -133,9 +142,9 @@ def _true_poses(folder: Path, stamps: FloatArray, T_body_camera: FloatArray) -> 
     except (ValueError, IndexError) as error:
         raise SequenceError(f"{table} needs stamp, position and quaternion in each row: {error}") from error
     sensor = folder / "sensor.yaml"
-    T_body_sensor = _read_sensor(sensor).T_body_sensor if sensor.exists() else np.eye(4)
+    T_body_sensor = _read_sensor(sensor).T_body_sensor() if sensor.exists() else np.eye(4)
     T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
-    T_any_camera = poses_near(T_any_body @ T_body_camera, known, stamps, table)
+    T_any_camera = poses_near(T_any_body @ _read_sensor(camera).T_body_sensor(), known, stamps, table)
     describe_unknown(T_any_camera, table)
     return T_any_camera
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from erfsfm.readers.images import read_image
+from erfsfm.readers.images import first_readable, read_image
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Image
@@ -11,13 +11,13 @@ MAX_GAP_FRAMES = 100
 
 
 class ImageFiles:
-    """Images on disk, one row a number, all of the size of the first."""
+    """Images on disk, one row a number, all of the size of the first that can be read."""
 
     def __init__(self, files: NumberedFiles) -> None:
-        """Read the first image for its size.
+        """Read the first readable image for its size.
 
         Raises:
-            DataError: if it cannot be read.
+            DataError: if none can be read.
             SequenceError: if a gap in the numbering is longer than 100 frames.
         """
         self.files = files
@@ -25,7 +25,8 @@ class ImageFiles:
             if last - first + 1 > MAX_GAP_FRAMES:
                 raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
-        self.height, self.width = read_image(files.paths[0]).shape[:2]
+        self._sized_by, image = first_readable(files.paths)
+        self.height, self.width = image.shape[:2]
 
     def __len__(self) -> int:
         """Number of frames, with those without an image."""
@@ -37,18 +38,19 @@ class ImageFiles:
         Raises:
             MissingFrameError: if the frame's number is missing.
             DataError: if the file cannot be read.
-            SequenceError: if the image has another size than the first.
+            SequenceError: if the image has another size than that one.
         """
-        path, first = self._paths.get(index), self.files.paths[0]
+        path = self._paths.get(index)
         if path is None:
+            folder = self.files.paths[0].parent
             raise MissingFrameError(
-                f"no image {self.files.file_name(index)} in {first.parent}: the numbering has a gap there"
+                f"no image {self.files.file_name(index)} in {folder}: the numbering has a gap there"
             )
         image = read_image(path)
         height, width = image.shape[:2]
         if (height, width) != (self.height, self.width):
             raise SequenceError(
-                f"{path} is {width}x{height}, but {first.name} is "
+                f"{path} is {width}x{height}, but {self._sized_by.name} is "
                 f"{self.width}x{self.height}: all images of a sequence need one size; resize or remove it"
             )
         return image

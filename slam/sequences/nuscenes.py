@@ -52,9 +52,8 @@ def open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> R
         (T_ego_camera,) = _poses([front.mount])
         K, size = np.array(front.mount["camera_intrinsic"]), (front.rows[0]["width"], front.rows[0]["height"])
         keys = {"width": size[0], "height": size[1], "fps": _FPS, "camera_height_m": float(T_ego_camera[2, 3])}
-        own = camera_of(
-            keys | {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}, str(tables / "calibrated_sensor.json")
-        )
+        keys |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        own = partial(camera_of, keys, str(tables / "calibrated_sensor.json"))
         T_camera_lidar, scans = (None, {}) if lidar is None else _scans(root, lidar, T_ego_camera, stamps)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise SequenceError(f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again") from error

@@ -39,7 +39,7 @@ def open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
         raise SequenceError(f"{unnamed} is not named by its number, as 0.jpg: rename it")
     files = by_name(paths)
     stored = ImageFiles(files)
-    camera = own_camera(_camera(folder / _INTRINSICS, stored), asked, stored, folder)
+    camera = own_camera(partial(_camera, folder / _INTRINSICS, stored), asked, stored, folder)
     images, intrinsics = calibrated(stored, camera, str(folder))
     there = [int(path.stem) for path in files.paths]
     numbers = np.interp(np.arange(len(files)), files.rows, there).round().astype(int).tolist()

@@ -39,7 +39,7 @@ def open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     frames = range(numbers[0], numbers[-1] + 1)
     files = by_table([folder / f"frame-{k:06d}.color.png" for k in frames], folder)
     stored = ImageFiles(files)
-    camera = own_camera(_PUBLISHED, asked, stored, folder, folder.parent)
+    camera = own_camera(lambda: _PUBLISHED, asked, stored, folder, folder.parent)
     images, intrinsics = calibrated(stored, camera, str(folder))
     stamps = np.array(frames) / _FPS
     require_short_gaps(files, stamps)

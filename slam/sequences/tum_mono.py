@@ -40,7 +40,7 @@ def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
     stamps = _stamps(folder / _TIMES, files)
     require_short_gaps(files, stamps)
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    camera = own_camera(_camera(folder / _CAMERA, fps), asked, stored, folder)
+    camera = own_camera(partial(_camera, folder / _CAMERA, fps), asked, stored, folder)
     images, intrinsics = calibrated(stored, camera, str(folder))
     return RecordedSequence(
         name=folder.name,

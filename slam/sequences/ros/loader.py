@@ -17,7 +17,7 @@ from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
 from slam.frames import Image
 from slam.se3 import FloatArray
-from slam.sequences.camera_file import explicit_camera, own_camera
+from slam.sequences.camera_file import own_camera
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near
 from slam.sequences.recording import RecordedSequence, ScanReader, Source
@@ -34,7 +34,7 @@ from slam.sequences.ros.messages import (
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_stamps
+from slam.trajectory import nearest_pairs
 
 logger = logging.getLogger(__name__)
 
@@ -141,10 +141,7 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stored = BagImages(bag, topic)
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-    if asked is not None:
-        camera = explicit_camera(asked, stored, fps)
-    else:
-        camera = own_camera(_calibration(bag, topic, fps), None, stored, path.absolute().parent)
+    camera = own_camera(partial(_calibration, bag, topic, fps), asked, stored, path.absolute().parent)
     images, intrinsics = calibrated(stored, camera, f"{topic} in {path}")
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
@@ -207,20 +204,19 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
 def _scans(
     bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatArray
 ) -> tuple[FloatArray | None, dict[int, ScanReader]]:
-    """``T_camera_lidar``, and the nearest cloud of each frame within 50 ms, of the first LiDAR whose mount is known."""
+    """``T_camera_lidar`` and clouds of the first LiDAR whose mount is known.
+
+    A frame has the cloud nearest to it, if within 50 ms and not nearer to another frame.
+    """
     for topic in bag.topics(POINT_CLOUD):
         T_camera_lidar = mounted.between(camera, bag.first(topic).header.frame_id)
         if T_camera_lidar is None:
             logger.warning("%s is not used: no static transform from its frame to the camera's %r", topic, camera)
             continue
         clouds = StampedMessages(bag, topic)
-        nearest = nearest_stamps(clouds.stamps, stamps)
-        close = np.abs(stamps[nearest] - clouds.stamps) <= _SCAN_DELAY_S
+        pairs = zip(*nearest_pairs(stamps, clouds.stamps, _SCAN_DELAY_S))
         where = f"a cloud of {topic} in {bag.path}"
-        read: dict[int, ScanReader] = {
-            int(nearest[k]): partial(_points, clouds, int(k), where) for k in np.flatnonzero(close)
-        }
-        return T_camera_lidar, read
+        return T_camera_lidar, {int(frame): partial(_points, clouds, int(cloud), where) for frame, cloud in pairs}
     return None, {}
 
 

@@ -91,6 +91,17 @@ def test_without_texture_the_guess_stays_and_says_so() -> None:
     assert found.relative_sigma.min() >= 0.15
 
 
+def test_what_no_neighbour_shows_is_not_measured() -> None:
+    """As behind a fence, or under a leaf on the lens: the sigma is that of a guess."""
+    images = [wall_and_step((0.0, 0.0, 0.0)), *(wall_and_step(position) for position in POSITIONS)]
+    image, depth = images[0]
+    image[20:60, 150:200] = painted(2, X * 3, Y * 3, 40.0)[20:60, 150:200]
+    result = refined([each for each, _ in images], depth)
+    hidden = np.zeros(depth.shape, bool)
+    hidden[23:57, 153:197] = True
+    assert result.measured[hidden].mean() < 0.05 < 0.5 < result.measured[~hidden].mean()
+
+
 def test_sky_is_far() -> None:
     images = [road_and_car(p, k)[0] for k, p in enumerate([(0.0, 0.0, 0.0), *POSITIONS])]
     _, truth, car = road_and_car((0.0, 0.0, 0.0), 0)

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 
 import erfsfm.training.run
-from erfsfm.checkpoint import load_model
-from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
+from erfsfm.checkpoint import Absent, Model, ModelRecord, build_networks, load_model, save_model
+from erfsfm.config import ExperimentConfig, TrainedNetworks, dump_yaml, load_experiment
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
@@ -301,6 +301,62 @@ def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list
     monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", on_validation_epoch_end)
 
 
+def poses_measured(world: Path, folder: Path) -> dict[str, Any]:
+    """Settings of a teacher that has measured the poses of the drive of 10 frames."""
+    (recording,) = discover(world)
+    ManyViewTeacher(folder / "measured", (32, 64), 2).drive(recording).keep_poses(np.stack([np.eye(4)] * 10))
+    return {"views": "many", "rotation_weight": 1.0, "cache": folder / "measured"}
+
+
+def saved(config: ExperimentConfig, networks: TrainedNetworks, folder: Path) -> Path:
+    """Weights of the experiment's networks, or of one of them."""
+    record = ModelRecord(network=config.network, networks=networks, trained_on=[])
+    depth_net, pose_net = build_networks(config.network)
+    absent = {"depth": (depth_net, Absent("pose", folder)), "pose": (Absent("depth", folder), pose_net)}
+    save_model(folder, Model(record, *absent.get(networks, (depth_net, pose_net))))
+    return folder
+
+
+def test_a_network_that_was_never_trained_is_neither_measured_nor_written(
+    small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    teacher = poses_measured(world, tmp_path)
+    config = configure(small, [world, held_out], training={"networks": "pose"}, teacher=teacher)
+    interrupted(monkeypatch, config, tmp_path / "run", 3)
+    output = train(config, tmp_path / "run", resume=True, device="cpu")
+    model = load_model(output)
+    assert model.record.networks == "pose" and not list(output.rglob("depth.safetensors"))
+    assert set(model.record.metrics) == {"snippet_ate", "snippet_re"}
+    with pytest.raises(CheckpointError, match="holds no depth network: the other one alone was trained"):
+        DepthPosePredictor.from_weights(output).depth(np.zeros((32, 64, 3), np.uint8))
+    depth = configure(small, [world, held_out], training={"networks": "depth"})
+    both = train(depth.model_copy(update={"initial_weights": str(output)}), tmp_path / "both", device="cpu")
+    assert load_model(both).record.networks == "both", "one trained here, the other before"
+    assert {"abs_rel", "photometric", "snippet_ate"} <= load_model(both).record.metrics.keys()
+
+
+def test_poses_without_truth_to_validate_are_the_last(
+    small: Small, world: Path, held_out: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(held_out, tmp_path / "blind")
+    (tmp_path / "blind" / "poses" / "00.txt").unlink()
+    training = {"networks": "pose", "validate_every": 1, "patience": 1}
+    roots = [world, tmp_path / "blind"]
+    config = configure(small, roots, training=training, teacher=poses_measured(world, tmp_path))
+    record = load_model(train(config, tmp_path / "run", device="cpu")).record
+    assert (record.step, record.metrics) == (4, {})
+
+
+@pytest.mark.parametrize("initial", [None, "depth"])
+def test_depth_is_not_trained_against_poses_that_never_were(
+    small: Small, world: Path, tmp_path: Path, initial: TrainedNetworks | None
+) -> None:
+    config = configure(small, [world], training={"networks": "depth"})
+    weights = str(saved(config, initial, tmp_path / "initial")) if initial else None
+    with pytest.raises(ConfigError, match="a pose network that was trained before, and there is none"):
+        train(config.model_copy(update={"initial_weights": weights}), tmp_path / "run", device="cpu")
+
+
 @pytest.mark.parametrize(
     ("networks", "steps"),
     [
@@ -320,11 +376,11 @@ def test_best_depth_and_best_pose_are_kept_apart(
 ) -> None:
     scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, 0.4] if networks != "pose" else [0.3] * 4)
     scripted_validation(monkeypatch, "snippet_ate", [0.05, math.nan, 0.01, 0.02])
-    (recording,) = discover(world)
-    ManyViewTeacher(tmp_path / "measured", (32, 64), 2).drive(recording).keep_poses(np.stack([np.eye(4)] * 10))
-    teacher: dict[str, Any] = {"views": "many", "rotation_weight": 1.0, "cache": tmp_path / "measured"}
+    teacher = poses_measured(world, tmp_path) if networks == "pose" else {}
     training = {"validate_every": 1, "networks": networks}
-    config = configure(small, [world, held_out], training=training, teacher=teacher if networks == "pose" else {})
+    config = configure(small, [world, held_out], training=training, teacher=teacher)
+    if networks == "depth":
+        config = config.model_copy(update={"initial_weights": str(saved(config, "both", tmp_path / "initial"))})
     output = train(config, tmp_path / "run", device="cpu")
     written = [name for name in (".", "best_pose", "last") if (output / name / "model.yaml").exists()]
     assert {name: load_model(output / name).record.step for name in written} == steps

@@ -249,6 +249,16 @@ def test_every_second_image_keeps_its_number(run: RunFolder, album: Path, tmp_pa
         image_numbers(album, "0:6")
 
 
+def test_photos_are_no_recording_whose_numbers_have_gaps(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name, photo in {"10": "0010", "25": "0011", "40": "0012", "50": "0250"}.items():
+        (album / f"{name}.png").rename(photos / f"IMG_{photo}.png")
+    half_width = places().intrinsics.width / 2 / places().intrinsics.fx
+    camera = Path(f"fov={2 * np.rad2deg(np.arctan(half_width))}")
+    assert [each.T_world_camera is not None for each in localise(photos, run, camera)] == [True, True, True, False]
+
+
 def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp_path: Path) -> None:
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
     with pytest.raises(RunError, match=r"has 4 poses and .* 5 images: give each image a row"):

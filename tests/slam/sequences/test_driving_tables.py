@@ -121,6 +121,7 @@ def log(tmp_path: Path, images) -> Path:
     )
     sweep = {axis: np.array([value, value + 1], np.float16) for axis, value in zip("xyz", (1, 3, 5), strict=True)}
     write(f"sensors/lidar/{FIRST_NS + 110_000_000}.feather", **sweep)
+    write(f"sensors/lidar/{FIRST_NS + 120_000_000}.feather", x=[0.0], y=[0.0], z=[0.0])  # farther from the image
     return root
 
 

@@ -90,7 +90,12 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
 ) -> None:
     given = tmp_path / "mine.yaml"
     given.write_text(camera_yaml)
+    sensor = flight / "cam0/sensor.yaml"
+    sensor.write_text(SENSOR.replace("radial-tangential", "omni"))  # a lens that is not known
     assert open_sequence(flight, camera=given).intrinsics.fx == 30
+    sensor.unlink()
+    assert open_sequence(flight, camera=given).intrinsics.fx == 30
+    sensor.write_text(SENSOR)
     (flight.parent / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.2\n")
     sequence = open_sequence(flight)
     assert sequence.camera_height_m == 1.2 and sequence.intrinsics.fx != 30
@@ -112,6 +117,7 @@ def test_damage(flight: Path, name: str, old: str, new: str, message: str) -> No
     path = flight / "cam0" / name
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new, 1))
+    write_truth(flight, 0, FRAMES)
     with pytest.raises(SequenceError, match=message) as caught:
         open_sequence(flight)
     assert "\n" not in str(caught.value)

@@ -30,7 +30,20 @@ def test_a_missing_number_is_a_missing_frame(tmp_path: Path, images) -> None:
         files.read(3)
 
 
-def test_the_first_image_must_be_readable(tmp_path: Path) -> None:
+def test_the_first_readable_image_gives_the_size(tmp_path: Path, images) -> None:
+    images(tmp_path, ["0.png", "1.png"])
+    images(tmp_path, ["2.png"], width=41)
     (tmp_path / "0.png").write_bytes(b"")
+    files = ImageFiles(by_name(list_images(tmp_path)))
+    assert (files.width, files.height, len(files)) == (40, 24, 3)
+    with pytest.raises(DataError, match=r"0\.png is empty"):
+        files.read(0)
+    with pytest.raises(SequenceError, match=r"2\.png is 41x24, but 1\.png is 40x24"):
+        files.read(2)
+
+
+def test_one_image_must_be_readable(tmp_path: Path) -> None:
+    for name in ("0.png", "1.png"):
+        (tmp_path / name).write_bytes(b"")
     with pytest.raises(DataError, match=r"0\.png is empty"):
         ImageFiles(by_name(list_images(tmp_path)))

@@ -72,7 +72,9 @@ def test_scannet(scene: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert sequence.stamps == pytest.approx(np.array([20, 30, 40, 50]) / 30)
     assert sequence.reference is None and "frames 2:4 have one each" in caplog.text
     assert sequence.true_depth_frames() == [2] and sequence.true_depth(2)[0, 0] == 2.5
-    part = open_sequence(scene, frames="2:4").reference
+    (scene / "intrinsic/intrinsic_color.txt").write_text("unknown")
+    assert open_sequence(scene, camera=Path("fov=90")).intrinsics.fx == pytest.approx(20)
+    part = open_sequence(scene, camera=Path("fov=90"), frames="2:4").reference
     assert part is not None and part[1, :3, 3] == pytest.approx([-10, 0, 0])
 
 

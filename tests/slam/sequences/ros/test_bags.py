@@ -157,19 +157,20 @@ def test_true_poses_and_scans_come_with_their_static_transforms(new_bag: NewBag,
         bag.make("sensor_msgs/msg/PointField", name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")
     ]
     points = np.array([[1, 2, 3, 0], [np.nan, 0, 0, 0], [4, 5, 6, 0]], np.float32)
-    cloud = bag.make(
-        "sensor_msgs/msg/PointCloud2",
-        header=bag.header(FIRST_NS + 2 * STEP_NS + 9_000_000, "lidar"),
-        height=1,
-        width=3,
-        fields=fields,
-        is_bigendian=False,
-        point_step=16,
-        row_step=48,
-        data=points.view(np.uint8).ravel(),
-        is_dense=False,
-    )
-    bag.write("/points", FIRST_NS + 3 * STEP_NS, cloud)
+    for late_ns, shift in ((9_000_000, 0), (24_000_000, 7)):  # the second is farther from the image
+        cloud = bag.make(
+            "sensor_msgs/msg/PointCloud2",
+            header=bag.header(FIRST_NS + 2 * STEP_NS + late_ns, "lidar"),
+            height=1,
+            width=3,
+            fields=fields,
+            is_bigendian=False,
+            point_step=16,
+            row_step=48,
+            data=(points + shift).view(np.uint8).ravel(),
+            is_dense=False,
+        )
+        bag.write("/points", FIRST_NS + 3 * STEP_NS + late_ns, cloud)
     sequence = open_sequence(bag.close())
     assert sequence.reference is not None
     assert sequence.reference[:, :3, 3] == pytest.approx(np.outer(np.arange(FRAMES), [0, 0, 1]), abs=1e-9)
@@ -187,9 +188,7 @@ def test_truth_of_an_unknown_mount_is_not_used(new_bag: NewBag, caplog: pytest.L
     assert "/vicon/rig is not used: no static transform from its 'rig' to the camera's 'camera'" in caplog.text
 
 
-def test_frames_without_a_name_are_not_taken_for_the_camera(
-    new_bag: NewBag, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_without_a_name_are_not_taken_for_the_camera(new_bag: NewBag, caplog: pytest.LogCaptureFixture) -> None:
     bag = new_bag()
     bag.camera_frame = ""
     drive(bag)

@@ -20,7 +20,8 @@ from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
 _TWELVE_BITS = 4096
 _NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
@@ -151,7 +152,7 @@ def _require_complete(data: bytes, where: str) -> None:
 
 
 def _require_sixteen_bits(values: NDArray[Any], where: str) -> None:
-    most = int(values.max())
+    most = int(np.atleast_3d(values)[..., :3].max())  # alpha is full where values are dark
     if 0 < most < _TWELVE_BITS:
         raise DataError(
             f"{where} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
@@ -162,10 +163,20 @@ def _require_sixteen_bits(values: NDArray[Any], where: str) -> None:
 def _is_complete(data: bytes) -> bool:
     """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey."""
     if data.startswith(_JPEG_START):
-        return data.rfind(_JPEG_END) > data.rfind(_JPEG_SCAN)
+        return _jpeg_is_complete(data)
     if data.startswith(_PNG_START):
         return data.rfind(_PNG_END) > 0
     return True
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether its segments lead to the end marker; phones put a video behind that, with bytes of any value."""
+    place = len(_JPEG_START)
+    while found := _JPEG_SEGMENT.search(data, place):
+        if found[0] == _JPEG_END:
+            return True
+        place = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    return False
 
 
 def _decode(where: str, data: bytes, flags: int) -> NDArray[Any]:

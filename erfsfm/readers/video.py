@@ -139,8 +139,9 @@ def _packet_times(path: Path) -> NDArray[np.float64]:
 
 
 def list_videos(folder: Path) -> list[Path]:
-    """The video files directly in a folder."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and p.is_file())
+    """The video files directly in a folder, without hidden ones."""
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
 
 
 def _capture(path: Path) -> cv2.VideoCapture:

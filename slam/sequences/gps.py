@@ -45,7 +45,9 @@ def read_gps(path: Path) -> GpsTrack:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
     if not len(table):
-        raise SequenceError(f"{path} holds no GPS fix: CSV with a header {','.join(_COLUMNS)}, or NMEA is read")
+        raise SequenceError(
+            f"{path} holds no GPS fix with an altitude: CSV with a header {','.join(_COLUMNS)}, or NMEA is read"
+        )
     stamps = table[:, 0]
     if (np.diff(stamps) <= 0).any():
         row = int(np.argmax(np.diff(stamps) <= 0)) + 2
@@ -85,19 +87,20 @@ def _csv_rows(lines: list[str], path: Path) -> list[list[float]]:
 
 
 def _nmea_rows(lines: Iterable[str], path: Path) -> list[list[float]]:
-    """The same of GGA sentences with a fix; each receiver repeats a fix at most once a stamp."""
+    """The same of GGA sentences with a fix and its altitude; each receiver repeats a fix at most once a stamp."""
     rows: list[list[float]] = []
     midnight: float | None = None
     for number, line in enumerate(lines, start=1):
         words = _sentence(line)
         kind = words[0][-3:]
         try:
-            if kind == "RMC" and len(words) > 9 and words[9]:
+            if kind == "RMC" and len(words) > 9 and words[1] and words[9]:
                 day = datetime.strptime(words[9], "%d%m%y").replace(tzinfo=UTC).timestamp()
-                if midnight is None:
-                    rows = [[row[0] + day, *row[1:]] for row in rows]
+                if midnight is None and rows:
+                    first = day + _DAY_S * round((_seconds(words[1]) - rows[-1][0]) / _DAY_S)
+                    rows = [[row[0] + first, *row[1:]] for row in rows]
                 midnight = day
-            if kind != "GGA" or len(words) < 10 or words[6] in ("", "0"):
+            if kind != "GGA" or len(words) < 10 or words[6] in ("", "0") or not words[9]:
                 continue
             stamp = (midnight or 0.0) + _seconds(words[1])
             if rows and stamp < rows[-1][0] - _DAY_S / 2:

@@ -32,18 +32,20 @@ def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: typ
     assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
 
 
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", [1, 3, 4])
 def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> None:
     path = tmp_path / "a.png"
     values = np.random.default_rng(0).integers(0, 4000, (24, 32, channels)).astype(np.uint16)
     values[0, 0] = 3999
+    values[..., 3:] = 65535  # opaque
     cv2.imwrite(str(path), values)
     with pytest.raises(DataError, match=r"a\.png has 16 bits, but no value above 3999: it looks like 12-bit") as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
-    cv2.imwrite(str(path), values * 16)
+    cv2.imwrite(str(path), np.concatenate([16 * values[..., :3], values[..., 3:]], axis=2))
     assert read_image(path).mean() > 100
-    cv2.imwrite(str(path), np.zeros_like(values))
+    values[..., :3] = 0
+    cv2.imwrite(str(path), values)
     assert read_image(path).max() == 0, "a black image is accepted"
 
 
@@ -72,6 +74,18 @@ def test_an_interrupted_preallocated_copy(tmp_path: Path) -> None:
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(DataError, match="truncated"):
+        read_image(path)
+
+
+def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
+    """As phones write motion photos; its bytes may look like markers."""
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.full((60, 80, 3), 90, np.uint8))
+    photo, clip = path.read_bytes(), b"....ftypmp42\xff\xd9..\xff\xda.."
+    path.write_bytes(photo + clip)
+    assert abs(int(read_image(path)[30, 40, 0]) - 90) <= 1
+    path.write_bytes(photo[:-20] + clip.replace(b"\xff\xd9", b""))
     with pytest.raises(DataError, match="truncated"):
         read_image(path)
 

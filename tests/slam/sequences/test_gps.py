@@ -39,6 +39,17 @@ def test_nmea_with_its_date_and_without_fixes_that_are_none(tmp_path: Path) -> N
     np.testing.assert_array_equal(track.dilution, [0.9, 1.8])
 
 
+def test_nmea_around_midnight_before_the_date_is_known_and_without_an_altitude(tmp_path: Path) -> None:
+    fix = "$GPGGA,{},4807.038,N,01131.000,E,1,08,0.9,{},M,46.9,M,,\n"
+    date = "$GPRMC,{},A,4807.038,N,01131.000,E,022.4,084.4,{},003.1,W\n"
+    eve, day = 1795478398.0, "241126"  # 2026-11-23 23:59:58 UTC, and the day after
+    before = fix.format("235958", 545.4) + fix.format("235959", "")
+    late = read_gps(written(tmp_path, before + date.format("000000", day) + fix.format("000000", 545.4)))
+    np.testing.assert_array_equal(late.stamps, [eve, eve + 2])
+    later = read_gps(written(tmp_path, before + fix.format("000001", 545.4) + date.format("000001", day)))
+    np.testing.assert_array_equal(later.stamps, [eve, eve + 3])
+
+
 def test_a_wrong_checksum_is_left_out(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="holds no GPS fix"):
         read_gps(written(tmp_path, NMEA.splitlines()[0].replace("*47", "*48")))

@@ -33,6 +33,7 @@ def camera_64(camera_yaml: str) -> str:
 def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
     path = write_video(tmp_path / "trip" / "drive.avi")
     (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
+    (tmp_path / "trip" / "._drive.avi").write_bytes(b"what macOS keeps beside a file")
     sequence = open_sequence(tmp_path / "trip" if by_folder else path, None, None, "10:20")
     assert (sequence.name, len(sequence)) == ("drive", 10)
     assert [bool(sequence.frame(k).image.mean() > 200) for k in range(1, 4)] == [False, True, False]

@@ -122,7 +122,9 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
         "out",
     ]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = subprocess.run([sys.executable, "-m", "slam", *words, "out"], cwd=here, env=env, capture_output=True, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-m", "slam", *words, "out"], cwd=here, env=env, capture_output=True, check=False
+    )
     assert ended.returncode == 0, ended.stdout.decode() + ended.stderr.decode()
     assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()
     with (here / "out" / "drives.csv").open() as file:

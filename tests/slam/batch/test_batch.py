@@ -109,21 +109,10 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     quick = "mapping: {enabled: false}\ngeometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
     (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
     (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
-    words = [
-        "batch",
-        "../data/root",
-        "--weights",
-        "mine",
-        "--config",
-        "mine.yaml",
-        "--frames",
-        "0:6",
-        "--output",
-        "out",
-    ]
+    words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
     env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     ended = subprocess.run(
-        [sys.executable, "-m", "slam", *words, "out"], cwd=here, env=env, capture_output=True, check=False
+        [sys.executable, "-m", "slam", *words, "--output", "out"], cwd=here, env=env, capture_output=True, check=False
     )
     assert ended.returncode == 0, ended.stdout.decode() + ended.stderr.decode()
     assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()

@@ -62,7 +62,7 @@ class DataConfig(Section):
     )
     exclude: list[str] = Field(
         default_factory=lambda: ["kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"],
-        description="recordings never trained on, also where a KITTI raw drive holds the same frames",
+        description="recordings or frames never trained on, also where a KITTI raw drive holds the same frames",
     )
     validation: list[str] = Field(
         default_factory=lambda: ["simulated/500-599"],

@@ -22,7 +22,6 @@ from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, training_sample
 from erfsfm.data.split_file import Split, read_split_file
-from erfsfm.data.splits import overlapping
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
 from erfsfm.errors import DataError
@@ -170,11 +169,12 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if not config.roots:
         raise DataError("no data to train on: name data sets with --dataset ROOT or data.roots")
     split = read_split_file(config.split) if config.split else Split()
-    scenes = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
+    left_out = read_split_file(config.leave_out).test_recordings if config.leave_out != "none" else []
+    scenes = [FrameRange.parse(name) for name in left_out]
     ranges = [FrameRange.parse(f"{key}[{span}]") for key, span in config.ranges.items()]
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
-    never = [*config.exclude, *split.test_recordings]
+    never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
     found = [recording for root in config.roots for recording in discover(root)]
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):
@@ -185,10 +185,9 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     validation: list[Recording] = []
     for recording in found:
         validation += _parts(recording, held_out)
-        forbidden = [*never, *scenes] if recording.name.startswith("kitti_raw/") else never
+        forbidden = [*held_out, *never, *(scenes if recording.name.startswith("kitti_raw/") else [])]
         for part in _chosen(recording, ranges, listed):
-            if not overlapping([part.frames_name], forbidden):
-                training += _rest(part, held_out)
+            training += _rest(part, forbidden)
     if not training:
         names = _some([recording.name for recording in found])
         raise DataError(

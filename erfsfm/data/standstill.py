@@ -1,10 +1,12 @@
 """Detection of frames in which the car stands still; there only traffic moves, which gives a wrong depth.
 
-By the speed of the GPS/IMU, or by image differences where there is none.
+By the speed of the GPS/IMU, or by image differences where there is none. A packet or an image that cannot be read is
+taken for one of a moving car.
 """
 
 from __future__ import annotations
 
+import logging
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.data.recordings import Recording
+from erfsfm.errors import DataError
 from erfsfm.readers.kitti_oxts import velocity
+
+logger = logging.getLogger(__name__)
 
 STILL_M_S = 0.5  # 5 cm a frame
 STILL_LEVELS = 1.5  # of 255; five real drives at 2.4 m/s and more never changed by less than 2
@@ -36,24 +41,42 @@ def _still(recording: Recording) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1)
 def _speeds(oxts: Path, start: int, frames: int) -> NDArray[np.float64]:
-    """``(N,)`` in m/s; the cameras of a drive share them."""
-    return np.array([np.linalg.norm(velocity(oxts, start + index)) for index in range(frames)])
+    """``(N,)`` in m/s, NaN where unknown; the cameras of a drive share them.
+
+    Raises:
+        DataError: no packet can be read.
+    """
+    speeds = np.full(frames, np.nan)
+    reasons = []
+    for index in range(frames):
+        try:
+            speeds[index] = np.linalg.norm(velocity(oxts, start + index))
+        except DataError as error:
+            reasons.append(str(error))
+    if len(reasons) == frames:
+        raise DataError(reasons[0])
+    if reasons:
+        logger.warning("%d of %d frames have no speed and are kept: %s", len(reasons), frames, reasons[0])
+    return speeds
 
 
 def _unchanged(recording: Recording) -> NDArray[np.bool_]:
-    """Whether an image hardly differs from the frame before, by its median absolute change of grey level, ``(N,)``.
+    """Whether an image hardly differs from the last before it, by its median absolute change of grey level, ``(N,)``.
 
     The median is robust to traffic. The median change itself is subtracted first, as a change of exposure. The first
     frame has the result of the second.
     """
     columns, rows = _SMALL
-    changes = []
+    changes = np.full(len(recording), np.nan)
     previous: NDArray[np.float32] | None = None
     for index in range(len(recording)):
-        image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        try:
+            image = cv2.cvtColor(recording.image(index, rows, columns), cv2.COLOR_RGB2GRAY).astype(np.float32)
+        except DataError:
+            continue  # whoever reads the snippets names it
         if previous is not None:
             change = image - previous
-            changes.append(np.median(np.abs(change - np.median(change))))
+            changes[index] = np.median(np.abs(change - np.median(change)))
         previous = image
-    steps = np.array(changes[:1] + changes)
-    return steps < STILL_LEVELS if len(steps) else np.zeros(len(recording), dtype=np.bool_)
+    changes[0] = changes[min(1, len(changes) - 1)]
+    return changes < STILL_LEVELS

@@ -30,10 +30,16 @@ class VideoFrames:
     A seek in compressed video may land on another frame, so its time is checked against the time recorded
     for the wanted frame; where they differ, the video is decoded again from its start. The last
     frames stay in memory. Not for use from several threads.
+
+    One pass over the file tells how many frames there are and when each is shown: it is decoded, or, where it is long,
+    its packets are read by PyAV, an optional extra. Without PyAV a long video has the frames that it announces.
+
+    Attributes:
+        fps: frames a second by their times, else as announced; None where the file does not say.
     """
 
     def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
-        """Open a video; one that announces no more than ``counted_frames`` is decoded once to count them.
+        """Open a video; one that announces more than ``counted_frames`` is long.
 
         Raises:
             DataError: it cannot be decoded.
@@ -43,12 +49,19 @@ class VideoFrames:
         self._times_ms: list[float] = []
         self._capture = _capture(path)
         announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self._frames = announced if announced > counted_frames else self._count()
+        shown_s = _packet_times(path) if announced > counted_frames else self._decoded_times()
+        self._frames = announced if shown_s is None else len(shown_s)
         if self._frames <= 0:
             raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
         if 0 < announced != self._frames:
-            logger.warning("video %s announces %d frames and has %d: it may be cut off", path, announced, self._frames)
-        self.fps = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
+            logger.warning(
+                "video %s announces %d frames and has %d: it may be cut off, or of an uneven rate",
+                path,
+                announced,
+                self._frames,
+            )
+        self._shown_s = None if shown_s is None or (np.diff(shown_s) <= 0).any() else shown_s
+        self.fps = self._rate() or float(self._capture.get(cv2.CAP_PROP_FPS)) or None
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
         self.height, self.width = self._cached(0).shape[:2]
 
@@ -65,21 +78,25 @@ class VideoFrames:
         return self._cached(index).copy()
 
     def times_s(self) -> NDArray[np.float64] | None:
-        """When each frame is shown, seconds ``(N,)``; None where the file does not say.
+        """When each frame is shown, seconds ``(N,)``; None, with a warning, where that is not known."""
+        if self._shown_s is None:
+            logger.warning(
+                "video %s has frame times that do not increase, or it is long and PyAV is missing (pip install "
+                "'erfsfm-slam[video]'); its frames are taken as even",
+                self._path,
+            )
+        return self._shown_s
 
-        Of a long video, which was not decoded to count its frames, the packets are read by PyAV, an optional extra.
+    def _rate(self) -> float | None:
+        """Frames a second by their times."""
+        if self._shown_s is None or len(self._shown_s) < 2:
+            return None
+        return (len(self._shown_s) - 1) / float(self._shown_s[-1] - self._shown_s[0])
 
-        Raises:
-            DataError: the video is long and PyAV is not installed.
-        """
-        is_counted = len(self._times_ms) == self._frames
-        times = np.array(self._times_ms) / 1000 if is_counted else _packet_times(self._path)
-        return times if len(times) == self._frames and (np.diff(times) > 0).all() else None
-
-    def _count(self) -> int:
+    def _decoded_times(self) -> NDArray[np.float64]:
         while self._grab():
             pass
-        return self._next
+        return np.array(self._times_ms) / 1000
 
     def _decode(self, index: int) -> Image:
         ahead = index - self._next
@@ -121,18 +138,17 @@ class VideoFrames:
         self._capture, self._next = _capture(self._path), 0
 
 
-def _packet_times(path: Path) -> NDArray[np.float64]:
-    """Of the first video stream, in the order of time, without decoding."""
+def _packet_times(path: Path) -> NDArray[np.float64] | None:
+    """Of the frames shown of the first video stream, in the order of time, without decoding; None without PyAV."""
     try:
         av = importlib.import_module("av")
-    except ImportError as error:
-        raise DataError(
-            f"the frame times of {path} need PyAV, for it is long ({error}): pip install 'erfsfm-slam[video]'"
-        ) from error
+    except ImportError:
+        return None
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
-            shown = sorted(packet.pts for packet in container.demux(stream) if packet.pts is not None)
+            packets = (packet for packet in container.demux(stream) if not packet.is_discard)  # trimmed on a phone
+            shown = sorted(packet.pts for packet in packets if packet.pts is not None)
             return np.array(shown, dtype=np.float64) * float(stream.time_base)
     except (av.error.FFmpegError, IndexError, TypeError) as error:
         raise DataError(f"video {path} cannot be read: {error}; copy it again") from error

@@ -307,10 +307,10 @@ class SlamPipeline:
             if mode not in ("reference", "known", "gps"):
                 return scale
             T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)
-            return scale.in_unit_of(self._unit(mode, T_odometry))
+            return scale.in_metres(self._unit(mode, T_odometry))
 
     def _unit(self, mode: ScaleMode, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
-        """Metres per unit of an odometry, by what the mode knows of the drive; a failure is logged."""
+        """Metres per unit of an odometry, by what the mode knows of the drive."""
         sequence, config = self._sequence, self._config.scale
         unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
         positioning = self._positioning(mode)
@@ -320,8 +320,6 @@ class SlamPipeline:
             unit = scale_from_distance(T_odometry, sequence.stamps, config)
         elif positioning is not None:
             unit = positioning.scale(T_odometry)
-        if isinstance(unit, MeasurementFailure):
-            logger.warning("no scale (%s): lengths stay in camera heights", unit.reason)
         return unit
 
     def _factors(self, unscaled: Unscaled, scale: Scale, by_lidar: Sequence[RelativePose]) -> list[RelativePose]:

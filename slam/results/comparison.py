@@ -82,7 +82,10 @@ def failure(metrics: Mapping[str, Any]) -> str:
 
 def unit_of_lengths(metrics: Mapping[str, Any]) -> str:
     """``metres``, ``camera heights``, or ``the networks' own unit`` where no road was found."""
-    mode, value = (lookup(metrics, "scale", key)[0] for key in ("mode", "value"))
+    mode, value, unit = (lookup(metrics, "scale", key)[0] for key in ("mode", "value", "unit"))
+    if unit is not None:
+        return str(unit)
+    # a run of before the unit was recorded
     if value is None and mode in ("none", "camera-height", "lidar"):
         return "the networks' own unit"
     if mode == "none" or (value is None and mode is not None):

@@ -149,15 +149,11 @@ def _network_snippets(result: SlamResult) -> SnippetErrors | None:
 
 
 def _scale(result: SlamResult) -> dict[str, Any]:
-    estimate = result.scale.estimate
+    scale, estimate = result.scale, result.scale.estimate
+    named = {"mode": scale.mode, "unit": scale.unit}
     if isinstance(estimate, MeasurementFailure):
-        return {"mode": result.scale.mode, **null("value", estimate.reason)}
-    return {
-        "mode": result.scale.mode,
-        "value": estimate.value,
-        "spread": estimate.spread,
-        "frames_used": estimate.frames_used,
-    }
+        return named | null("value", estimate.reason)
+    return named | {"value": estimate.value, "spread": estimate.spread, "frames_used": estimate.frames_used}
 
 
 def _graph(result: SlamResult) -> dict[str, Any]:

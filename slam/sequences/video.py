@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.errors import DataError
 from erfsfm.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
@@ -23,7 +22,7 @@ _RATE_TOLERANCE = 0.1
 
 
 def open_video(path: Path, asked: Path | None) -> RecordedSequence:
-    """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own uneven frame times.
+    """Open a video, turned as its rotation flag says, at the camera's frame rate or at its own frame times.
 
     Raises:
         DataError: if it cannot be decoded.
@@ -31,46 +30,36 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     """
     folder = path.absolute().parent
     frames = VideoFrames(path)
-    times_s = _times(frames, path)
-    own_fps = None if times_s is None else (len(times_s) - 1) / float(times_s[-1] - times_s[0])
-    camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=own_fps)
+    camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
     images, intrinsics = calibrated(frames, camera, str(path))
     return RecordedSequence(
         name=path.stem,
         images=images,
         intrinsics=intrinsics,
-        stamps=_stamps(path, times_s, len(frames), camera.fps),
+        stamps=_stamps(path, frames, camera.fps),
         sources=(Source(f"folder/{folder.name}"),),
         camera_height_m=camera.height_or(None),
     )
 
 
-def _times(frames: VideoFrames, path: Path) -> FloatArray | None:
-    """The video's own frame times; None, with a warning, where they cannot be read."""
-    if len(frames) == 1:
-        return None
-    try:
-        return frames.times_s()
-    except DataError as error:
-        logger.warning("%s; its frames are taken as even", error)
-        return None
-
-
-def _stamps(path: Path, times_s: FloatArray | None, frames: int, fps: float) -> FloatArray:
-    """Even stamps at the camera's rate; uneven times as they are, where that rate is not another one."""
-    even = uniform_stamps(frames, fps)
+def _stamps(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
+    """The video's own frame times; at the camera's rate where those agree, are of another rate or unknown."""
+    even, times_s = uniform_stamps(len(frames), fps), frames.times_s()
+    if frames.fps is not None and abs(frames.fps / fps - 1) > _RATE_TOLERANCE:
+        logger.warning(
+            "%s has %.4g frames a second, the camera has %g: taken as even at the camera's rate; correct fps, unless "
+            "the video plays faster or slower than it was taken",
+            path,
+            frames.fps,
+            fps,
+        )
+        return even
     if times_s is None:
         return even
     shown: FloatArray = times_s - times_s[0]
-    own_fps = (frames - 1) / float(shown[-1])
-    if np.abs(shown - uniform_stamps(frames, own_fps)).max() * own_fps < _UNEVEN:
+    if np.abs(shown - even).max() * fps < _UNEVEN:
         return even
-    if abs(own_fps / fps - 1) > _RATE_TOLERANCE:
-        logger.warning(
-            "%s has uneven frame times at %.4g frames a second, the camera has %g: taken as even", path, own_fps, fps
-        )
-        return even
-    logger.info("%s has uneven frame times, %.4g frames a second: used as they are", path, own_fps)
+    logger.info("%s has %.6g frames a second: its own frame times are used", path, frames.fps)
     return shown
 
 

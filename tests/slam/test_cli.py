@@ -227,7 +227,7 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
     assert (code, err) == (0, "")
     for name in ("network", "odometry", "optimised"):
         assert re.search(rf"^\s*{name}\s+[\d.]+", out, re.MULTILINE)
-    assert "sim, scale none" in out and "camera heights" in out
+    assert "sim, scale none" in out and "networks' own unit" in out
     assert "none, untrained" in out and "LEAK" not in out
     assert "6 frames in" in out and "my run" in out and "report.html" not in out
     metrics = RunFolder.open(Path("my run")).metrics()

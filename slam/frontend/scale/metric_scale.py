@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from slam.frontend.step_table import links
 from slam.frontend.visual.motion import Motion
 from slam.robust import mad_sigma
 from slam.se3 import FloatArray
+
+LengthUnit = Literal["metres", "camera heights", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
@@ -38,35 +41,36 @@ class StepLength:
 
 @dataclass(frozen=True)
 class Scale:
-    """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in the mode's unit.
+    """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in ``unit``.
 
     ``lengths`` are those of the steps measured without learned depth, unscaled: times ``per_frame`` at a step's first
-    frame they are in the mode's unit.
+    frame they are in ``unit``. ``estimate`` is that of the mode's unit, or why there is none.
     """
 
     mode: ScaleMode
     estimate: ScaleEstimate | MeasurementFailure
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
+    unit: LengthUnit
 
     @property
     def is_metric(self) -> bool:
         """Whether lengths are metres."""
-        return self.mode != "none" and not isinstance(self.estimate, MeasurementFailure)
+        return self.unit == "metres"
 
     @property
     def unit_name(self) -> str | None:
-        """``m``, with mode none ``camera heights`` or, where none was found, that of the networks; else None."""
-        if self.mode == "none":
-            return "the networks' own unit" if isinstance(self.estimate, MeasurementFailure) else "camera heights"
-        return "m" if self.is_metric else None
+        """``m``, with mode none ``unit``; None where metres were not found."""
+        return "m" if self.is_metric else self.unit if self.mode == "none" else None
 
-    def in_unit_of(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
-        """The same times an estimate in this unit; unchanged where that failed."""
+    def in_metres(self, other: ScaleEstimate | MeasurementFailure) -> Scale:
+        """In metres, by those per unit of this scale; where they were not found the unit stays."""
         if isinstance(other, MeasurementFailure):
+            logger.warning("no scale (%s): lengths stay in %s", other.reason, self.unit)
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
-        return replace(self, estimate=replace(other, value=float(np.median(per_frame))), per_frame=per_frame)
+        estimate = replace(other, value=float(np.median(per_frame)))
+        return replace(self, estimate=estimate, per_frame=per_frame, unit="metres")
 
     def unit_at(self, measured: RelativePose) -> float:
         """The mode's unit per unscaled length at the first frame of a measurement."""
@@ -119,15 +123,18 @@ def find_scale(
     misfit = np.abs(evidence.absolute - np.log(solved.length))
     used = int(np.isfinite(misfit).sum())
     estimate = by_planes
+    is_metric = height is not None or (mode == "lidar" and len(metres) > 0)
+    named: LengthUnit = "metres" if is_metric else "camera heights"
     if used >= MIN_FRAMES:
         spread = mad_sigma(misfit[np.isfinite(misfit)])
         estimate = ScaleEstimate(float(np.median(per_frame)), spread, used)
     elif isinstance(by_planes, MeasurementFailure):
-        logger.warning("no scale (%s): lengths stay in the networks' own unit", by_planes.reason)
-    if mode == "lidar" and height is None and not metres:
+        named = "the networks' own unit"
+        logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
+    if mode == "lidar" and not is_metric:
         estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
-        logger.warning("no metres (%s)", estimate.reason)
-    return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame))
+        logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)
+    return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame), named)
 
 
 def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: FloatArray) -> dict[Ends, StepLength]:

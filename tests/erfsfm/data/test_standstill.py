@@ -41,14 +41,17 @@ def test_parts_of_parts_keep_their_numbers(tmp_path: Path, write_raw: WriteDrive
     assert names == [f"{left.name}[1:3]", f"{left.name}[4:6]"]
 
 
-def test_a_missing_packet(tmp_path: Path, write_raw: WriteDrive) -> None:
-    drive = write_raw(tmp_path, speeds=[9, 9, 9])
+def test_missing_packets(tmp_path: Path, write_raw: WriteDrive, caplog: pytest.LogCaptureFixture) -> None:
+    drive = write_raw(tmp_path, speeds=[9, 9, 0, 0, 9])
     (drive / "oxts/data/0000000001.txt").write_text("49.0 8.4\n")
-    with pytest.raises(DataError, match=r"0000000001\.txt has 2 numbers, not 30"):
-        moving_parts(open_drive(drive)[0])
-    (drive / "oxts/data/0000000001.txt").unlink()
-    with pytest.raises(DataError, match=r"0000000001\.txt is missing: the speed"):
-        moving_parts(open_drive(drive)[0])
+    (drive / "oxts/data/0000000004.txt").unlink()
+    assert spans(open_drive(drive)[0]) == [(0, 2), (4, 5)], "their frames are kept"
+    assert "2 of 5 frames have no speed and are kept" in caplog.text
+    assert "0000000001.txt has 2 numbers, not 30" in caplog.text
+    for packet in (drive / "oxts/data").iterdir():
+        packet.unlink()
+    with pytest.raises(DataError, match=r"0000000000\.txt is missing: the speed"):
+        moving_parts(open_drive(drive)[0].part(0, 4))
 
 
 def street(shift: int, traffic: int, gain: float, rng: np.random.Generator) -> np.ndarray:
@@ -77,6 +80,21 @@ def test_by_images_where_there_is_no_speed(tmp_path: Path, write_raw: WriteDrive
 def test_one_frame_alone(tmp_path: Path, write_raw: WriteDrive) -> None:
     left, _ = open_drive(write_raw(tmp_path, speeds=None, frames=1))
     assert spans(left) == [(0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("broken", "kept"), [(0, [(0, 4), (7, 10)]), (4, [(0, 5), (7, 10)]), (5, [(0, 4), (5, 6), (7, 10)])]
+)
+def test_an_image_that_cannot_be_read_is_passed_over(
+    tmp_path: Path, write_raw: WriteDrive, broken: int, kept: list[tuple[int, int]]
+) -> None:
+    """The next one is compared with the one before it; the car stands in frames 3 to 6."""
+    drive = write_raw(tmp_path, speeds=None, frames=10, size=(64, 208))
+    rng = np.random.default_rng(1)
+    for index, shift in enumerate([0, 4, 8, 12, 12, 12, 12, 16, 20, 24]):
+        cv2.imwrite(str(drive / "image_02/data" / f"{index:010d}.png"), street(shift, 10 * index, 0, rng))
+    (drive / "image_02/data" / f"{broken:010d}.png").write_bytes(b"broken")
+    assert spans(open_drive(drive)[0]) == kept
 
 
 @pytest.mark.data

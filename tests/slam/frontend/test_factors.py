@@ -59,7 +59,7 @@ def snippets(T: FloatArray) -> list[SnippetPoses]:
 
 def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
     known = {ends: StepLength(value, 0.02, 0.03) for ends, value in (lengths or {}).items()}
-    return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known)
+    return Scale("camera-height", MeasurementFailure("drawn"), np.full(FRAMES, METRES), known, "the networks' own unit")
 
 
 def factors(

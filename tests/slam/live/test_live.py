@@ -99,7 +99,8 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
     request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
     folder = run_live(request, messages.append)
-    assert folder.metrics()["scale"]["value"] is None
+    recorded = folder.metrics()["scale"]
+    assert (recorded["unit"], recorded["value"]) == ("the networks' own unit", None)
     *poses, last = messages
     assert last["unit"] == unit
     starting, known = ("starting", None, False), ("tracking", unit, True)

@@ -9,7 +9,7 @@ import pytest
 from slam.config import MappingConfig, ScaleMode
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.scale.metric_scale import LengthUnit, Scale
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.loops.closure import LoopClosures
 from slam.loops.verification import Loop
@@ -65,15 +65,15 @@ def test_without_a_loop_between_submaps_there_is_a_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "estimate", "is_metric"),
+    ("mode", "estimate", "unit"),
     [
-        ("camera-height", ScaleEstimate(1.0, 0.0, 9), True),
-        ("none", ScaleEstimate(1.0, 0.0, 9), False),
-        ("gps", MeasurementFailure("the track is too short"), False),
+        ("camera-height", ScaleEstimate(1.0, 0.0, 9), "metres"),
+        ("none", ScaleEstimate(1.0, 0.0, 9), "camera heights"),
+        ("gps", MeasurementFailure("the track is too short"), "camera heights"),
     ],
 )
 def test_without_metres_there_are_no_double_walls(
-    tmp_path: Path, mode: ScaleMode, estimate: ScaleEstimate | MeasurementFailure, is_metric: bool
+    tmp_path: Path, mode: ScaleMode, estimate: ScaleEstimate | MeasurementFailure, unit: LengthUnit
 ) -> None:
     closed = passes(0.0)
     result = SimpleNamespace(
@@ -81,10 +81,10 @@ def test_without_metres_there_are_no_double_walls(
         loops=loops((3, PASS + 3)),
         odometry=passes(1.0),
         optimised=closed,
-        scale=Scale(mode, estimate, np.ones(2 * PASS), {}),
+        scale=Scale(mode, estimate, np.ones(2 * PASS), {}, unit),
         stopwatch=Stopwatch(),
     )
     numbers = write_map(RunFolder(tmp_path), result, SimpleNamespace(reference=None))
     for name in ("double_wall_share", "double_wall_share_at_loops"):
-        assert (numbers[name] is not None) == is_metric
-        assert numbers.get(f"{name}_reason") == (None if is_metric else "lengths are not in metres")
+        assert (numbers[name] is not None) == (unit == "metres")
+        assert numbers.get(f"{name}_reason") == (None if unit == "metres" else "lengths are not in metres")

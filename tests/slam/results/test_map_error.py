@@ -12,7 +12,7 @@ import pytest
 from slam.config import ScaleMode
 from slam.errors import SequenceError
 from slam.frames import Intrinsics, Sequence
-from slam.frontend.scale.metric_scale import Scale
+from slam.frontend.scale.metric_scale import LengthUnit, Scale
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.results.map_error import find_truth, map_errors
 from slam.se3 import FloatArray, apply
@@ -53,12 +53,13 @@ def errors(
     points: FloatArray, sequence: Sequence, mode: ScaleMode = "camera-height", scale: float = 1.0
 ) -> dict[str, Any]:
     """Errors of a map in the world of the true poses, all lengths divided by ``scale``."""
+    unit: LengthUnit = "camera heights" if mode == "none" else "metres"
     assert sequence.reference is not None
     T_world_camera = sequence.reference.copy()
     T_world_camera[:, :3, 3] /= scale
     result = SimpleNamespace(
         optimised=SimpleNamespace(T_world_camera=T_world_camera),
-        scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}),
+        scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit),
     )
     return map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)
 

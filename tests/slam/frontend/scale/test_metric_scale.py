@@ -147,7 +147,7 @@ def test_a_step_inside_of_a_longer_one_is_no_link_and_has_no_length():
 
 def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
     scale = find("camera-height", measured())
-    drifting = Scale(scale.mode, scale.estimate, np.arange(1.0, FRAMES + 1), {})
+    drifting = replace(scale, per_frame=np.arange(1.0, FRAMES + 1))
     assert drifting.unit_at(step((4, 7), 1.0, "essential")) == 5.0
     backwards = RelativePose(9, 6, np.eye(4), np.ones(6), "network")
     assert drifting.unit_at(backwards) == 7.0
@@ -155,11 +155,28 @@ def test_the_unit_is_that_of_the_first_frame_of_a_measurement():
 
 def test_a_later_estimate_scales_everything_and_a_failure_nothing():
     scale = find("none", measured())
-    doubled = scale.in_unit_of(ScaleEstimate(2.0, 0.1, 9))
+    doubled = scale.in_metres(ScaleEstimate(2.0, 0.1, 9))
     assert_lengths(doubled, {ends: 2.0 * length for ends, length in lengths(scale).items()}, rtol=1e-12)
     np.testing.assert_allclose(doubled.per_frame, 2.0 * scale.per_frame)
     assert isinstance(doubled.estimate, ScaleEstimate) and doubled.estimate.frames_used == 9
-    refused = scale.in_unit_of(MeasurementFailure("it stands"))
+    refused = scale.in_metres(MeasurementFailure("it stands"))
     assert refused.lengths == scale.lengths
     np.testing.assert_array_equal(refused.per_frame, scale.per_frame)
     assert refused.estimate == MeasurementFailure("it stands")
+
+
+@pytest.mark.parametrize(
+    ("mode", "road", "unit"),
+    [
+        ("camera-height", True, "metres"),
+        ("camera-height", False, "the networks' own unit"),
+        ("none", True, "camera heights"),
+        ("none", False, "the networks' own unit"),
+        ("gps", True, "camera heights"),
+        ("gps", False, "the networks' own unit"),
+    ],
+)
+def test_lengths_have_the_unit_that_was_measured(mode, road, unit):
+    scale = find(mode, measured(road=road, planes=road))
+    assert scale.unit == scale.in_metres(MeasurementFailure("the track is too short")).unit == unit
+    assert scale.in_metres(ScaleEstimate(2.0, 0.1, 9)).unit == "metres"

@@ -15,7 +15,7 @@ from erfsfm.data.video import Video
 from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
 from erfsfm.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.readers.folder import image_folder, recording_name
+from erfsfm.readers.folder import image_folder, recording_name, video_name
 from erfsfm.readers.images import first_size, list_images
 from erfsfm.readers.kitti_calibration import ODOMETRY_CALIBRATION, CalibrationFile
 from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_drives, find_odometry_root
@@ -101,13 +101,12 @@ def _own(root: Path) -> list[Recording]:
     if not (home / CAMERA_FILE).is_file():
         return []
     camera = _camera(home / CAMERA_FILE)
-    name = f"folder/{recording_name(home)}"
     images = [] if is_video else _images(home)
     if images:
         files = by_name(images)
-        return split_at_gaps(Recording(name, files.paths, camera), files)
+        return split_at_gaps(Recording(f"folder/{recording_name(home)}", files.paths, camera), files)
     videos = [Video(file) for file in ([root] if is_video else list_videos(home))]
-    return [Recording(name, (video.path,) * len(video), camera, video) for video in videos]
+    return [Recording(f"folder/{video_name(v.path)}", (v.path,) * len(v), camera, v) for v in videos]
 
 
 def _images(home: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Folders of a user's own images: where in them the images are, and what the recording is called."""
+"""Folders of a user's own images and videos: where in them the images are, and what the recordings are called."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from erfsfm.errors import DataError
 from erfsfm.readers.images import has_images
+from erfsfm.readers.video import list_videos
 
 IMAGE_FOLDERS = ("images", "image_2", "image_02", "image_0", "image_00", "rgb", "data")  # never a name of a drive
 
@@ -29,3 +30,10 @@ def recording_name(folder: Path) -> str:
     """The folder's name, or its parent's where the folder is only called ``images`` or the like."""
     folder = folder.absolute()
     return folder.parent.name if folder.name in IMAGE_FOLDERS and folder.parent.name else folder.name
+
+
+def video_name(video: Path) -> str:
+    """The name of the folder, as `recording_name`; of one of several videos its own name, too: ``my_drive/clip2``."""
+    folder = video.absolute().parent
+    name = recording_name(folder)
+    return f"{name}/{video.stem}" if len(list_videos(folder)) > 1 else name

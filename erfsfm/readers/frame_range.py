@@ -1,8 +1,8 @@
 """Names of recordings and their frames, as the leak record of a checkpoint writes them.
 
 A name is ``kind/recording`` with an optional half-open frame range: ``kitti_odometry/00[0:250]``,
-``kitti_raw/2011_09_26_drive_0013``, ``simulated/17``, ``simulated/0-499``, ``folder/my_drive``. The range is read from
-the right: a folder may have brackets in its own name.
+``kitti_raw/2011_09_26_drive_0013``, ``simulated/17``, ``simulated/0-499``, ``folder/my_drive``, ``folder/clips/clip2``.
+The range is read from the right: a folder may have brackets in its own name.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ class FrameRange:
         return FrameRange(recording, start, stop) if start < stop else None
 
     def covers(self, other: FrameRange) -> bool:
-        """Whether the two share a frame."""
-        same = self.counted_in(other.recording)
+        """Whether the two share a frame; the name of a folder stands for any video in it."""
+        shorter, longer = sorted((self.recording, other.recording), key=len)
+        same = self if longer.startswith(f"{shorter}/") else self.counted_in(other.recording)
         return same is not None and same.start < other.stop and other.start < same.stop
 
     def __str__(self) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from erfsfm.readers.folder import video_name
 from erfsfm.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
@@ -37,7 +38,7 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
         images=images,
         intrinsics=intrinsics,
         stamps=_stamps(path, frames, camera.fps),
-        sources=(Source(f"folder/{folder.name}"),),
+        sources=(Source(f"folder/{video_name(path)}"),),
         camera_height_m=camera.height_or(None),
     )
 

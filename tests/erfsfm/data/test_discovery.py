@@ -186,10 +186,11 @@ def test_video(tmp_path: Path, give: str) -> None:
 
 
 def test_every_video_of_a_folder(tmp_path: Path) -> None:
-    write_camera(tmp_path)
+    write_camera(tmp_path / "trip")
     for name, frames in (("b.avi", 3), ("a.avi", 2)):
-        write_video(tmp_path / name, frames)
-    assert [len(recording) for recording in discover(tmp_path)] == [2, 3]
+        write_video(tmp_path / "trip" / name, frames)
+    found = ["folder/trip/a[0:2]", "folder/trip/b[0:3]"]
+    assert [recording.frames_name for recording in discover(tmp_path / "trip")] == found
 
 
 def test_a_collection_of_roots(tmp_path: Path, write_root: Callable[..., Path]) -> None:

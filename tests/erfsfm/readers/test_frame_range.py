@@ -38,6 +38,14 @@ def test_leaks_of_bracketed_names() -> None:
     assert merge(record) == record
 
 
+def test_leaks_of_videos_in_one_folder() -> None:
+    clips = ["folder/trip/clip1[0:30]", "folder/trip/clip2[0:30]"]
+    assert overlapping(clips, ["folder/trip/clip1[20:40]"]) == clips[:1]
+    assert overlapping(clips, ["folder/trip[20:40]"]) == clips, "of a record that knew the folder alone"
+    assert overlapping(["folder/trip[20:40]"], clips[:1]) == ["folder/trip[20:40]"]
+    assert overlapping(clips, ["folder/trip[30:40]", "folder/tri[0:9]"]) == []
+
+
 @pytest.mark.parametrize("name", ["kitti_odometry/00[a:b]", "kitti_raw/x[1]", "00[nope]"])
 def test_names_of_data_sets_have_no_brackets(name: str) -> None:
     with pytest.raises(ConfigError, match="names no frames"):

@@ -12,6 +12,7 @@ from erfsfm.readers.video import VideoFrames
 from slam.errors import SequenceError
 from slam.sequences import video
 from slam.sequences.catalogue import open_sequence
+from slam.sequences.continued import missing_between
 
 
 def write_video(path: Path) -> Path:
@@ -39,6 +40,17 @@ def test_opens(tmp_path: Path, camera_64: str, by_folder: bool) -> None:
     assert [bool(sequence.frame(k).image.mean() > 200) for k in range(1, 4)] == [False, True, False]
     assert sequence.stamps[0] == pytest.approx(2.0)
     assert sequence.provenance() == ("folder/trip[10:20]",)
+
+
+def test_the_next_clip_of_a_folder_follows(tmp_path: Path, camera_64: str, caplog: pytest.LogCaptureFixture) -> None:
+    """As dash cams write them."""
+    for name in ("clip1", "clip2"):
+        write_video(tmp_path / "trip" / f"{name}.avi")
+    (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
+    first, following = (open_sequence(tmp_path / "trip", name, frames="0:20") for name in ("clip1", "clip2"))
+    assert first.provenance() == ("folder/trip/clip1[0:20]",)
+    assert missing_between(first.provenance(), following.provenance()) == 0
+    assert "folder/trip/clip2[0:20] is assumed to follow folder/trip/clip1[0:20]" in caplog.text
 
 
 def test_errors(tmp_path: Path, camera_64: str, camera_yaml: str) -> None:

@@ -6,6 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any, BinaryIO, Protocol
@@ -15,7 +16,7 @@ import numpy as np
 
 from erfsfm.errors import DataError
 from erfsfm.files import open_written
-from erfsfm.readers.images import IMAGE_SUFFIXES, is_image, natural_key, read_image
+from erfsfm.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Image
 from slam.sequences.camera_file import DEFAULT_FPS
@@ -43,28 +44,23 @@ class FolderSource:
     """A folder that another program fills; image ``k`` in natural order was taken at ``k / fps``."""
 
     def __init__(self, folder: Path, wait_s: float) -> None:
-        """Wait up to ``wait_s`` for the first image.
+        """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
 
         Raises:
-            SequenceError: none came, or it cannot be read.
+            SequenceError: none came.
         """
         self._folder, self.fps = folder, DEFAULT_FPS
         self._past: set[str] = set()
-        deadline = time.monotonic() + wait_s
-        while not (waiting := self._waiting()):
-            if time.monotonic() > deadline:
-                suffixes = ", ".join(IMAGE_SUFFIXES)
-                raise SequenceError(f"no image came to {folder} within {wait_s:g} s: looked for {suffixes}")
-            time.sleep(_POLL_S)
-        first = self._read(waiting[0], deadline)
-        self.height, self.width = first.shape[:2]
+        self.height, self.width = self._first_size(wait_s)
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         """Every usable image, in natural order; one that comes after its successor is left out with a warning."""
         count, last = 0, Path()
         while not stopped.is_set():
             waiting = self._waiting()
-            for path in waiting[:1]:
+            for path in waiting:
+                if stopped.is_set():
+                    return
                 if natural_key(path) < natural_key(last):
                     logger.warning("%s came after %s, before which its name belongs; it is left out", path, last.name)
                 else:
@@ -98,15 +94,29 @@ class FolderSource:
         return sorted(filter(is_image, fresh), key=natural_key)
 
     @sequence_errors()
+    def _first_size(self, wait_s: float) -> tuple[int, int]:
+        deadline = time.monotonic() + wait_s
+        while time.monotonic() < deadline:
+            with suppress(DataError):
+                if waiting := self._waiting():
+                    return first_size(waiting)
+            time.sleep(_POLL_S)
+        if waiting := self._waiting():
+            return first_size(waiting)
+        suffixes = ", ".join(IMAGE_SUFFIXES)
+        raise SequenceError(f"no image came to {self._folder} within {wait_s:g} s: looked for {suffixes}")
+
+    @sequence_errors()
     def _read(self, path: Path, deadline: float) -> Image:
         """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
+        is_written = False
         while True:
-            is_newest = self._waiting()[-1:] == [path]
             try:
                 return read_image(path)
             except DataError:
-                if time.monotonic() > deadline or not is_newest:
+                if time.monotonic() > deadline or is_written:
                     raise
+                is_written = self._waiting()[-1:] != [path]
                 time.sleep(_POLL_S)
 
 

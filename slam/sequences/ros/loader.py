@@ -6,13 +6,14 @@ import functools
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import CameraFile
 from slam.errors import SequenceError
 from slam.frames import Image
@@ -98,18 +99,18 @@ class StampedMessages:
 
 
 class BagImages:
-    """The images of a topic, all of the size of the first. Not for use from several threads."""
+    """The images of a topic, all of the size of the first that can be read. Not for use from several threads."""
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps of all and the first image for its size.
+        """Read the stamps of all and the first readable image for its size.
 
         Raises:
-            SequenceError, DataError: the bag is damaged, or the first image cannot be read.
+            SequenceError, DataError: the bag is damaged, or no image can be read.
         """
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
-        self.height, self.width = self._cached(0).shape[:2]
+        self.height, self.width = self._first().shape[:2]
 
     def __len__(self) -> int:
         """Number of images."""
@@ -126,6 +127,12 @@ class BagImages:
             height, width = image.shape[:2]
             raise SequenceError(f"{self._where} is {width}x{height}, the first is {self.width}x{self.height}")
         return image.copy()
+
+    def _first(self) -> Image:
+        for index in range(len(self)):
+            with suppress(SequenceError, DataError):
+                return self._cached(index)
+        return self._cached(0)
 
     def _decode(self, index: int) -> Image:
         return image_of(self.messages.read(index), self._where)

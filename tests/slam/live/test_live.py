@@ -273,6 +273,15 @@ def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCap
     assert "frame_7.png came after frame_8.png, before which its name belongs; it is left out" in caplog.text
 
 
+def test_a_broken_first_image_is_left_out(street: Path, tmp_path: Path) -> None:
+    (tmp_path / "000000.png").write_bytes(b"damaged")
+    shutil.copy(street / "images" / "000001.png", tmp_path)
+    source, stopped = FolderSource(tmp_path, 5.0), Event()
+    for stamp, image in source.images(stopped):
+        assert (stamp, image.shape) == (0.1, (source.height, source.width, 3))
+        stopped.set()
+
+
 def test_sources_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(SequenceError, match="no image comes from"):
         VideoSource(str(tmp_path / "none.mp4"), 1.0)

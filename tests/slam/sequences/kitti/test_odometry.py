@@ -134,8 +134,9 @@ def broken(folder: Path, base: Path, what: str) -> None:
             (folder / "times.txt").write_text("0\none\n")
         case "equal times":
             (folder / "times.txt").write_text("0\n1\n1\n2\n3\n4\n")
-        case "first image":
-            (folder / "image_2/000000.png").write_bytes(b"")
+        case "every image":
+            for path in (folder / "image_2").iterdir():
+                path.write_bytes(b"")
         case "no images":
             for path in (folder / "image_2").iterdir():
                 path.unlink()
@@ -153,7 +154,7 @@ def broken(folder: Path, base: Path, what: str) -> None:
         ("short times", r"times\.txt has 2 rows for 6 images"),
         ("bad times", r"times\.txt must hold one time"),
         ("equal times", r"times\.txt row 3: stamps must be numbers that increase"),
-        ("first image", r"000000\.png is empty"),
+        ("every image", r"000000\.png is empty"),
         ("no images", "looked for png or jpg in .*image_2"),
     ],
 )

@@ -84,10 +84,12 @@ _graphs: dict[tuple[object, str], _Networks] = {}  # of the last weights in this
 class DepthPosePredictor:
     """Depth of single images and poses of snippets, in one unknown scale.
 
-    ``noise`` is the noise model of the poses if it was measured with these weights, else None.
+    ``noise`` is the noise model of the poses if it was measured with these weights, else None; ``noise_sha256`` is that
+    of its file.
     """
 
     noise: PoseNoise | None = None
+    noise_sha256: str = ""
     pose_sha256: str = ""
     origin: str = "these weights"
 
@@ -123,8 +125,8 @@ class DepthPosePredictor:
                 "%s was measured with other weights and is not used: run erfsfm calibrate-noise again",
                 folder / NOISE_FILE,
             )
-        else:
-            predictor.noise = noise
+        elif noise is not None:
+            predictor.noise, predictor.noise_sha256 = noise, file_sha256(folder / NOISE_FILE)
         return predictor
 
     def freeze(self) -> Self:

@@ -106,6 +106,15 @@ def require_other_output(continues: Path, output: Path | None) -> None:
         )
 
 
+def warn_of_other_noise(folder: Path, noise_sha256: str) -> None:
+    """Say that a run had another noise model: its whole drive is solved again, by the one that is there now."""
+    known: dict[str, Any] = RunFolder(folder).metrics().get("provenance") or {}
+    if "noise_sha256" in known and (known["noise_sha256"] or "") != noise_sha256:
+        logger.warning(
+            "noise.yaml of the weights is not that of %s: the whole drive is solved with the new one", folder
+        )
+
+
 def state_to_resume(folder: Path, recording: FrameSequence) -> SessionCheckpoint | None:
     """The last kept state of a run that did not end; None where it kept none, and begins again.
 

@@ -25,6 +25,7 @@ from slam.continuation import (
     settings_to_resume,
     state_to_continue,
     state_to_resume,
+    warn_of_other_noise,
 )
 from slam.errors import RunError
 from slam.frames import Sequence as FrameSequence
@@ -191,11 +192,14 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
         first = len(recording) - len(following)
     source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first))
     sha256 = mixed_sha256(networks.sha256, source)
+    before = resumes or request.continues
     if checkpoint is not None and checkpoint.weights_sha256 != sha256:
         raise RunError(
-            f"{resumes or request.continues} was run with other weights or another depth source: continue it with the "
+            f"{before} was run with other weights or another depth source: continue it with the "
             "same --weights and depth.source"
         )
+    if before is not None:
+        warn_of_other_noise(before, networks.noise_sha256)
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     rest = get_or_compute, checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
@@ -238,6 +242,7 @@ def provenance_of(
         device=str(networks.device),
         weights=_from_anywhere(request.weights) if is_folder else str(request.weights),
         weights_sha256=networks.sha256,
+        noise_sha256=networks.noise_sha256 or None,
         weights_licence=networks.record.licence,
         trained_on=networks.record.trained_on,
         leak=bool(networks.leaks(recording.provenance())),

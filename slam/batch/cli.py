@@ -47,9 +47,12 @@ def batch(
 
     if memory and not Path("/proc/self/statm").exists():
         raise SlamError("--memory needs Linux: leave it out here")
-    options = [word for value in overrides or [] for word in ("--set", value)]
-    for name, value in {"weights": weights, "config": config, "frames": frames}.items():
-        options += [f"--{name}", value] if value is not None else []
+    options = [word for value in overrides or [] for word in ("--set", _seen_from_here(value))]
+    if weights is not None:
+        options += ["--weights", _whole(weights) if Path(weights, "model.yaml").is_file() else weights]
+    if config is not None:
+        options += ["--config", _whole(config) if Path(config).is_file() else config]
+    options += ["--frames", frames] if frames is not None else []
     options += ["--seed", str(seed), "--device", device]
     planned = drives_of(drives, sequence or ["all"], options)
     each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
@@ -67,6 +70,18 @@ def batch(
         first = next(outcome for outcome in outcomes if outcome.status == "failed")
         rest = "; the others are whole" if failed < len(outcomes) else ""
         raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")
+
+
+def _whole(path: str) -> str:
+    """A path that holds in the folder of a drive, too."""
+    return str(Path(path).absolute())
+
+
+def _seen_from_here(override: str) -> str:
+    """The same for the path of ``depth.source``."""
+    kind, colon, path = override.partition(":")
+    is_path = kind.startswith("depth.source=") and colon and Path(path).exists()
+    return f"{kind}:{_whole(path)}" if is_path else override
 
 
 def _print(table: Table) -> None:

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from slam.batch.execution import Outcome
 from slam.errors import RunError
-from slam.results.comparison import MISSING, lookup, written
+from slam.results.comparison import METRES, MISSING, lookup, unit_of_lengths, written
 from slam.results.folder import RunFolder
 from slam.storage.files import write_atomically
 
@@ -24,12 +24,13 @@ CSV = "drives.csv"
 PAGE = "index.html"
 _ALIGNED = ("trajectories", "optimised", "align")
 _FIRST = ("drive", "status", "reason")
-# column, its place in metrics.json, decimals on the page
+# column, its place in metrics.json (but the unit of lengths), decimals on the page
 _COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("sequence", ("sequence", "name"), 0),
     ("frames", ("sequence", "frames"), 0),
     ("length_m", ("sequence", "length_m"), 0),
     ("scale", ("scale", "mode"), 0),
+    ("unit", ("unit",), 0),
     ("ate_6dof_m", (*_ALIGNED, "6dof", "ate_rmse_m"), 3),
     ("ate_7dof_m", (*_ALIGNED, "7dof", "ate_rmse_m"), 3),
     ("t_rel_percent", (*_ALIGNED, "7dof", "t_rel_percent"), 2),
@@ -83,7 +84,7 @@ def summary_table(outcomes: Sequence[Outcome]) -> Table:
     """The main numbers of the runs that are whole, for a terminal."""
     from rich.table import Table
 
-    shown = ("frames", "length_m", "ate_6dof_m", "ate_7dof_m", "t_rel_percent", "seconds")
+    shown = ("frames", "length_m", "unit", "ate_6dof_m", "ate_7dof_m", "t_rel_percent", "seconds")
     table = Table("drive", "status", *shown)
     for outcome in outcomes:
         if outcome.status != "failed":
@@ -106,8 +107,12 @@ def failure_table(outcomes: Sequence[Outcome]) -> Table:
 
 def _row(outcome: Outcome) -> dict[str, Any]:
     row: dict[str, Any] = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
-    metrics = {} if outcome.status == "failed" else RunFolder(outcome.folder).metrics()
-    return row | {name: lookup(metrics, *place)[0] for name, place, _ in _COLUMNS}
+    metrics: dict[str, Any] = {}
+    if outcome.status != "failed":
+        metrics = RunFolder(outcome.folder).metrics()
+        metrics["unit"] = unit_of_lengths(metrics)
+    row |= {name: lookup(metrics, *place)[0] for name, place, _ in _COLUMNS}
+    return row if row["unit"] == METRES else row | {"ate_6dof_m": None}
 
 
 def _cells(outcome: Outcome, row: dict[str, Any], output: Path) -> tuple[str, str, list[str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ from slam.se3 import FloatArray
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import frame_range
-from slam.storage.files import write_atomically
+from slam.storage.files import remove, write_atomically
 from slam.trajectory import Trajectory, nearest_stamps
 
 logger = logging.getLogger(__name__)
 
-_POINTS = "points.ply"
+POINTS = "points.ply"
+_IMAGE = re.compile(r"\d{6,}\.png")
 _SAME_STAMP_S = 2e-3
 _SAME_PIXEL = 0.01
 
@@ -46,7 +48,7 @@ def write_scene(
 
     Args:
         folder: the run.
-        output: made where missing; other files in it stay.
+        output: made where missing; images and points of a scene before go, files of other names stay.
         trajectory: optimised, in the axes of the scene.
         cloud: of the map, in the same axes.
         dataset: where the images are now; None where the run found them.
@@ -74,9 +76,14 @@ def write_scene(
         raise RunError(f"no image of {folder.path} can be read: check the data set")
     if len(poses) < len(trajectory):
         logger.warning("%d of %d frames have no usable image: left out", len(trajectory) - len(poses), len(trajectory))
-    if cloud is not None:
-        write_ply(output / _POINTS, cloud)
-    write_transforms(output / TRANSFORMS, sequence.intrinsics, poses, None if cloud is None else _POINTS)
+    for path in (output / "images").glob("*.png"):
+        if _IMAGE.fullmatch(path.name) and f"images/{path.name}" not in poses:
+            remove(path, RunError)
+    if cloud is None:
+        remove(output / POINTS, RunError)
+    else:
+        write_ply(output / POINTS, cloud)
+    write_transforms(output / TRANSFORMS, sequence.intrinsics, poses, None if cloud is None else POINTS)
 
 
 def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) -> tuple[Sequence, list[int | None]]:

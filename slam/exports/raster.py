@@ -18,9 +18,10 @@ from slam.formats.geotiff import local_projection, write_geotiff
 from slam.formats.ply import Ply, rotated
 from slam.runtime.imports import import_rasterio
 from slam.se3 import FloatArray
-from slam.storage.files import write_atomically
+from slam.storage.files import remove, write_atomically
 
 RASTER = "raster.yaml"
+GEOTIFFS = ("height.tif", "colour.tif")
 _HEIGHT_STEPS = 65535  # of a 16-bit image; 0 is unknown
 _FINEST_STEP = 0.001
 _OPAQUE = 255
@@ -71,7 +72,7 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     """Write ``height.png`` (16 bit), ``colour.png``, world files, GeoTIFFs with an origin, and ``raster.yaml`` last.
 
     Args:
-        output: the folder; other files in it stay.
+        output: the folder; GeoTIFFs of a raster before go, files of other names stay.
         raster: what to write.
         unit: of its lengths, in words.
 
@@ -90,11 +91,14 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     _write_png(output / "colour.png", np.concatenate([raster.colours[..., ::-1], opacity], axis=2))
     for name in ("height.pgw", "colour.pgw"):
         _write_text(output / name, _world_file(grid))
-    if raster.crs is not None:
+    if raster.crs is None:
+        for name in GEOTIFFS:
+            remove(output / name, RunError)
+    else:
         corner = grid.x_min, grid.y_max
-        write_geotiff(output / "height.tif", raster.heights[None], corner, grid.resolution, raster.crs)
+        write_geotiff(output / GEOTIFFS[0], raster.heights[None], corner, grid.resolution, raster.crs)
         bands = raster.colours.transpose(2, 0, 1)
-        write_geotiff(output / "colour.tif", bands, corner, grid.resolution, raster.crs, known)
+        write_geotiff(output / GEOTIFFS[1], bands, corner, grid.resolution, raster.crs, known)
     description = {
         "width": grid.width,
         "height": grid.height,

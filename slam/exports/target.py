@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from slam.errors import RunError
-from slam.exports.raster import RASTER
+from slam.exports.nerfstudio import POINTS
+from slam.exports.raster import GEOTIFFS, RASTER
 from slam.formats.colmap import MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
@@ -16,8 +17,8 @@ from slam.results.replaced import check_replaced, check_replaced_trajectory
 _FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
 _NAMES = {
     "colmap": MODEL_FILES,
-    "nerfstudio": ("images", TRANSFORMS),
-    "raster": ("height.png", "colour.png"),
+    "nerfstudio": ("images", POINTS, TRANSFORMS),
+    "raster": ("height.png", "colour.png", *GEOTIFFS),
 }
 _OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": lambda output: (output / RASTER).is_file()}
 _BEGINNINGS = {

@@ -142,6 +142,15 @@ class Slam:
         """Number of frames so far."""
         return len(self._sequence)
 
+    @property
+    def unit_name(self) -> str | None:
+        """Of the lengths of `trajectory`: ``m``, ``camera heights`` or ``the networks' own unit``.
+
+        None before the first snippet and, where metres are wanted, until a road is seen: lengths are the networks' own
+        up to then.
+        """
+        return self._tracker.unit_name
+
     def __enter__(self) -> Self:
         return self
 
@@ -222,7 +231,7 @@ class Slam:
 
     @_in_turn
     def trajectory(self) -> Trajectory:
-        """All frames so far; before the first snippet the camera is assumed to stand.
+        """All frames so far, lengths in `unit_name`; before the first snippet the camera is assumed to stay in place.
 
         Raises:
             SlamError: no frame yet.

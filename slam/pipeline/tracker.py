@@ -63,8 +63,11 @@ class Tracker:
 
     @property
     def T_world_camera(self) -> FloatArray:
-        """Poses of all frames ``(N, 4, 4)``."""
-        return np.array(self._T_world_camera).reshape(-1, 4, 4)
+        """Poses of all frames ``(N, 4, 4)``, at one place before the first snippet, while there is no unit."""
+        T_world_camera = np.array(self._T_world_camera).reshape(-1, 4, 4)
+        if self._unit is None:
+            T_world_camera[:, :3, 3] = 0.0
+        return T_world_camera
 
     def add(self, observer: Observer) -> list[Tracked]:
         """The frames that the observer has finished since the last call."""
@@ -118,10 +121,14 @@ class Tracker:
         self._recent.stamps = np.arange(count - first, dtype=np.float64)
         measured = self._pipeline.measure(self._mode, closed(window, self._sources))
         self.unit_name = measured.scale.unit_name
-        if observer.keyframe_step(count - 1) is not None:
-            self._unit = float(np.median(measured.scale.per_frame))
+        by_keyframes = observer.keyframe_step(count - 1) is not None
+        unit = float(np.median(measured.scale.per_frame) if by_keyframes else measured.scale.per_frame[-1])
+        if self._unit is None:
+            for T in (*self._T_world_camera, self._T_previous_newest):
+                T[:3, 3] *= unit
+        self._unit = unit
+        if by_keyframes:
             return
-        self._unit = float(measured.scale.per_frame[-1])
         kept = max(first, self._settled)
         T_window_camera = measured.T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])

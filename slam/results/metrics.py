@@ -72,7 +72,7 @@ def estimate_metrics(
             "schema": SCHEMA,
             "status": "estimated",
             "reason": "the run has not ended, or was killed while it made the map",
-            "provenance": asdict(provenance),
+            "provenance": provenance.described(),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
             | describe_gaps(result.observations.interpolated)
             | {"doubled": describe_frames(doubled)}

@@ -94,7 +94,7 @@ def what_ran(metrics: Metrics) -> Table:
 
     seen, _ = lookup(metrics, "provenance", "trained_on")
     leak, _ = lookup(metrics, "provenance", "leak")
-    sha256 = text("provenance", "weights_sha256")
+    sha256, noise = text("provenance", "weights_sha256"), text("provenance", "noise_sha256")
     rows = [
         ("Sequence", f"{text('sequence', 'name')}, {text('sequence', 'frames')} frames"),
         ("Interpolated frames", _frames(metrics, "bridged") or "none"),
@@ -105,6 +105,7 @@ def what_ran(metrics: Metrics) -> Table:
         ("Scale", f"mode {text('scale', 'mode')}, value {text('scale', 'value', decimals=4)}"),
         ("Speed", text("timing", "frames_per_second", unit=" frames/s over the whole run")),
         ("Weights", f"{text('provenance', 'weights')}, sha256 {sha256 if MISSING in sha256 else sha256[:16]}"),
+        ("Noise of the poses", noise if MISSING in noise else f"noise.yaml, sha256 {noise[:16]}"),
         ("Depth", _depth_source(metrics)),
         ("Licence of the weights", text("provenance", "weights_licence")),
         ("Trained on", _shortened([str(name) for name in seen]) if seen else MISSING),

@@ -33,6 +33,7 @@ class ProvenanceRecord(_Part):
     seed: Count | None = None
     weights: str | None = None
     weights_sha256: str | None = None
+    noise_sha256: str | None = None
     weights_licence: str | None = None
     trained_on: list[str] | None = None
     leak: bool | None = None

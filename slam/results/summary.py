@@ -18,8 +18,8 @@ SCHEMA = 1
 class Provenance:
     """Version, command, weights and their training data, where depth comes from, and where the recording is.
 
-    ``recording`` holds ``dataset``, ``sequence`` and ``camera`` as far as they were given; none for the embedded
-    street.
+    ``noise_sha256`` is that of the noise model beside the weights, None without one. ``recording`` holds ``dataset``,
+    ``sequence`` and ``camera`` as far as they were given; none for the embedded street.
     """
 
     version: str
@@ -29,12 +29,18 @@ class Provenance:
     device: str
     weights: str
     weights_sha256: str
+    noise_sha256: str | None
     weights_licence: str
     trained_on: list[str]
     leak: bool
     depth_source: str
     depth_sha256: str
     recording: dict[str, str] = field(default_factory=dict)
+
+    def described(self) -> dict[str, Any]:
+        """As in ``metrics.json``."""
+        reason = {} if self.noise_sha256 else null("noise_sha256", "no noise.yaml was measured with these weights")
+        return asdict(self) | reason
 
 
 def null(name: str, reason: str) -> dict[str, Any]:
@@ -76,7 +82,7 @@ def describe_start(provenance: Provenance) -> dict[str, Any]:
         "schema": SCHEMA,
         "status": "running",
         "reason": "the run has not ended, or was killed before its trajectories were written",
-        "provenance": asdict(provenance),
+        "provenance": provenance.described(),
     }
 
 

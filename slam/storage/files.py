@@ -25,3 +25,15 @@ def write_atomically(
         files.write_atomically(path, fill, sync)
     except OSError as cause:
         raise error(str(cause)) from cause
+
+
+def remove(path: Path, error: type[SlamError] = SlamError) -> None:
+    """Remove a file if it is there.
+
+    Raises:
+        SlamError: (or the given kind) it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as cause:
+        raise error(f"{path} cannot be removed: {cause.strerror or cause}") from cause

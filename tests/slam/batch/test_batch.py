@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +21,8 @@ from slam.batch.summary import check_output, write_summary
 from slam.errors import RunError, SequenceError, SlamError
 
 QUICK = ["--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false"]
+
+UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -95,6 +98,28 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
     write_summary(output, [outcome])
     assert "0 of 1 drives" in (output / "index.html").read_text()
     check_output(output)
+
+
+def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
+    here, data = tmp_path / "here", tmp_path / "data"
+    shutil.copytree(tiny_weights, here / "mine")
+    shutil.copytree(kitti_root, data / "root")
+    quick = "mapping: {enabled: false}\ngeometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+    (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
+    (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
+    words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(
+        [sys.executable, "-m", "slam", *words, "--output", "out"], cwd=here, env=env, capture_output=True, check=False
+    )
+    assert ended.returncode == 0, ended.stdout.decode() + ended.stderr.decode()
+    assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()
+    with (here / "out" / "drives.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["scale"], row["ate_6dof_m"]) == ("none", "") and row["unit"] in UNITS_WITHOUT_METRES
+    assert float(row["ate_7dof_m"]) > 0
 
 
 def test_a_command_that_leaves_no_run_is_a_failure(tmp_path: Path) -> None:

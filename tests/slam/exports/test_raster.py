@@ -163,6 +163,19 @@ def test_without_metres_there_is_no_place_on_earth(
     assert yaml.safe_load((written / "raster.yaml").read_text())["unit"] == unit
 
 
+def test_nothing_of_a_raster_before_stays(make_recorded: Callable[..., RunFolder], tmp_path: Path) -> None:
+    folder, output, options = make_recorded(), tmp_path / "raster", ExportOptions(resolution=0.5)
+    export(folder, "raster", output, options=options)
+    names = sorted(path.name for path in output.iterdir())
+    for name in ("height.tif", "colour.tif", "notes.txt"):
+        (output / name).write_text("before")
+    export(folder, "raster", output, options=options)
+    assert sorted(path.name for path in output.iterdir()) == sorted([*names, "notes.txt"])
+    (tmp_path / "drive" / "height.tif").write_text("mine")
+    with pytest.raises(RunError, match=r"height\.tif is none of ours"):
+        export(folder, "raster", tmp_path / "drive", options=options)
+
+
 @pytest.mark.parametrize("text", ["", "49", "49,8", "91,8,0", "49,181,0", "49,8,north", "49,8,inf"])
 def test_origins_that_are_no_places_are_refused(text: str) -> None:
     with pytest.raises(RunError, match=r"--origin .*LAT,LON,HEADING"):

@@ -95,6 +95,17 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         assert distance == 0.0 if count < 5 else 0.5 * count < distance < 1.5 * count
 
 
+def test_the_camera_stays_at_its_place_until_there_is_a_unit() -> None:
+    """Image geometry measures steps before the first snippet, but not their lengths."""
+    slam = started(load_config(None, SETTINGS[1:]))
+    for count in range(1, 5):
+        feed(slam, len(slam), count)
+        assert not slam.trajectory().positions.any() and slam.unit_name is None
+    feed(slam, 4, 12)
+    lengths = np.linalg.norm(np.diff(slam.trajectory().positions, axis=0), axis=1)
+    assert slam.unit_name == "m" and lengths.min() > 0.5 and lengths.max() < 1.5
+
+
 def test_blank_frames_are_interpolated() -> None:
     slam = started(load_config(None, SETTINGS))
     feed(slam, 0, 12)

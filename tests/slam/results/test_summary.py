@@ -55,11 +55,12 @@ def test_timing() -> None:
 
 def test_a_run_begins_as_running_with_its_provenance() -> None:
     known = Provenance(
-        "1", "abc", "erfsfm-slam run", 0, "cpu", "sim", "9f", "MIT", ["simulated/1"], False, "network", "9f"
+        "1", "abc", "erfsfm-slam run", 0, "cpu", "sim", "9f", None, "MIT", ["simulated/1"], False, "network", "9f"
     )
     begun = describe_start(known)
     assert (begun["status"], begun["schema"]) == ("running", 1) and "has not ended" in begun["reason"]
     assert begun["provenance"]["trained_on"] == ["simulated/1"]
+    assert begun["provenance"]["noise_sha256_reason"] == "no noise.yaml was measured with these weights"
 
 
 def test_not_finite_becomes_null_with_a_reason_at_any_depth() -> None:

@@ -53,7 +53,7 @@ def test_a_snippet_shorter_than_asked(refusal: Refusal, tmp_path: Path, write_ro
     error = refusal(*TRAIN, *SMALL, "--set", "network.sources=4", "--dataset", root, "--output", tmp_path / "run")
     assert "a snippet needs 5 consecutive frames; found kitti_odometry/00 (4 frames)" in error
     error = refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
-    assert "kitti_odometry/00 has 4 frames; a snippet needs 5" in error
+    assert "kitti_odometry/00 has 4 frames without a gap; a snippet needs 5" in error
 
 
 def test_images_of_mixed_size(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path) -> None:

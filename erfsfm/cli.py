@@ -191,7 +191,8 @@ def receptive_field(
         snippet = [resize_image(read_image(file), height, width) for file in files]
     torch.manual_seed(seed)
     learned = None if weights == "none" else (weights, load_model(weights))
-    rows = measure_fields(network or list(PRESETS), fidelity, snippet, offsets_px, learned, choose_device(device))
+    every = [name for name, preset in PRESETS.items() if fidelity == "default" or preset.encoder == "paper"]
+    rows = measure_fields(network or every, fidelity, snippet, offsets_px, learned, choose_device(device))
     output.parent.mkdir(parents=True, exist_ok=True)
     draw_fields(rows, snippet[2], output)
     if as_json:
@@ -266,7 +267,7 @@ def calibrate_noise(
 ) -> None:
     """Measure the pose network's noise on held-out recordings; writes noise.yaml beside the weights, for SLAM.
 
-    Prints the coverage of each recording by the noise measured on the others.
+    Prints the coverage of each recording by the noise measured on the others; with one alone there is none.
 
     Example: erfsfm calibrate-noise --weights sim --dataset worlds/600 --dataset KITTI
     """

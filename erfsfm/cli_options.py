@@ -22,7 +22,7 @@ def print_rows(rows: list[dict[str, Any]], as_json: bool) -> None:
         return
     columns = []
     for key in dict.fromkeys(key for row in rows for key in row):
-        values = [row.get(key, "-") for row in rows]
+        values = ["-" if row.get(key) is None else row[key] for row in rows]
         cells = [key, *(f"{value:.4f}" if isinstance(value, float) else str(value) for value in values)]
         width = max(map(len, cells))
         columns.append([cell.ljust(width) if isinstance(values[0], str) else cell.rjust(width) for cell in cells])

@@ -7,6 +7,7 @@ Every recording has the same weight, whatever its length.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak, windows
 from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses
+
+logger = logging.getLogger(__name__)
 
 LEVELS = (0.5, 0.9, 0.95)
 _DEGREES = 4.0
@@ -62,27 +65,35 @@ def calibrate(
         pose_sha256: fingerprint of the pose network's file.
 
     Returns:
-        The noise, and for each recording the coverage by the noise that the others give.
+        The noise, and for each recording the coverage by the noise that the others give; None of one recording alone.
 
     Raises:
-        DataError: nothing with true poses, too little of it, or a leak that was not allowed.
+        DataError: nothing with true poses or one of the names, too little of it, or a leak that was not allowed.
     """
     recordings = [r for root in roots for r in discover(root) if r.sequence and r.poses_file]
+    absent = [name for name in sequences if all(name not in (r.name, r.sequence) for r in recordings)]
+    if absent or not recordings:
+        names = ", ".join(dict.fromkeys(r.name for r in recordings)) or "none"
+        raise DataError(
+            f"no {' or '.join(absent) or 'sequence'} with true poses in {', '.join(map(str, roots))}, against which "
+            f"noise is measured: found {names}"
+        )
     recordings = [r for r in recordings if not sequences or {r.name, r.sequence} & set(sequences)]
-    cameras = {(r.name, r.start): r for r in reversed(recordings)}  # one camera of a drive is enough
-    if not cameras:
-        raise DataError(f"no sequence with true poses in {', '.join(map(str, roots))}: noise is measured against truth")
+    # one camera of a drive is enough; simulated worlds in two folders may have one name
+    cameras = {(r.images[0].parents[1].resolve(), r.start): r for r in reversed(recordings)}
     refuse_leak(networks, [r.frames_name for r in cameras.values()], allow_leak)
     errors = [measure(networks, recording) for recording in cameras.values()]
     few = [e for e in errors if len(e) < _LEAST_PAIRS]
     if few:
         raise DataError(f"{few[0].recording} has {len(few[0])} pairs of frames that move; wanted {_LEAST_PAIRS}")
+    if len(errors) == 1:
+        logger.warning("one recording alone gives no coverage: it takes the noise measured on another")
     rows = []
     for k, held_out in enumerate(errors):
-        others = errors[:k] + errors[k + 1 :] or errors
-        ratios = coverage(held_out, fit(others, pose_sha256))
-        names = [f"coverage_{100 * level:.0f}" for level in LEVELS]
-        rows.append({"recording": held_out.recording, "pairs": len(held_out), **dict(zip(names, ratios, strict=True))})
+        others = errors[:k] + errors[k + 1 :]
+        ratios = coverage(held_out, fit(others, pose_sha256)) if others else [None] * len(LEVELS)
+        covered = {f"coverage_{100 * level:.0f}": ratio for level, ratio in zip(LEVELS, ratios, strict=True)}
+        rows.append({"recording": held_out.recording, "pairs": len(held_out), **covered})
     return fit(errors, pose_sha256), rows
 
 

@@ -79,22 +79,14 @@ def pose_protocol(
     """Five-frame snippets of each sequence, or of a part of it (``00[250:300]``): the networks, and
     constant velocity straight ahead.
 
-    In paper fidelity the truth is that of camera 0, whichever camera took the images.
+    No snippet spans a gap, and a stretch between gaps that is shorter than one is passed over. In paper fidelity the
+    truth is that of camera 0, whichever camera took the images.
 
     Raises:
         DataError: a sequence or its poses are missing, networks of another snippet length, or a leak that was
             not allowed.
     """
-    rows = []
-    for name in sequences:
-        for recording in named_recordings(root, name):
-            T_world_camera = recording.true_poses(fidelity)
-            if T_world_camera is None:
-                raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
-            leak = refuse_leak(networks, [recording.frames_name], allow_leak)
-            shown = recording.frames_name if "[" in name else recording.name
-            rows += _pose_rows(networks, recording, T_world_camera, fidelity, leak, shown)
-    return rows
+    return [row for name in sequences for row in _pose_rows(networks, root, name, fidelity, allow_leak)]
 
 
 def named_recordings(root: Path, name: str) -> list[Recording]:
@@ -120,26 +112,33 @@ def named_recordings(root: Path, name: str) -> list[Recording]:
 
 
 def _pose_rows(
-    networks: PoseDepthNetworks,
-    recording: Recording,
-    T_world_camera: NDArray[np.float64],
-    fidelity: Fidelity,
-    leak: bool,
-    shown: str,
+    networks: PoseDepthNetworks, root: Path, name: str, fidelity: Fidelity, allow_leak: bool
 ) -> list[dict[str, Any]]:
+    """The networks' row and that of the baseline, of all parts of a sequence."""
     length = networks.sources + 1
+    parts = named_recordings(root, name)
+    first, last = parts[0], parts[-1]
+    shown = str(FrameRange(first.name, first.start, last.start + len(last))) if "[" in name else first.name
+    leak = refuse_leak(networks, [part.frames_name for part in parts], allow_leak)
     if length != 5:
         raise DataError(f"the snippet protocol needs networks with 4 sources; these have {networks.sources}")
-    true = snippets_from_trajectory(T_world_camera, length)
-    if len(true) == 0:
-        raise DataError(f"{recording.name} has {len(recording)} frames; a snippet needs {length}")
-    predicted = np.stack([snippet_from_network(networks.poses(images)) for images in windows(networks, recording)])
+    snippets, predicted = [], []
+    for part in parts:
+        T_world_camera = part.true_poses(fidelity)
+        if T_world_camera is None:
+            raise DataError(f"no true poses of sequence {name}: wanted {root}/poses/{name}.txt")
+        snippets.append(snippets_from_trajectory(T_world_camera, length))
+        predicted += [snippet_from_network(networks.poses(images)) for images in windows(networks, part)]
+    if not predicted:
+        longest = max(map(len, parts))
+        raise DataError(f"{shown} has {longest} frames without a gap; a snippet needs {length}")
+    true = np.concatenate(snippets)
     straight = np.tile(np.eye(4), (len(true), length, 1, 1))
     straight[:, :, 2, 3] = np.arange(length)
     rows = []
-    for name, guess in (("networks", predicted), ("straight constant motion", straight)):
+    for method, guess in (("networks", np.stack(predicted)), ("straight constant motion", straight)):
         errors = snippet_errors(guess, true, fidelity=fidelity)
-        row = {"method": name, "recording": shown, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
+        row = {"method": method, "recording": shown, "ate_mean": errors.ate_mean, "ate_std": errors.ate_std}
         rows.append(row | {"re_mean": errors.re_mean, "re_std": errors.re_std, "snippets": errors.count, "leak": leak})
     return rows
 

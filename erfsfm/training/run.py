@@ -88,10 +88,11 @@ def train(
     module = SelfSupervision(config, timer.time_elapsed)
     draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output / "teacher", quiet)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
-    seen = trained_on(draws.recordings)
-    if not resume:
-        seen = merge([*seen, *_start_from(module, config)])
+    before = [] if resume else _start_from(module, config)
+    seen = merge([*trained_on(draws.recordings), *before])
     keeper = WeightKeeper(output, seen, command, bool(validation), config.training.networks)
+    if resume:
+        module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
     trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
     if config.training.nodes > 1:

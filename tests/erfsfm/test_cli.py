@@ -210,6 +210,14 @@ def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Ca
     assert {row["weights"] for row in rows} == {"untrained"}
 
 
+@pytest.mark.slow
+def test_receptive_fields_of_the_papers_networks(run: Run, tmp_path: Path) -> None:
+    options = ["--fidelity", "paper", "--height", "48", "--width", "64", "--json"]
+    code, out, _ = run("receptive-field", *options, "--output", tmp_path / "field.png")
+    names = [row["name"] for row in json.loads(out)]
+    assert code == 0 and len(names) == 8 and not any("lite0" in name for name in names)
+
+
 def test_convert(run: Run, tmp_path: Path) -> None:
     old = {"pose_pred.weight": torch.zeros(12, 64, 1, 1), "pose_pred.bias": torch.zeros(12)}
     planes = [9, 4, 8, 16, 32, 64, 64, 64]

@@ -116,14 +116,26 @@ def test_the_command_refuses_leaks_short_drives_and_roots_without_truth(
         calibrate(ConstantMotion(), [tmp_path], (), False, "abc")
     with pytest.raises(DataError, match="leak"):
         calibrate(ConstantMotion(["kitti_odometry/00"]), [tmp_path], (), False, "abc")
-    with pytest.raises(DataError, match="no sequence with true poses"):
-        calibrate(ConstantMotion(), [tmp_path], ["77"], False, "abc")
+    with pytest.raises(DataError, match=r"no 77 with true poses in .*: found kitti_odometry/00"):
+        calibrate(ConstantMotion(), [tmp_path], ["00", "77"], False, "abc")
+    (tmp_path / "poses/00.txt").unlink()
+    with pytest.raises(DataError, match=r"no sequence with true poses in .*: found none"):
+        calibrate(ConstantMotion(), [tmp_path], (), False, "abc")
+
+
+def test_worlds_of_one_name_in_two_folders_are_two_drives(tmp_path: Path, write_root: Callable[..., Path]) -> None:
+    cameras = ("image_2", "image_3")
+    roots = [write_root(tmp_path / name, 30, cameras=cameras, seed=601, step=(0.0, 0.0, 0.1)) for name in "ab"]
+    noise, rows = calibrate(ConstantMotion(), [*roots, roots[0]], (), False, "abc")
+    assert noise.measured_on == ["simulated/601[0:30]"] * 2, "by one camera each"
+    assert all(0 <= row["coverage_50"] <= 1 for row in rows)
 
 
 def test_the_command_measures_a_drive(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     write_root(tmp_path, frames=40, step=(0.0, 0.0, 0.1))
     noise, rows = calibrate(ConstantMotion(), [tmp_path], ["00"], False, "abc")
     assert [row["recording"] for row in rows] == noise.measured_on == ["kitti_odometry/00[0:40]"]
+    assert rows[0]["coverage_95"] is None, "no other measured a noise for it"
     assert noise.pairs == rows[0]["pairs"] > 50 and noise.pose_sha256 == "abc"
     assert min(noise.frame) > 0
 

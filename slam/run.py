@@ -205,16 +205,20 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
+    settings = _settings_from_anywhere(settings)
     return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress)
 
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:
     if resumes is not None:
-        settings = settings_to_resume(resumes, request.config, request.overrides)
-    elif request.continues is not None:
-        settings = settings_to_continue(request.continues, request.config, request.overrides)
-    else:
-        settings = load_config(request.config, request.overrides)
+        return settings_to_resume(resumes, request.config, request.overrides)
+    if request.continues is not None:
+        return settings_to_continue(request.continues, request.config, request.overrides)
+    return load_config(request.config, request.overrides)
+
+
+def _settings_from_anywhere(settings: SlamConfig) -> SlamConfig:
+    """The same with the source of depth by its whole path."""
     kind, colon, path = settings.depth.source.partition(":")
     if not colon:
         return settings

@@ -14,7 +14,7 @@ from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply
-from slam.sequences.excerpt import Excerpt
+from slam.sequences.continued import NO_SCANS, Continued, recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +55,11 @@ class DepthQuality:
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:
             logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
-        missing = unreadable if self._unreadable else "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
+        if isinstance(self._sequence, Continued):
+            missing = f"the frames that follow have no true depth (simulated or depth_2), and {NO_SCANS}"
+        if self._unreadable:
+            missing = unreadable
         if self._keyframes == 0:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:
@@ -76,7 +80,10 @@ def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | Non
     Raises:
         SlamError: a depth map or a scan cannot be read.
     """
-    base, frame = (sequence.base, sequence.start + index) if isinstance(sequence, Excerpt) else (sequence, index)
+    base, start, first = recording_of(sequence)
+    if index < first:
+        return None
+    frame = start + index
     if getattr(base, "street", None) is not None and count % _EVERY_RENDERED != 1:
         return None
     if isinstance(base, HasTrueDepth) and frame in base.true_depth_frames():

@@ -17,7 +17,7 @@ from slam.frontend.lidar_odometry import readable_scan
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
 from slam.se3 import FloatArray, Similarity, apply, invert
-from slam.sequences.excerpt import Excerpt
+from slam.sequences.continued import NO_SCANS, Continued, recording_of
 
 logger = logging.getLogger(__name__)
 
@@ -44,23 +44,23 @@ class HasTrueDepth(Protocol):
 class DepthTruth:
     """Depth maps at true poses; ``distance`` is exact where the surface itself is known."""
 
-    def __init__(self, sequence: Sequence, depth: HasTrueDepth, first: int) -> None:
-        """Depth of a sequence whose frame 0 is frame ``first`` of ``depth``."""
-        self._depth, self._first = depth, first
+    def __init__(self, sequence: Sequence, depth: HasTrueDepth, start: int, first: int) -> None:
+        """Depth of a sequence, from its frame ``first`` on, whose frame 0 is frame ``start`` of ``depth``."""
+        self._depth, self._start = depth, start
         self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
-        frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - first
-        self.frames: Indices = frames[(frames >= 0) & (frames < len(sequence))]
+        frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - start
+        self.frames: Indices = frames[(frames >= first) & (frames < len(sequence))]
         street = getattr(depth, "street", None)
         self.name = "depth maps" if street is None else "exact surface"
         self.distance: Callable[[FloatArray], FloatArray] | None = None
         if street is not None:
-            T_street_first = street.T_world_camera[first]
+            T_street_first = street.T_world_camera[start]
             self.distance = lambda points: np.asarray(street.distance_to_surface(apply(T_street_first, points)))
 
     def view(self, frame: int) -> Surface:
         """Surface within 50 m, for walls may be too high for the images from nearby; completeness is about 25 m."""
         assert self._poses is not None
-        depth = self._depth.true_depth(self._first + frame)
+        depth = self._depth.true_depth(self._start + frame)
         height, width = depth.shape
         camera = Intrinsics.of(self._intrinsics.resized(width, height))
         step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
@@ -138,15 +138,17 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     """The best truth of a sequence, or why there is none."""
     if sequence.reference is None:
         return "the sequence has no true poses"
-    base, first = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+    base, start, first = recording_of(sequence)
     if isinstance(base, HasTrueDepth):
-        depth = DepthTruth(sequence, base, first)
+        depth = DepthTruth(sequence, base, start, first)
         if len(depth.frames):
             return depth
     if sequence.T_camera_lidar is not None:
         lidar = LidarTruth(sequence)
         if len(lidar.frames):
             return lidar
+    if isinstance(sequence, Continued):
+        return f"the true surface is not known: the frames that follow have no depth maps, and {NO_SCANS}"
     return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
 
 

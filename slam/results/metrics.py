@@ -34,6 +34,7 @@ from slam.results.summary import (
     null,
 )
 from slam.se3 import umeyama
+from slam.sequences.continued import NO_SCANS, Continued
 from slam.trajectory import Trajectory, associate
 
 
@@ -44,13 +45,13 @@ def lidar_trajectory(result: SlamResult) -> Trajectory | None:
     return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
 
 
-def _lidar_metrics(result: SlamResult) -> dict[str, Any]:
+def _lidar_metrics(result: SlamResult, sequence: Sequence) -> dict[str, Any]:
     """Errors of LiDAR odometry at its frames."""
     path, lidar = result.lidar, lidar_trajectory(result)
     if isinstance(path, MeasurementFailure):
         return null("lidar", path.reason)
     if path is None or lidar is None:
-        return null("lidar", "the sequence has no LiDAR scans")
+        return null("lidar", NO_SCANS if isinstance(sequence, Continued) else "the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
     return {"lidar": trajectory_metrics(lidar, reference)}
 
@@ -64,7 +65,7 @@ def estimate_metrics(
         "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
         "odometry": trajectory_metrics(result.odometry, reference),
         "optimised": trajectory_metrics(result.optimised, reference),
-        **_lidar_metrics(result),
+        **_lidar_metrics(result, sequence),
     }
     doubled = dict.fromkeys(doubled_frames(len(sequence), result.observations, result.state), DOUBLED)
     metrics: dict[str, Any] = finite(

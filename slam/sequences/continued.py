@@ -21,6 +21,9 @@ _SIMULATED = "simulated/"
 _NUMBERED = ("kitti_", _SIMULATED)  # of names whose frame numbers are those of the recording
 
 
+NO_SCANS = "LiDAR scans are not used where a drive continues another folder"
+
+
 class Continued:
     """Earlier frames, then all of another sequence of the same camera. LiDAR scans are not used.
 
@@ -60,7 +63,8 @@ class Continued:
         self._missing = missing_between(sources, following.provenance())
         if _same_world(sources, following.provenance()):
             self._missing = _missing_by_clock(name, stamps, following.stamps)
-        self._following, self._sources = following, sources
+        self.following, self._sources = following, sources
+        self.first = self.before + self._missing  # of the frames that follow
         self.stamps = _joined_stamps(stamps, self._missing, following.stamps)
         self._require_short_gap()
         self.reference = _joined_poses(stamps, reference, self._missing, following)
@@ -79,10 +83,9 @@ class Continued:
         require_frame(self.name, index, len(self))
         if index < self.before:
             raise SequenceError(f"frame {index} of {self.name} is of an earlier run, which keeps no images")
-        first = self.before + self._missing
-        if index < first:
+        if index < self.first:
             raise MissingFrameError(f"frame {index} of {self.name} is missing between two runs")
-        return Frame(index, float(self.stamps[index]), self._following.frame(index - first).image)
+        return Frame(index, float(self.stamps[index]), self.following.frame(index - self.first).image)
 
     def has_scan(self, index: int) -> bool:
         """False: scans of earlier frames are not kept."""
@@ -94,19 +97,28 @@ class Continued:
 
     def provenance(self) -> tuple[str, ...]:
         """Names of all parts, as in the leak record of a checkpoint."""
-        return (*self._sources, *self._following.provenance())
+        return (*self._sources, *self.following.provenance())
 
     def _require_short_gap(self) -> None:
         if not self._missing:
             return
-        seconds = float(self.stamps[self.before + self._missing] - self.stamps[self.before - 1])
-        between = f"{self._missing} frames between {', '.join(self._sources)} and {self._following.provenance()[0]}"
+        seconds = float(self.stamps[self.first] - self.stamps[self.before - 1])
+        between = f"{self._missing} frames between {', '.join(self._sources)} and {self.following.provenance()[0]}"
         if self._missing > MAX_GAP_FRAMES or seconds > MAX_GAP_S:
             raise SequenceError(
                 f"{between} are missing ({seconds:.1f} s), too long a gap to interpolate: give frames that follow "
                 f"sooner, with --frames A:B, or run them on their own"
             )
         logger.warning("%s are missing: the motion across them is interpolated", between)
+
+
+def recording_of(sequence: Sequence) -> tuple[Sequence, int, int]:
+    """The recording of a sequence, which frame of it frame 0 is, and from which frame on the sequence is of it."""
+    first = 0
+    if isinstance(sequence, Continued):
+        first, sequence = sequence.first, sequence.following
+    base, start = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
+    return base, start - first, first
 
 
 def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:

@@ -92,6 +92,21 @@ def test_the_seed_and_the_gps_track_of_the_run_hold(kitti_root: Path, tmp_path: 
         run(kitti_root, tmp_path / "none", "8:", overrides=(), continues=before)
 
 
+def test_frames_that_follow_have_their_true_depth(tmp_path: Path) -> None:
+    street = SimulatedStreet(SimulationOptions(route="straight", frames=16, seed=1003, width=208, height=64))
+    root = tmp_path / "root"
+    write_kitti_root(street, root, depth=True, lidar=True)
+    before = run(root, tmp_path / "before", "0:7", overrides=["output.report=false", "mapping.min_weight=1"]).path
+    metrics = run(root, tmp_path / "after", "8:", overrides=(), continues=before).metrics()
+    assert metrics["map"]["truth"] == "depth maps" and metrics["map"]["with_scale"]["accuracy_median_m"] < 1
+    assert 0 < metrics["depth"]["network"]["abs_rel"] < 0.5
+    reason = metrics["trajectories"]["lidar_reason"]
+    assert reason == "LiDAR scans are not used where a drive continues another folder"
+    shutil.rmtree(root / "sequences/sim/depth_2")
+    metrics = run(root, tmp_path / "without", "8:", overrides=(), continues=before).metrics()
+    assert all(reason in metrics[part][f"{name}_reason"] for part, name in (("map", "truth"), ("depth", "network")))
+
+
 def test_three_runs_in_a_row_give_the_graph_of_one(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
     """One of them is of a single frame."""
     settings = ["output.report=false", "mapping.enabled=false"]

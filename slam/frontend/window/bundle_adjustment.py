@@ -11,19 +11,18 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
 from slam.frontend.window.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.frontend.window.projection import pixel_jacobian
+from slam.frontend.window.reduced_system import Part, solve_sum
 from slam.se3 import FloatArray, apply, make
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 # points whose sightings are eliminated together: they share few cameras
 _BLOCK = 512
-_SIX = np.arange(6)
 
 
 @dataclass(frozen=True)
@@ -231,10 +230,9 @@ class _System:
     def step(self, damping: float) -> tuple[FloatArray, FloatArray] | None:
         """Steps of cameras ``(F, 6)`` and points ``(P, 3)``; None where the system is singular."""
         V_inverse = np.asarray(np.linalg.inv(_damped(self.V, damping)), np.float64)
-        S, side, blocks = self._reduced(damping, V_inverse)
-        try:
-            by_camera = cho_solve(cho_factor(S, check_finite=False), side, check_finite=False).reshape(-1, 6)
-        except LinAlgError:
+        parts, side, blocks = self._reduced(damping, V_inverse)
+        by_camera = solve_sum(parts, side)
+        if by_camera is None:
             return None
         by_point = self.point_side.copy()
         for block, W in blocks:
@@ -243,23 +241,21 @@ class _System:
 
     def _reduced(
         self, damping: float, V_inverse: FloatArray
-    ) -> tuple[FloatArray, FloatArray, list[tuple[_Block, FloatArray]]]:
-        """The cameras' system without the points, and the coupling of each block."""
-        F = len(self.U)
-        S, side = np.zeros((F, 6, F, 6)), self.camera_side.copy()
-        S[range(F), :, range(F), :] = _damped(self.U, damping)
+    ) -> tuple[list[Part], FloatArray, list[tuple[_Block, FloatArray]]]:
+        """The cameras' system without the points, as a sum of parts, and the coupling of each block."""
+        side = self.camera_side.copy()
+        parts = [(np.array([k]), own) for k, own in enumerate(_damped(self.U, damping))]
         coupled = []
         for block in self.blocks:
             coupling = self.W[..., block.sightings]
             inverse = np.ascontiguousarray(V_inverse[block.points[block.local_point]].transpose(1, 2, 0))
             # row by row: products of small matrices one by one take ten times as long
             W, WV = (block.dense(part) for part in (coupling, sum(coupling[:, i, None] * inverse[i] for i in range(3))))
-            shape = len(block.cameras), 6, len(block.cameras), 6
             # cameras of a block are few, so that the product is small
-            S[np.ix_(block.cameras, _SIX, block.cameras, _SIX)] -= (WV @ W.T).reshape(shape)
+            parts.append((block.cameras, -(WV @ W.T)))
             side[block.cameras] -= (WV @ self.point_side[block.points].ravel()).reshape(-1, 6)
             coupled.append((block, W))
-        return S.reshape(6 * F, 6 * F), side.ravel(), coupled
+        return parts, side, coupled
 
 
 def _damped(blocks: FloatArray, damping: float) -> FloatArray:

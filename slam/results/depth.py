@@ -14,7 +14,7 @@ from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
 from slam.se3 import FloatArray, apply
-from slam.sequences.continued import NO_SCANS, Continued, recording_of
+from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)
 
@@ -55,9 +55,7 @@ class DepthQuality:
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:
             logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
-        missing = "the sequence has no true depth (simulated, depth_2 or LiDAR)"
-        if isinstance(self._sequence, Continued):
-            missing = f"the frames that follow have no true depth (simulated or depth_2), and {NO_SCANS}"
+        missing = unused_scans(self._sequence) or "the sequence has no true depth (simulated, depth_2 or LiDAR)"
         if self._unreadable:
             missing = unreadable
         if self._keyframes == 0:

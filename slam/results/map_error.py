@@ -17,7 +17,7 @@ from slam.frontend.lidar_odometry import readable_scan
 from slam.pipeline.batch import SlamResult
 from slam.results.summary import null
 from slam.se3 import FloatArray, Similarity, apply, invert
-from slam.sequences.continued import NO_SCANS, Continued, recording_of
+from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)
 
@@ -147,9 +147,8 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
         lidar = LidarTruth(sequence)
         if len(lidar.frames):
             return lidar
-    if isinstance(sequence, Continued):
-        return f"the true surface is not known: the frames that follow have no depth maps, and {NO_SCANS}"
-    return "the true surface is not known: there are neither depth maps nor LiDAR scans beside the images"
+    why = unused_scans(sequence) or "there are neither depth maps nor LiDAR scans beside the images"
+    return f"the true surface is not known: {why}"
 
 
 def no_map_errors(reason: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from slam.results.summary import (
     null,
 )
 from slam.se3 import umeyama
-from slam.sequences.continued import NO_SCANS, Continued
+from slam.sequences.continued import unused_scans
 from slam.trajectory import Trajectory, associate
 
 
@@ -51,7 +51,7 @@ def _lidar_metrics(result: SlamResult, sequence: Sequence) -> dict[str, Any]:
     if isinstance(path, MeasurementFailure):
         return null("lidar", path.reason)
     if path is None or lidar is None:
-        return null("lidar", NO_SCANS if isinstance(sequence, Continued) else "the sequence has no LiDAR scans")
+        return null("lidar", unused_scans(sequence) or "the sequence has no LiDAR scans")
     reference = None if result.reference is None else result.reference.select(path.frames).rebased()
     return {"lidar": trajectory_metrics(lidar, reference)}
 

@@ -21,9 +21,6 @@ _SIMULATED = "simulated/"
 _NUMBERED = ("kitti_", _SIMULATED)  # of names whose frame numbers are those of the recording
 
 
-NO_SCANS = "LiDAR scans are not used where a drive continues another folder"
-
-
 class Continued:
     """Earlier frames, then all of another sequence of the same camera. LiDAR scans are not used.
 
@@ -119,6 +116,13 @@ def recording_of(sequence: Sequence) -> tuple[Sequence, int, int]:
         first, sequence = sequence.first, sequence.following
     base, start = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
     return base, start - first, first
+
+
+def unused_scans(sequence: Sequence) -> str:
+    """Why the LiDAR scans of a sequence are not used; empty where they are, or it has none."""
+    following = sequence.following if isinstance(sequence, Continued) else None
+    has_scans = following is not None and any(following.has_scan(k) for k in range(len(following)))
+    return "LiDAR scans are not used where a drive continues another folder" if has_scans else ""
 
 
 def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:

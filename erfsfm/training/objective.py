@@ -274,8 +274,7 @@ class _Level:
         error = photometric_error(target, warped, loss.ssim_weight)  # (B*N, 1, h, w)
         shape = (len(self.target), count, *error.shape[-2:])
         error, valid = error.reshape(shape), valid.reshape(shape)
-        if mask is not None:
-            error = error * mask
+        weighed = error if mask is None else error * mask
         still: Tensor | None = None
         if loss.auto_mask:
             with torch.no_grad():
@@ -286,15 +285,15 @@ class _Level:
                 )[:, 0]  # (B, h, w)
         if loss.reduction == "mean":
             # pixels without a source count as zero and sources are summed, as in the paper's code
-            summed = (error * valid).sum(dim=1)
+            summed = (weighed * valid).sum(dim=1)
             if still is None:
                 return summed.mean()
             moving = ((error * valid).sum(1) / valid.sum(1).clamp(min=1) < still) & valid.any(dim=1)
             return (summed * moving).mean()
-        best = error.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
+        best = weighed.masked_fill(~valid, torch.inf).amin(dim=1)  # (B, h, w)
         counted = valid.any(dim=1)
         if still is not None:
-            counted = counted & (best.detach() < still)
+            counted = counted & (error.detach().masked_fill(~valid, torch.inf).amin(dim=1) < still)
         return best.masked_fill(~counted, 0).sum() / counted.sum().clamp(min=1)
 
     def smoothness(self, loss: LossConfig) -> Tensor:

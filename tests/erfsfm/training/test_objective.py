@@ -317,6 +317,16 @@ def test_masks_weigh_the_error_and_are_regularised_towards_one(batch: SnippetBat
     assert float(outcome.total) == pytest.approx(plain / 2 + 0.4 * math.log(2))
 
 
+@pytest.mark.parametrize("reduction", ["mean", "minimum"])
+def test_masks_do_not_change_which_pixels_move(batch: SnippetBatch, reduction: str) -> None:
+    wanted = {"reduction": reduction, "auto_mask": True}
+    plain = evaluate(batch, experiment(**wanted), 0.3, true_poses())
+    masks = FixedPose(true_poses(), mask=0.5)
+    with torch.no_grad():
+        halved = evaluate_objective(FixedDepth(0.3), masks, batch, experiment(masks=True, mask_weight=0.1, **wanted))
+    assert float(halved.terms["photometric"]) == pytest.approx(float(plain.terms["photometric"]) / 2)
+
+
 def test_masks_of_another_size_are_refused(batch: SnippetBatch) -> None:
     with pytest.raises(ConfigError, match=r"network\.masks"):
         evaluate_objective(

@@ -22,7 +22,7 @@ from slam.results.output import UNFINISHED
 logger = logging.getLogger(__name__)
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
-_FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops")
+_FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops", "window")
 
 
 def provenance_to_resume(continues: Path, output: Path | None, recording: Mapping[str, str]) -> dict[str, Any] | None:
@@ -91,6 +91,12 @@ def settings_to_continue(folder: Path, config: str | Path | None, overrides: Seq
             raise ConfigError(
                 f"{name} cannot be changed for {folder}: leave out --set {name}..., or run from the first frame"
             )
+    kept, now = own.mapping, settings.mapping
+    if own.output.keep == "keyframes" and (kept.width_px, kept.frame_stride) != (now.width_px, now.frame_stride):
+        raise ConfigError(
+            f"mapping.width_px and mapping.frame_stride are those of the keyframes that {folder} kept: leave them out, "
+            "or run from the first frame"
+        )
     return settings
 
 

@@ -170,8 +170,13 @@ def test_graph_mapping_and_output_may_be_changed(go_on: Callable[..., RunFolder]
     [
         ({"config": "default"}, "leave out --config"),
         ({"overrides": ["geometry.max_corners=300"]}, "geometry cannot be changed for .*: leave out --set geometry"),
+        ({"overrides": ["window.use=never"]}, "window cannot be changed for .*: leave out --set window"),
+        (
+            {"overrides": ["mapping.width_px=96"]},
+            "mapping.width_px and mapping.frame_stride are those of the keyframes",
+        ),
     ],
-    ids=["configuration", "geometry"],
+    ids=["configuration", "geometry", "window", "keyframes"],
 )
 def test_configuration_of_the_pass_over_the_frames_is_fixed(
     go_on: Callable[..., RunFolder], options: dict[str, Any], message: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from erfsfm.inference import DepthPosePredictor
@@ -14,6 +15,8 @@ from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
 from slam.storage.fingerprint import code_fingerprint
+
+logger = logging.getLogger(__name__)
 
 
 def open_depth(config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumbers | None) -> DepthSource | None:
@@ -36,6 +39,12 @@ def open_depth(config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumber
         raise SlamError(
             f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or onnx:FILE "
             "for frames as they come"
+        )
+    if intrinsics.undistorted:
+        logger.warning(
+            "images of this camera are undistorted as they are read: depth.source=%s must be depth of the undistorted "
+            "images, not of the stored ones, which would bend the map",
+            config.source,
         )
     return DepthFolder(config, numbers, intrinsics.width, intrinsics.height)
 

@@ -48,6 +48,7 @@ class DepthTruth:
         """Depth of a sequence, from its frame ``first`` on, whose frame 0 is frame ``start`` of ``depth``."""
         self._depth, self._start = depth, start
         self._intrinsics, self._poses = sequence.intrinsics, sequence.reference
+        self._is_part = first > 0
         frames = np.asarray(depth.true_depth_frames(), dtype=np.int64) - start
         self.frames: Indices = frames[(frames >= first) & (frames < len(sequence))]
         street = getattr(depth, "street", None)
@@ -70,8 +71,14 @@ class DepthTruth:
         return Surface(points, np.linalg.norm(points - self._poses[frame][:3, 3], axis=1) <= RANGE_M)
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
-        """True: the map comes from the same images."""
-        return np.ones(len(points), dtype=bool)
+        """All, for the map comes from the same images; with earlier ones that have no truth, points in these images."""
+        if not self._is_part:
+            return np.ones(len(points), dtype=bool)
+        assert self._poses is not None
+        found = np.zeros(len(points), dtype=bool)
+        for frame in frames:
+            found |= _in_image(apply(invert(self._poses[frame]), points), self._intrinsics, _DEPTH_RANGE_M)
+        return found
 
 
 class LidarTruth:
@@ -102,11 +109,7 @@ class LidarTruth:
         ranges = np.linalg.norm(points, axis=1)
         self._limits[frame] = _elevations(points, ranges)
         points = apply(sequence.T_camera_lidar, points[ranges <= RANGE_M])
-        camera = sequence.intrinsics
-        inside = points[:, 2] > NEAREST_M
-        pixels = camera.project(points[inside])
-        inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
-        return Surface(apply(sequence.reference[frame], points), inside)
+        return Surface(apply(sequence.reference[frame], points), _in_image(points, sequence.intrinsics, np.inf))
 
     def in_field(self, points: FloatArray, frames: Indices) -> Mask:
         """Points within 25 m of a scanner, between its lowest and its highest beam."""
@@ -123,6 +126,14 @@ class LidarTruth:
             sine = seen[:, 2] / np.maximum(ranges, 1e-6)
             found |= (ranges <= RANGE_M) & (sine >= low) & (sine <= high)
         return found
+
+
+def _in_image(points: FloatArray, camera: Intrinsics, furthest_m: float) -> Mask:
+    """Which points of a camera ``(P, 3)`` project into its image."""
+    inside = (points[:, 2] > NEAREST_M) & (points[:, 2] <= furthest_m)
+    pixels = camera.project(points[inside])
+    inside[inside] = ((pixels > -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+    return inside
 
 
 def _elevations(points: FloatArray, ranges: FloatArray) -> tuple[float, float]:

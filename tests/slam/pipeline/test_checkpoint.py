@@ -96,9 +96,11 @@ def test_frames_that_follow_have_their_true_depth(tmp_path: Path) -> None:
     street = SimulatedStreet(SimulationOptions(route="straight", frames=16, seed=1003, width=208, height=64))
     root = tmp_path / "root"
     write_kitti_root(street, root, depth=True, lidar=True)
-    before = run(root, tmp_path / "before", "0:7", overrides=["output.report=false", "mapping.min_weight=1"]).path
+    settings = ["output.report=false", "mapping.min_weight=1", "output.keep=keyframes"]
+    before = run(root, tmp_path / "before", "0:7", overrides=settings).path
     metrics = run(root, tmp_path / "after", "8:", overrides=(), continues=before).metrics()
     assert metrics["map"]["truth"] == "depth maps" and metrics["map"]["with_scale"]["accuracy_median_m"] < 1
+    assert 0 < metrics["map"]["with_scale"]["in_field"]["share"] < 1
     assert 0 < metrics["depth"]["network"]["abs_rel"] < 0.5
     reason = metrics["trajectories"]["lidar_reason"]
     assert reason == "LiDAR scans are not used where a drive continues another folder"

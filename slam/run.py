@@ -42,6 +42,7 @@ from slam.runtime.imports import import_rerun
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
+from slam.storage.files import from_anywhere
 
 logger = logging.getLogger(__name__)
 
@@ -222,7 +223,7 @@ def _settings_from_anywhere(settings: SlamConfig) -> SlamConfig:
     kind, colon, path = settings.depth.source.partition(":")
     if not colon:
         return settings
-    depth = settings.depth.model_copy(update={"source": f"{kind}:{_from_anywhere(path)}"})
+    depth = settings.depth.model_copy(update={"source": f"{kind}:{from_anywhere(path)}"})
     return settings.model_copy(update={"depth": depth})
 
 
@@ -244,7 +245,7 @@ def provenance_of(
         command=request.command,
         seed=request.seed or 0,
         device=str(networks.device),
-        weights=_from_anywhere(request.weights) if is_folder else str(request.weights),
+        weights=from_anywhere(request.weights) if is_folder else str(request.weights),
         weights_sha256=networks.sha256,
         noise_sha256=networks.noise_sha256 or None,
         weights_licence=networks.record.licence,
@@ -260,12 +261,6 @@ def _recording(request: RunRequest) -> dict[str, str]:
     """The options that name the recording."""
     files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
     named = {name: Path(path) for name, path in files.items() if path is not None}
-    places = {name: _from_anywhere(path) for name, path in named.items()}
+    places = {name: from_anywhere(path) for name, path in named.items()}
     words = {"sequence": request.sequence, "frames": request.frames}
     return places | {name: word for name, word in words.items() if word is not None}
-
-
-def _from_anywhere(name_or_path: str | Path) -> str:
-    """A file or folder by its whole path, for the run may be opened from another folder; a name as it is."""
-    path = Path(name_or_path)
-    return str(path.absolute() if path.exists() else name_or_path)

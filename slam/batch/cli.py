@@ -11,6 +11,7 @@ import typer
 
 from slam.errors import RunError, SlamError
 from slam.runtime.progress import progress_bar
+from slam.storage.files import from_anywhere
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -49,9 +50,9 @@ def batch(
         raise SlamError("--memory needs Linux: leave it out here")
     options = [word for value in overrides or [] for word in ("--set", _seen_from_here(value))]
     if weights is not None:
-        options += ["--weights", _whole(weights) if Path(weights, "model.yaml").is_file() else weights]
+        options += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
     if config is not None:
-        options += ["--config", _whole(config) if Path(config).is_file() else config]
+        options += ["--config", from_anywhere(config) if Path(config).is_file() else config]
     options += ["--frames", frames] if frames is not None else []
     options += ["--seed", str(seed), "--device", device]
     planned = drives_of(drives, sequence or ["all"], options)
@@ -72,16 +73,10 @@ def batch(
         raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")
 
 
-def _whole(path: str) -> str:
-    """A path that holds in the folder of a drive, too."""
-    return str(Path(path).absolute())
-
-
 def _seen_from_here(override: str) -> str:
-    """The same for the path of ``depth.source``."""
+    """The path of ``depth.source`` holds in the folder of a drive, too."""
     kind, colon, path = override.partition(":")
-    is_path = kind.startswith("depth.source=") and colon and Path(path).exists()
-    return f"{kind}:{_whole(path)}" if is_path else override
+    return f"{kind}:{from_anywhere(path)}" if kind.startswith("depth.source=") and colon else override
 
 
 def _print(table: Table) -> None:

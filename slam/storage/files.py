@@ -1,4 +1,4 @@
-"""Atomic writes, with one line of error."""
+"""Atomic writes, with one line of error, and places of files."""
 
 from __future__ import annotations
 
@@ -37,3 +37,9 @@ def remove(path: Path, error: type[SlamError] = SlamError) -> None:
         path.unlink(missing_ok=True)
     except OSError as cause:
         raise error(f"{path} cannot be removed: {cause.strerror or cause}") from cause
+
+
+def from_anywhere(name_or_path: str | Path) -> str:
+    """A file or folder that is there by its whole path, which holds in any folder; all else as it is."""
+    path = Path(name_or_path)
+    return str(path.absolute() if path.exists() else name_or_path)

@@ -42,6 +42,7 @@ from slam.runtime.imports import import_rerun
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
+from slam.sequences.undistortion import undistortion_of
 from slam.storage.files import from_anywhere
 
 logger = logging.getLogger(__name__)
@@ -191,7 +192,9 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
         checkpoint = state_to_continue(request.continues, following)
         recording = checkpoint.continued(following)
         first = len(recording) - len(following)
-    source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first))
+    lens = undistortion_of(following)
+    undistort = None if lens is None else lens.apply_to_depth
+    source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first), undistort)
     sha256 = mixed_sha256(networks.sha256, source)
     before = resumes or request.continues
     if checkpoint is not None and checkpoint.weights_sha256 != sha256:

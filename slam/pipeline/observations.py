@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from slam.config import MappingConfig
+from slam.depth_sampling import resized_depth
 from slam.frames import DepthMap, Ends, Frame, Image, SnippetPoses
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import InterpolatedGaps
@@ -41,7 +42,7 @@ class Keyframe:
         image, depth = frame.image, depth_unscaled
         if ratio < 1.0:
             size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
-            depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+            depth = resized_depth(depth, *size)
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         return cls(frame.index, spill_file.put(image), spill_file.put(depth))
 

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from erfsfm.inference import DepthPosePredictor
 from slam.config import DepthConfig
 from slam.errors import SlamError
 from slam.frames import Intrinsics, Predictor
-from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
 from slam.prediction.depth_source import DepthSource, SourcedPredictor
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
 from slam.storage.fingerprint import code_fingerprint
 
-logger = logging.getLogger(__name__)
 
-
-def open_depth(config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumbers | None) -> DepthSource | None:
+def open_depth(
+    config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumbers | None, undistort: Undistort | None = None
+) -> DepthSource | None:
     """Open and check the source of depth; None where depth is that of the networks.
 
     Args:
         config: which source.
         intrinsics: of the images.
         numbers: of the frames; None where they are not known beforehand, as live.
+        undistort: what is done with the images as they are read, for depth files of the stored ones.
 
     Raises:
         SlamError: the source is missing, damaged or does not fit.
@@ -40,13 +40,7 @@ def open_depth(config: DepthConfig, intrinsics: Intrinsics, numbers: FrameNumber
             f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or onnx:FILE "
             "for frames as they come"
         )
-    if intrinsics.undistorted:
-        logger.warning(
-            "images of this camera are undistorted as they are read: depth.source=%s must be depth of the undistorted "
-            "images, not of the stored ones, which would bend the map",
-            config.source,
-        )
-    return DepthFolder(config, numbers, intrinsics.width, intrinsics.height)
+    return DepthFolder(config, numbers, intrinsics.width, intrinsics.height, undistort)
 
 
 def make_predictor(

@@ -17,11 +17,12 @@ from erfsfm.readers.images import natural_key, read_values
 from erfsfm.readers.numbering import by_name
 from slam.config import DepthConfig
 from slam.errors import SlamError, sequence_errors
-from slam.frames import Frame
-from slam.prediction.depth_source import Disparity, Kind, disparity_of
+from slam.frames import DepthMap, Frame
+from slam.prediction.depth_source import Disparity, Kind, at_size, disparity_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 26
+Undistort = Callable[[DepthMap], DepthMap]  # z-depth (H, W) of a stored image to that of the undistorted one
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,16 @@ class FrameNumbers:
 class DepthFolder:
     """Files of a folder in the order of their numbers, or names; each is checked before the first is used."""
 
-    def __init__(self, config: DepthConfig, numbers: FrameNumbers, width: int, height: int) -> None:
+    def __init__(
+        self, config: DepthConfig, numbers: FrameNumbers, width: int, height: int, undistort: Undistort | None = None
+    ) -> None:
         """Check the files of the frames of a run.
 
         Args:
             config: a source of kind ``npy`` or ``png``.
             numbers: of the frames.
             width, height: of the images.
+            undistort: for files of distorted images that are undistorted as they are read.
 
         Raises:
             SlamError: no such folder, another number of files than frames, or a file that is no depth map.
@@ -57,6 +61,7 @@ class DepthFolder:
         self.identity = f"{suffix} {config.kind} {config.align} {config.png_scale}"
         self._kind: Kind = "disparity" if config.kind == "disparity" else "depth"
         self._scale = config.png_scale if suffix == "png" else 1.0
+        self._size, self._undistort = (height, width), undistort
         self._read: Callable[[Path], NDArray[Any]] = _read_png if suffix == "png" else _read_npy
         folder = Path(path).expanduser()
         paths = _listed(folder, suffix)
@@ -81,7 +86,11 @@ class DepthFolder:
             raise SlamError(f"{self._folder} has no depth for frame {frame.index}: its number is missing, add the file")
         with sequence_errors():
             values = self._read(path)
-        return disparity_of(values / self._scale, self._kind)
+        disparity = disparity_of(values / self._scale, self._kind)
+        if self._undistort is None:
+            return disparity
+        depth = np.asarray(1 / at_size(disparity, *self._size), np.float32)
+        return disparity_of(self._undistort(depth), "depth")
 
     def _checked(self, header: Callable[[Path, bytes], tuple[int, int]], width: int, height: int) -> str:
         """SHA-256 of all names and files of the run's frames, whose sizes must agree."""

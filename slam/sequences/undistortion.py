@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.readers.camera_file import CameraFile
+from slam.depth_sampling import sampled_depth
 from slam.errors import SequenceError
-from slam.frames import Image, Intrinsics
+from slam.frames import DepthMap, Image, Intrinsics, Sequence
 from slam.se3 import FloatArray
-from slam.sequences.recording import ImageSource
+from slam.sequences.excerpt import Excerpt
+from slam.sequences.recording import ImageSource, RecordedSequence
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +70,10 @@ class Undistortion:
             )
         flat: Image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return flat
+
+    def apply_to_depth(self, depth: DepthMap) -> DepthMap:
+        """Undistort z-depth ``(H, W)`` of an image, not positive or not finite where unknown."""
+        return sampled_depth(depth, *self._maps)
 
     def distort(self, pixels: FloatArray, K: FloatArray) -> FloatArray:
         """Distorted pixels of the ``pixels`` ``(N, 2)`` of a pinhole ``K`` ``(3, 3)``."""
@@ -127,7 +133,7 @@ class UndistortedImages:
 
     def __init__(self, images: ImageSource, undistortion: Undistortion) -> None:
         self._images = images
-        self._undistortion = undistortion
+        self.undistortion = undistortion
         self.width, self.height = images.width, images.height
 
     def __len__(self) -> int:
@@ -136,7 +142,15 @@ class UndistortedImages:
 
     def read(self, index: int) -> Image:
         """One undistorted image ``(height, width, 3)`` uint8 RGB."""
-        return self._undistortion.apply(self._images.read(index))
+        return self.undistortion.apply(self._images.read(index))
+
+
+def undistortion_of(recording: Sequence) -> Undistortion | None:
+    """What a recording does with its images as it reads them; None where they have no distortion."""
+    if isinstance(recording, Excerpt):
+        return undistortion_of(recording.base)
+    images = recording.images if isinstance(recording, RecordedSequence) else None
+    return images.undistortion if isinstance(images, UndistortedImages) else None
 
 
 def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[ImageSource, Intrinsics]:

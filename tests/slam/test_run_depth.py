@@ -11,12 +11,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 import slam.cli
 from slam import Slam, run_slam
 from slam.config import load_config
 from slam.errors import SlamError
 from slam.localisation.localiser import localise
+from slam.loops.places import PLACES, Places
+from slam.pipeline.checkpoint import KEYFRAMES, read_keyframes
 from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
@@ -112,6 +115,23 @@ def test_a_range_of_frames_and_a_blank_one(
     metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics()
     assert metrics["status"] == "ok" and "frame 10 has no known depth" in caplog.text
     assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
+
+
+def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
+    depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
+    lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
+    camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
+    chosen = ["mapping.enabled=true", "output.keep=keyframes"]
+    finished = run(world, tmp_path / "run", f"png:{exact(world)}", *chosen, camera=camera, frames="0:7")
+    pinhole = Places.read(finished.path / PLACES).intrinsics
+    K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
+    maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (416, 128), cv2.CV_32FC1)
+    stored = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
+    wanted = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
+    kept = next(read_keyframes(finished.path / KEYFRAMES))
+    both = (wanted > 0) & np.isfinite(kept.depth_unscaled)
+    assert np.quantile(np.abs(kept.depth_unscaled / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
+    np.testing.assert_array_equal(np.isfinite(kept.depth_unscaled), wanted > 0)
 
 
 def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path) -> None:

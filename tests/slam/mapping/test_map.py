@@ -89,6 +89,28 @@ def test_thinned_keyframes_keep_the_geometry():
     assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15
 
 
+@pytest.mark.parametrize("width", [70, 104])  # of 208: 2.97 and exactly 2
+def test_thinned_depth_is_not_shifted(width):
+    thinned = CAMERA.resized(width, round(CAMERA.height * width / CAMERA.width))
+    road = np.where(Y > 0.02, 1.65 / np.maximum(Y, 0.02), np.nan).astype(np.float32)
+    kept = Keyframe.of(Frame(0, 0.0, GREY), road, SpillFile(), MappingConfig(width_px=width)).depth_unscaled
+    rays = thinned.rays(thinned.pixel_grid())
+    assert np.isfinite(kept[rays[..., 1] > 0.05]).all()
+    heights = (rays[..., 1] * kept)[(kept > 3) & (kept < 20)]
+    assert np.abs(np.median(heights) / 1.65 - 1) < 0.001
+
+
+@pytest.mark.parametrize("width", [70, 104])
+def test_thinning_invents_no_depth_across_edges_and_beside_unknown_pixels(width):
+    rng = np.random.default_rng(0)
+    blocks = rng.choice([0.0, 5.0, 9.0], (16, 52)).repeat(4, axis=0).repeat(4, axis=1)[:64, :208]
+    depth = np.where(rng.random(blocks.shape) < 0.1, np.nan, blocks).astype(np.float32)
+    kept = Keyframe.of(Frame(0, 0.0, GREY), depth, SpillFile(), MappingConfig(width_px=width)).depth_unscaled
+    assert set(np.unique(kept[kept > 0])) == {5, 9}
+    of_each = [np.mean(np.isnan(d) | (d == 0)) for d in (kept, depth)]
+    assert of_each[0] == pytest.approx(of_each[1], abs=0.02)
+
+
 def test_depth_inconsistent_between_views_is_left_out():
     def ghost(depth, k):
         depth = depth.copy()

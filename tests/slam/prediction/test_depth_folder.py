@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,7 @@ import pytest
 
 from slam.config import DepthConfig
 from slam.errors import SlamError
-from slam.frames import Frame, Intrinsics
-from slam.prediction.assembly import open_depth
+from slam.frames import Frame
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers
 
 HEIGHT, WIDTH = 12, 40
@@ -39,15 +37,6 @@ def metres(source: DepthFolder, index: int) -> float:
     disparity = source.disparity(frame(index))
     assert disparity is not None
     return float(1 / disparity[0, 0])
-
-
-def test_a_lens_with_distortion_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = DepthConfig(source=f"npy:{folder_of(tmp_path, ['0.npy'])}")
-    pinhole = Intrinsics(WIDTH, HEIGHT, 30.0, 30.0, 19.5, 5.5)
-    for camera in (pinhole, replace(pinhole, undistorted=True)):
-        assert not caplog.messages
-        assert isinstance(open_depth(config, camera, FrameNumbers(1, 0, 1)), DepthFolder)
-    assert "depth of the undistorted images" in caplog.text
 
 
 @pytest.mark.parametrize("first", [0, 1, 100])

@@ -142,7 +142,7 @@ class SlamPipeline:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
         Args:
-            journal: keeps the state of the pass every 100 frames.
+            journal: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """

@@ -22,6 +22,8 @@ from slam.storage.files import JOURNAL_FILE, write_atomically
 logger = logging.getLogger(__name__)
 
 EVERY_FRAMES = 100
+# maps of keyframes, rewritten whole with each state, grow with the drive: so must the distance between states
+_GROWTH = 0.1
 
 
 class Journal:
@@ -48,10 +50,11 @@ class Journal:
         self._counts = {name: len(items) for name, items in _items(seen).items()}
 
     def keep(self, state: ObserverState) -> None:
-        """Write what is new since the last call, then the state of the front end."""
-        if not self._is_writable:
+        """Write what is new since the last state, then the state of the front end; maps, at distances that grow."""
+        frames, items, before = len(state.seen.roads), _items(state.seen), self._counts.get("roads", 0)
+        is_early = state.keyframes is not None and frames - before < _GROWTH * before
+        if is_early or not self._is_writable:
             return
-        frames, items = len(state.seen.roads), _items(state.seen)
         new = Observations(**{name: _after(each, self._counts.get(name, 0)) for name, each in items.items()})
         whole = replace(self._checkpoint_of(state), reference=None, state=replace(state, seen=Observations()))
         measured = replace(new, keyframes=[], examples=[])

@@ -64,6 +64,8 @@ class KeyframeTracking:
         """Track the next usable frame."""
         if self._odometry is not None:
             self._odometry.follow(frame)
+            if self._odometry.lost_map() is None:
+                self._places = None
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned depth ``(H, W)`` of one of the last two frames."""
@@ -75,9 +77,7 @@ class KeyframeTracking:
         if self._odometry is None:
             return
         lost = self._odometry.lost_map()
-        if lost is None:
-            self._places = None
-        elif self._loops.enabled and frame.index % _RELOCALISED_FRAMES == 0:
+        if lost is not None and self._loops.enabled and frame.index % _RELOCALISED_FRAMES == 0:
             self._relocalise(self._odometry, lost.map, frame, depth)
 
     def _relocalise(self, odometry: WindowOdometry, lost: LocalMap, frame: Frame, depth: DepthMap) -> None:

@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.errors import ConfigError, RunError, SlamError
+from slam.errors import ConfigError, RunError, SequenceError, SlamError
+from slam.frames import Frame
 from slam.pipeline import batch
+from slam.pipeline.observer import Observer
 from slam.results.folder import RunFolder
 from slam.storage.files import JOURNAL_FILE
 
@@ -91,6 +93,32 @@ def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
         assert (output / name).read_bytes() == (whole / name).read_bytes(), name
     assert metrics["map"] == RunFolder(whole).metrics()["map"]
     assert {path.name for path in output.iterdir()} == {path.name for path in whole.iterdir()}
+
+
+def test_states_of_a_carried_camera_are_kept_at_distances_that_grow(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = [*OVERRIDES, "window.use=always", "mapping.enabled=false"]
+    options: dict[str, Any] = {"weights": tiny_weights, "overrides": overrides, "frames": "0:13"}
+    uninterrupted = run_slam(kitti_root, "sim", output=tmp_path / "whole", **options).path
+    output, add = tmp_path / "run", Observer.add
+    kept: list[str] = []
+
+    def add_or_end(self: Observer, index: int, frame: Frame | SequenceError) -> None:
+        kept.extend(name for name in journal(output) if "state" in name)
+        if index == 12:
+            raise RunError("ended")
+        add(self, index, frame)
+
+    monkeypatch.setattr(batch, "EVERY_FRAMES", 1)
+    with monkeypatch.context() as patched, pytest.raises(RunError, match="ended"):
+        patched.setattr(Observer, "add", add_or_end)
+        run_slam(kitti_root, "sim", output=output, **options)
+    assert kept == [f"pass-state-{frames:06d}.zip" for frames in (*range(1, 12), 11)]
+    metrics = run_slam(continues=output).metrics()
+    assert metrics["sequence"]["continued_at"] == 11
+    for name in SAME:
+        assert (output / name).read_bytes() == (uninterrupted / name).read_bytes(), name
 
 
 def test_it_goes_on_from_another_folder_and_says_once_that_it_did_not_end(

@@ -107,6 +107,10 @@ class LocalMap:
         if len(self.keyframes) > _IMAGES_KEPT:
             self.keyframes[-_IMAGES_KEPT - 1] = replace(self.keyframes[-_IMAGES_KEPT - 1], grey=None)
 
+    def forget_images(self) -> None:
+        """Free the images of a map to which no keyframe will be added."""
+        self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
+
     def triangulate(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
         newest = self.keyframes[-1]

@@ -210,6 +210,8 @@ class WindowOdometry:
             return
         segment.map.points[track_ids[found.solid]] = found.points[found.solid]
         segment.started = True
+        for before in self._state.segments[:-1]:
+            before.map.forget_images()
         self._note(frame.index, "map begun", support=int(found.solid.sum()))
         self._state.T_camera_world = found.T_current_first
         self._add_keyframe(segment, frame, track_ids, pixels)

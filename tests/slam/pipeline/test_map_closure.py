@@ -133,20 +133,30 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     assert rotation < 0.3
 
 
-def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is() -> None:
+@pytest.mark.parametrize(
+    ("places", "unseen", "sparse", "relocalised"),
+    [
+        ([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 69]),
+        ([*range(61), 68, 60, 8], (60, 62), (61,), [63]),
+    ],
+    ids=["relocalised before", "located in a frame without depth before"],
+)
+def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
+    places: list[int], unseen: Sequence[int], sparse: Sequence[int], relocalised: list[int]
+) -> None:
     """As by a session that is resumed after every frame, and remembers no earlier map."""
-    walked = there_and_back(110, roll=0.4, closer=0.3)
-    truth = np.concatenate([walked[:60], walked[82:89], walked[35:38]])
+    truth = there_and_back(110, roll=0.4, closer=0.3)[places]
     config, states = WindowConfig(max_corners=400, use="always"), [WindowState(), WindowState()]
     going_on, resumed = (KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, state) for state in states)
     for k, T in enumerate(truth):
-        frame, depth = room.frame(k, T, 9 if 60 <= k < 66 else 0), room.depth_map(T)
+        frame, depth = room.frame(k, T, 9 if k in unseen else 0), room.depth_map(T)
         for tracking in (going_on, resumed):
             tracking.follow(frame)
-            tracking.learn(frame, depth)
-            tracking.look_for_lost(frame, depth)
+            if k not in sparse:
+                tracking.learn(frame, depth)
+                tracking.look_for_lost(frame, depth)
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
-    assert [each.frame for each in states[0].events if each.event == "relocalised"] == [66, 69]
+    assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
     assert states[0].events == states[1].events
 
 

@@ -99,10 +99,13 @@ def test_standing_after_a_walk_adds_no_keyframe_and_does_not_drift() -> None:
 
 def test_another_scene_begins_another_map() -> None:
     walked = room.walk(80)
-    found = poses(tracked(walked, [0] * 35 + [7] * 45))
+    state = tracked(walked, [0] * 35 + [7] * 45)
+    found = poses(state)
     assert len(set(found.segments.values())) == 2
     assert max(frame for frame, number in found.segments.items() if number == 0) < 35
     assert not any(pose.from_index < 35 <= pose.to_index for pose in found.poses)
+    images = [[keyframe.grey is not None for keyframe in segment.map.keyframes] for segment in state.segments]
+    assert not any(images[0]) and any(images[1])
 
 
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:

@@ -87,7 +87,14 @@ def predict(
     Example: erfsfm predict drive/images --weights default --output depth
     """
     from erfsfm.errors import DataError
-    from erfsfm.inference import DepthPosePredictor, colour_disparity, read_image, save_depth, save_image
+    from erfsfm.inference import (
+        DepthPosePredictor,
+        colour_disparity,
+        is_prediction,
+        read_image,
+        save_depth,
+        save_image,
+    )
     from erfsfm.readers.images import list_images
 
     if output.is_file():
@@ -98,10 +105,10 @@ def predict(
     if output.resolve() in {file.parent.resolve() for file in files}:
         raise DataError(f"{output} holds the images themselves: choose another --output, or they would be overwritten")
     for file in files:
-        if (output / f"{file.stem}.png").is_file() and not (output / f"{file.stem}.npy").is_file():
-            raise DataError(
-                f"{output / file.stem}.png is no earlier prediction and would be replaced: choose another --output"
-            )
+        depth_file = output / f"{file.stem}.npy"
+        found = [path for path in (depth_file, depth_file.with_suffix(".png")) if path.exists()]
+        if found and not is_prediction(depth_file):
+            raise DataError(f"{found[0]} is no earlier prediction and would be replaced: choose another --output")
     predictor = DepthPosePredictor.from_weights(weights, device)
     unreadable = []
     for file in files:

@@ -303,3 +303,18 @@ def save_depth(path: Path, depth: NDArray[np.float32]) -> None:
             np.save(file, depth)
 
     write_atomically(path, write)
+
+
+def is_prediction(depth_file: Path) -> bool:
+    """Whether a ``.npy`` file and the ``.png`` beside it were predicted: the picture must be that of the array."""
+    picture_file = depth_file.with_suffix(".png")
+    if not (depth_file.is_file() and picture_file.is_file()):
+        return False
+    try:
+        depth, picture = np.load(depth_file, mmap_mode="r", allow_pickle=False), read_image(picture_file)
+    except (OSError, ValueError, EOFError, DataError):
+        return False
+    if not isinstance(depth, np.ndarray) or depth.dtype != np.float32 or depth.shape != picture.shape[:2]:
+        return False
+    with np.errstate(all="ignore"):
+        return np.array_equal(colour_disparity(depth), picture)

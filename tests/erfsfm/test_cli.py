@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -272,7 +273,8 @@ def test_predict_leaves_out_what_it_cannot_read(
     assert code == 0 and f"depth of 2 images in {depth}" in out
     assert "1 of 3 images are left out" in caplog.text and "b.png is truncated" in caplog.text
     assert sorted(p.name for p in depth.iterdir()) == ["a.npy", "a.png", "c.npy", "c.png"]
-    (depth / "b.npy").touch()  # depth of the image as it was
+    for suffix in (".npy", ".png"):  # depth of the image as it was
+        shutil.copy(depth / f"a{suffix}", depth / f"b{suffix}")
     code, _, err = run(*given)
     assert code == 1 and "b.png is truncated" in err and "b.npy is of an earlier image: remove it" in err
 
@@ -290,6 +292,27 @@ def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights
     assert code == 1
     assert "overwritten" in err
     assert (tmp_path / "a.png").read_bytes() == before
+
+
+@pytest.mark.parametrize("suffixes", [[".npy"], [".png"], [".npy", ".png"]])
+def test_predict_replaces_earlier_predictions_alone(
+    run: Run, tmp_path: Path, weights: Path, suffixes: list[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 30, 3), 99, np.uint8))
+    depth = tmp_path / "depth"
+    given = ["predict", tmp_path / "a.png", "--weights", weights, "--output", depth]
+    assert [run(*given)[0] for _ in range(2)] == [0, 0]
+    shutil.rmtree(depth)
+    depth.mkdir()
+    np.save(depth / "a.npy", np.full((20, 30), 42, np.float32))
+    cv2.imwrite(str(depth / "a.png"), np.full((20, 30, 3), 7, np.uint8))
+    for path in depth.iterdir():
+        if path.suffix not in suffixes:
+            path.unlink()
+    before = {path.name: path.read_bytes() for path in depth.iterdir()}
+    code, _, err = run(*given)
+    assert code == 1 and f"a{suffixes[0]} is no earlier prediction" in err
+    assert {path.name: path.read_bytes() for path in depth.iterdir()} == before
 
 
 def test_evaluate_depth(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:

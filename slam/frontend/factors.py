@@ -77,9 +77,14 @@ def make_factors(
 
 def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
-    numbers = set(window.segments.values())
-    units = {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
+    units = map_units(window, scale)
     return [pose.scaled(units[window.segments[pose.from_index]]) for pose in poses]
+
+
+def map_units(window: WindowPoses, scale: Scale) -> dict[int, float]:
+    """The unit of the scale per learned length in each map, by the map's number."""
+    numbers = set(window.segments.values())
+    return {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:

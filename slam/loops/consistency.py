@@ -36,7 +36,8 @@ def agreeing(
         drift = np.linalg.norm((T_earlier_later - loop.measured.T_from_to)[:3, 3])
         length = path[later] - path[earlier]
         if drift > thresholds.max_drift_ratio * length:
-            refused.append(loop.refused(f"corrects the odometry by {drift:.1f} over a path of {length:.0f}"))
+            limit = f"{thresholds.max_drift_ratio:.0%}"
+            refused.append(loop.refused(f"corrects the odometry by more than {limit} of the path between its frames"))
         else:
             possible.append(loop)
     for loop, (supporting, conflicting) in zip(possible, _votes(possible, T_world_camera, thresholds), strict=True):

@@ -5,7 +5,7 @@ All thresholds are independent of scale: pixels, ratios, degrees, and lengths ov
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,12 @@ class RejectedLoop:
     score: float
     inliers: int = 0
     T_from_to: FloatArray | None = None
+
+    def scaled(self, scale: float) -> RejectedLoop:
+        """The same in another unit: the translation times ``scale``."""
+        if self.T_from_to is None:
+            return self
+        return replace(self, T_from_to=make(self.T_from_to[:3, :3], scale * self.T_from_to[:3, 3]))
 
 
 class LoopVerifier:

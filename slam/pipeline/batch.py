@@ -15,7 +15,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.factors import Unscaled, chain_odometry, make_factors, scaled_poses
+from slam.frontend.factors import Unscaled, chain_odometry, make_factors
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
@@ -203,7 +203,7 @@ class SlamPipeline:
     def close_loops(self, seen: ClosedObservations, measured: Measurements) -> LoopClosures:
         """Loops after the last frame: those of the closed maps, or else among all views."""
         if seen.closure is not None:
-            return seen.closure.closures(scaled_poses(seen.window.loops, seen.window, measured.scale))
+            return seen.closure.closures(measured.scale)
         with self._watch.stage("loops"):
             scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in seen.views]
             intrinsics, config = self._sequence.intrinsics, self._config.loops

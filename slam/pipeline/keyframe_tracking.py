@@ -152,6 +152,11 @@ class KeyframeTracking:
         return window_poses(maps, self._intrinsics, self._seed)
 
 
+def has_keyframes(config: WindowConfig, seen: Observations) -> bool:
+    """Whether a drive of which this was measured is tracked by keyframes, so that its state has them."""
+    return config.use == "always" or (config.use == "auto" and is_vehicle(seen) is not True)
+
+
 def is_vehicle(seen: Observations) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
     triangulated = (motion for motion in seen.motions if motion.is_triangulated)

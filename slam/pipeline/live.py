@@ -22,7 +22,7 @@ from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.growing import GrowingSequence
-from slam.pipeline.keyframe_tracking import decided
+from slam.pipeline.keyframe_tracking import decided, has_keyframes
 from slam.pipeline.observer import Observer, ObserverState
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
@@ -216,7 +216,8 @@ class Slam:
         """Continue after the last frame of a file by `save`, with the whole drive solved.
 
         Raises:
-            SlamError: there are frames already, or the file is missing, damaged or of another camera or other weights.
+            SlamError: there are frames already, or the file is missing, damaged or of another camera, other weights or
+                another ``window.use``.
         """
         if len(self):
             raise SlamError(f"{path} can only be resumed before the first frame; there are {len(self)} already")
@@ -224,6 +225,8 @@ class Slam:
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
+        if has_keyframes(self._config.window, checkpoint.state.seen) != (checkpoint.state.keyframes is not None):
+            raise SlamError(f"{path} was made with another window.use: make Slam with the same")
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
         self._sequence.stamps = checkpoint.stamps

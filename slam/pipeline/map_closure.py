@@ -12,11 +12,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.config import SlamConfig
-from slam.frames import Intrinsics, RelativePose, RelativeSimilarity, TrackingEvent
+from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent
+from slam.frontend.factors import map_units, scaled_poses
+from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.joining import SharedCorners, join
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment
-from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.loops.closure import LoopClosures
 from slam.loops.descriptors import View
 from slam.loops.maps import MapLoop, find_map_loops
@@ -38,7 +40,10 @@ _LEAST_SIGMA = 1e-4
 
 @dataclass(frozen=True)
 class MapClosure:
-    """Poses by the closed maps, their accepted ``loops``, the rejected ones, and the maps that were joined."""
+    """Poses by the closed maps, their accepted ``loops``, the rejected ones, and the maps that were joined.
+
+    Rejected loops are in the unit of learned depth, accepted ones in that of their maps.
+    """
 
     poses: WindowPoses
     loops: tuple[MapLoop, ...] = ()
@@ -47,10 +52,12 @@ class MapClosure:
     measured: int = 0
     joins: tuple[TrackingEvent, ...] = ()
 
-    def closures(self, scaled: Sequence[RelativePose]) -> LoopClosures:
-        """The loops, by their relative poses in the unit of the trajectory."""
+    def closures(self, scale: Scale) -> LoopClosures:
+        """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
+        scaled, units = scaled_poses(self.poses.loops, self.poses, scale), map_units(self.poses, scale)
         accepted = (Loop(pose, loop.inliers, loop.score) for pose, loop in zip(scaled, self.loops, strict=True))
-        rejected = sorted(self.rejected, key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
+        rejected = [loop.scaled(units[self.poses.segments[loop.from_index]]) for loop in self.rejected]
+        rejected.sort(key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
         return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
 
 
@@ -80,7 +87,7 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     joins = rows.joins(loops)
     for joined in joins:
         logger.info("%s", joined)
-    return MapClosure(poses, tuple(loops), tuple(rejected), found.candidates, found.measured, joins)
+    return MapClosure(poses, tuple(loops), rows.in_learned_unit(rejected), found.candidates, found.measured, joins)
 
 
 def views_of(local: LocalMap) -> list[View]:
@@ -119,6 +126,13 @@ class _Rows:
         """A loop rejected after all."""
         first, last = (self.keyframes[row].index for row in loop.rows)
         return RejectedLoop(first, last, reason, loop.score, loop.inliers, loop.similarity.T_from_to)
+
+    def in_learned_unit(self, rejected: Sequence[RejectedLoop]) -> tuple[RejectedLoop, ...]:
+        """Rejected loops in the unit of learned depth in place of that of their first frame's map."""
+        units: dict[int, float] = {}
+        for segment in self.segments:
+            units |= dict.fromkeys((keyframe.index for keyframe in segment.map.keyframes), learned_unit(segment.map))
+        return tuple(loop.scaled(units[loop.from_index]) for loop in rejected)
 
     def joins(self, loops: Sequence[MapLoop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""

@@ -270,7 +270,7 @@ def live(root: Path, **options: Any) -> Slam:
 
     assert sequence.reference is not None
     oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3), 0.2)
-    return Slam(oracle, sequence.intrinsics, load_config(), sequence.camera_height_m, **options)
+    return Slam(oracle, sequence.intrinsics, camera_height_m=sequence.camera_height_m, **options)
 
 
 def feed(slam: Slam, root: Path, frames: range) -> None:
@@ -304,5 +304,7 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")
+    with pytest.raises(SlamError, match=r"was made with another window\.use"):
+        live(kitti_root, config=load_config(None, ["window.use=always"])).resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="is missing"):
         live(kitti_root).resume(tmp_path / "none.zip")

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from slam.config import SlamConfig, WindowConfig
 from slam.frames import RelativeSimilarity
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.odometry import WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.loops import maps
 from slam.loops.descriptors import View
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
 from slam.pipeline import map_closure
@@ -158,6 +161,24 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
     assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
     assert states[0].events == states[1].events
+
+
+def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "OF_KEYFRAMES", replace(maps.OF_KEYFRAMES, min_support=99, alone_inliers=10_000))
+    truth = np.concatenate([there_and_back(110, roll=0.4, closer=0.3)[rows] for rows in (slice(30), slice(48, 110))])
+    after = closed(tracked(truth, [0] * 30 + [9] * 11 + [0] * 51))
+    unit = MeasurementFailure("no road")
+    loops = after.closures(Scale("none", unit, np.full(len(truth), 3.0), {}, "the networks' own unit"))
+    measured = [loop for loop in loops.rejected if loop.T_from_to is not None]
+    assert loops.accepted == () and len(measured) > 3
+    lengths = {pose.ends: np.linalg.norm(pose.T_from_to[:3, 3]) for pose in after.poses.poses}
+    true = {(a, b): np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3]) for a, b in lengths}
+    units = [length / true[ends] for ends, length in lengths.items() if ends[0] < 30]
+    for loop in measured:
+        assert loop.T_from_to is not None
+        T = invert(truth[loop.from_index]) @ truth[loop.to_index]
+        ratio = np.linalg.norm(loop.T_from_to[:3, 3]) / np.linalg.norm(T[:3, 3])
+        assert ratio == pytest.approx(3.0 * np.median(units), rel=0.1)
 
 
 def test_another_scene_is_no_loop() -> None:

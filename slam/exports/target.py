@@ -50,9 +50,9 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
         check_replaced(output, _BEGINNINGS[what])
     if what == "occupancy" and output.suffix.lower() in _BEGINNINGS[what]:
         files = [output.with_suffix(suffix) for suffix in _BEGINNINGS[what]]
-        others = [path for path in files if path.exists() and path.stat().st_size]
-        if others and not describes_map(files[0]):
-            raise RunError(f"{others[0]} exists and is no map of ROS: choose another --output")
+        present = [path for path in files if path.exists() and path.stat().st_size]
+        if present and not describes_map(files[0]):
+            raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
         for path in files:
             check_replaced(path, _BEGINNINGS[what])
     for path in files:

@@ -44,9 +44,13 @@ def export(
     """
     from slam.exports.export import export as export_run
     from slam.exports.options import ExportOptions, parse_crop, parse_origin
+    from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
 
+    folder = RunFolder.open(run)
     options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
     with progress_bar() as progress:
-        written = export_run(RunFolder.open(run), what, output, up, options, progress)
+        written = export_run(folder, what, output, up, options, progress)
     typer.echo(f"{what} of {run} in {written}")
+    for note in unit_notes(folder.metrics()):
+        typer.echo(note)

@@ -25,7 +25,7 @@ from slam.formats.obj import write_obj
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.loops.places import PLACES, Places
-from slam.results.comparison import METRES, is_metric, lookup, unit_of_lengths
+from slam.results.comparison import CAMERA_HEIGHTS, METRES, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.storage.files import write_atomically
 from slam.trajectory import Trajectory, write_kitti, write_tum
@@ -134,13 +134,16 @@ def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, prog
 def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
     if output.suffix.lower() not in (".yaml", ".pgm"):
         raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
+    unit = unit_of_lengths(folder.metrics())
+    if unit not in (METRES, CAMERA_HEIGHTS):
+        raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
     with map_file(folder, "mesh", progress) as source:
         mesh = prepared(read_ply(source), options)
     trajectory = _trajectory(folder, "z")
-    metric, resolution = is_metric(folder.metrics()), options.resolution or DEFAULT_RESOLUTION
-    grid = occupancy_grid(_rotated(mesh, "z"), trajectory.T_world_camera, resolution, metric)
+    resolution = options.resolution or DEFAULT_RESOLUTION
+    grid = occupancy_grid(_rotated(mesh, "z"), trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
-    write_ros_map(written, grid.cells, grid.corner, grid.resolution)
+    write_ros_map(written, grid.cells, grid.corner, grid.resolution, unit)
     return written
 
 

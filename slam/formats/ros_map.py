@@ -24,7 +24,9 @@ def describes_map(path: Path) -> bool:
         return False
 
 
-def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: tuple[float, float], resolution: float) -> None:
+def write_ros_map(
+    path: Path, cells: NDArray[np.uint8], corner: tuple[float, float], resolution: float, unit: str
+) -> None:
     """Write ``<name>.pgm`` and, after it, ``<name>.yaml``, each atomically.
 
     Args:
@@ -32,6 +34,7 @@ def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: tuple[float, flo
         cells: ``(H, W)`` of `FREE`, `OCCUPIED` and `UNKNOWN`; the first row has the largest y.
         corner: x and y of the outer corner at the bottom left.
         resolution: side of a cell.
+        unit: of lengths, which ``map_server`` takes for metres: a comment says so.
 
     Raises:
         RunError: a file cannot be written.
@@ -48,5 +51,5 @@ def write_ros_map(path: Path, cells: NDArray[np.uint8], corner: tuple[float, flo
         "occupied_thresh": _OCCUPIED_THRESH,
         "free_thresh": _FREE_THRESH,
     }
-    text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
+    text = f"# lengths in {unit}\n" + yaml.safe_dump(description, sort_keys=False, default_flow_style=None)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)

@@ -57,7 +57,8 @@ class Painter:
         u, v = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
         inside = (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
         u, v, z, ahead = u[inside].astype(np.intp), v[inside].astype(np.intp), z[inside], ahead[inside]
-        same = np.abs(depth[v, u] - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z)
+        known = depth[v, u]
+        same = (known > 0) & (np.abs(known - z) < np.maximum(_SAME_VOXELS * self._voxel, _SAME_SURFACE * z))
         shown, share = ahead[same], z[same] ** -_NEARNESS
         weight[shown] += share
         total[shown] += share[:, None] * (self._gains[view] * image[v[same], u[same]])

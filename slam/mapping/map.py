@@ -101,6 +101,7 @@ class TsdfMap:
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
         remove_submaps(self._folder)  # of a run that was killed here
         self._previous: DepthView | None = None
+        self._first: int | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
@@ -134,7 +135,7 @@ class TsdfMap:
         view = DepthView(frame, known_depth, relative_sigma, image, T_world_camera)
         previous = self._previous
         if previous is None:
-            self._previous = view
+            self._first, self._previous = frame, view
         elif self._has_moved(view.T_world_camera, previous.T_world_camera):
             if not self._first_is_fused:
                 self._fuse(previous, view)
@@ -182,8 +183,10 @@ class TsdfMap:
         points = np.concatenate(list(self.surface().cloud_pieces()))
         return MapCloud(positions(points), normals(points), colours(points))
 
-    def submap_of(self, frame: int) -> int:
-        """Number of the finished submap whose stretch of road a frame is on."""
+    def submap_of(self, frame: int) -> int | None:
+        """Number of the finished submap whose stretch of road a frame is on; None before the first fused frame."""
+        if self._first is None or frame < self._first:
+            return None
         return max(bisect_right(self._views_of_submaps, frame, key=lambda views: int(views[0])) - 1, 0)
 
     def submap_anchor(self, number: int) -> int:

@@ -30,11 +30,11 @@ def double_walls_at_loops(
         before: the trajectory without loops.
         after: the trajectory that the map was fused at.
     """
-    joined = Counter(tuple(sorted(map(tsdf_map.submap_of, loop.ends))) for loop in loops.accepted)
-    pairs = [(numbers, count) for numbers, count in joined.most_common() if numbers[0] != numbers[1]]
-    if not pairs:
+    ends = [{number for number in map(tsdf_map.submap_of, loop.ends) if number is not None} for loop in loops.accepted]
+    joined = Counter(tuple(sorted(numbers)) for numbers in ends if len(numbers) == 2)
+    if not joined:
         return null(AT_LOOPS, "no loop joins two submaps")
-    numbers, _ = pairs[0]
+    ((numbers, _),) = joined.most_common(1)
     anchors = [tsdf_map.submap_anchor(number) for number in numbers]
     (one, one_triangles), (other, other_triangles) = map(tsdf_map.submap_mesh, numbers)
     triangles = np.concatenate([one_triangles, other_triangles + len(one)])

@@ -140,7 +140,7 @@ class RunFolder:
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
-            no_map = "it ran without a map: run it again with mapping.enabled=true"
+            no_map = (self.metrics().get("map") or {}).get("triangles_reason") or "it ran without a map"
             why = no_map if name.endswith(".ply") else f"it holds {present}"
             raise RunError(f"{self.path} has no {name}: {why}")
         return path

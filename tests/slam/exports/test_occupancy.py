@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from slam import se3
+from slam.cli import app
 from slam.errors import RunError
 from slam.exports.export import export
 from slam.exports.ground import ground_along
@@ -135,7 +136,7 @@ def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None
 def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
     cells = np.full((5, 4), UNKNOWN, np.uint8)
     cells[0, 3], cells[4, 0] = OCCUPIED, FREE
-    write_ros_map(tmp_path / "a: map.yaml", cells, (-1.5, 2.25), 0.05)
+    write_ros_map(tmp_path / "a: map.yaml", cells, (-1.5, 2.25), 0.05, "metres")
     described = yaml.safe_load((tmp_path / "a: map.yaml").read_text())
     assert described == {
         "image": "a: map.pgm",
@@ -158,3 +159,18 @@ def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Pa
     assert written.name == "map.yaml" and yaml.safe_load(written.read_text())["origin"] == [0.0, 2.0, 0.0]
     cells = cv2.imread(str(tmp_path / "new" / "map.pgm"), cv2.IMREAD_UNCHANGED)
     assert cells.shape == (15, 10) and (cells == FREE).mean() > 0.9
+
+
+def test_a_grid_without_metres_says_so(
+    make_recorded: Callable[..., RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, output = make_recorded(), tmp_path / "map.yaml"
+    words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
+    for unit, note in (("camera heights", True), ("metres", False)):
+        folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "value": 9.8, "unit": unit}})
+        app(words, standalone_mode=False)
+        assert ("not in metres" in capsys.readouterr().out) == note
+        assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(output.read_text())
+    folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "unit": "the networks' own unit"}})
+    with pytest.raises(RunError, match="need metres or camera heights"):
+        export(folder, "occupancy", output)

@@ -8,6 +8,7 @@ from slam.frames import Intrinsics
 from slam.mapping.colours import evened
 from slam.mapping.filters import FILTERS, DepthFilters, DepthView
 from slam.mapping.holes import with_holes_closed
+from slam.mapping.map import TsdfMap
 from slam.mapping.patch import Patch
 
 
@@ -17,6 +18,23 @@ def test_exposure_is_evened_out(street_map):
     assert flat.std() < 0.02
     assert changing.std() < 0.03  # 0.1 without it
     assert 0.4 < changing.mean() < 0.75
+
+
+def test_a_view_without_depth_paints_nothing_right_before_it():
+    camera = Intrinsics(104, 64, 60.0, 60.0, 51.5, 31.5)
+    x, y = np.moveaxis(camera.rays(camera.pixel_grid()), -1, 0)[:2]
+    tsdf_map = TsdfMap(MappingConfig(min_weight=1, min_component_triangles=10), camera)
+    for frame, z in enumerate((0.0, 0.5, 1.0, 7.85, 8.35)):  # a red plate at 8 m, unknown to the last two green views
+        walls = 6 / np.maximum(np.abs(x), 0.01)
+        is_plate = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
+        depth = np.where(is_plate, 8.0 - z if z < 7 else 0.0, np.where(walls < 20, walls, 0.0)).astype(np.float32)
+        image = np.full((64, 104, 3), (200, 0, 0) if z < 7 else (0, 200, 0), np.uint8)
+        T_world_camera = np.eye(4)
+        T_world_camera[2, 3] = z
+        tsdf_map.integrate(depth, image, T_world_camera, frame=frame)
+    mesh = tsdf_map.mesh()
+    plate = mesh.colours[(np.abs(mesh.vertices_world[:, :2]) < 0.15).all(axis=1)]
+    assert len(plate) and plate[:, 1].max() < 0.1
 
 
 @pytest.mark.parametrize("per_metre", [0.125, 8.0])

@@ -33,13 +33,13 @@ def passes(drift_m: float) -> Trajectory:
     return Trajectory(np.arange(2.0 * PASS), T_world_camera)
 
 
-def fused(trajectory: Trajectory) -> TsdfMap:
+def fused(trajectory: Trajectory, first: int = 0) -> TsdfMap:
     """Between two walls; a submap a pass."""
     rays = CAMERA.rays(CAMERA.pixel_grid())
     depth = (WALL_M / np.maximum(np.abs(rays[..., 0]), 1e-6)).astype(np.float32)
     grey = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
     tsdf_map = TsdfMap(MappingConfig(submap_m=PASS - 1.0), CAMERA)
-    for frame, T_world_camera in enumerate(trajectory.T_world_camera):
+    for frame, T_world_camera in enumerate(trajectory.T_world_camera, first):
         tsdf_map.integrate(depth, grey, T_world_camera, frame=frame)
     assert tsdf_map.surface().submaps == 2
     return tsdf_map
@@ -55,6 +55,17 @@ def test_walls_of_two_passes_stand_apart_before_their_loop_is_closed() -> None:
     shares = found["double_wall_share_at_loops"]
     assert shares["after"] < 0.01
     assert 0.3 < shares["before"] < 0.6  # the right wall of one pass stands before the other's, the left one behind
+
+
+def test_a_loop_from_before_the_map_joins_no_submaps() -> None:
+    """Of a continued run whose earlier keyframes were not kept, the map begins in its middle."""
+    later, earlier = 100, 5
+    poses = np.concatenate([np.tile(np.eye(4), (later, 1, 1)), passes(0.0).T_world_camera])
+    trajectory = Trajectory(np.arange(float(len(poses))), poses)
+    tsdf_map = fused(passes(0.0), later)
+    for before_map, ends in ((True, (earlier, later + PASS + 3)), (False, (later + 3, later + PASS + 3))):
+        found = double_walls_at_loops(tsdf_map, loops(ends), trajectory, trajectory)
+        assert (found["double_wall_share_at_loops"] is None) == before_map
 
 
 def test_without_a_loop_between_submaps_there_is_a_reason() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -211,3 +212,14 @@ def test_require_names_what_there_is(make_run: MakeRun) -> None:
     assert folder.require("graph.g2o").is_file()
     with pytest.raises(RunError, match=r"has no map\.las: it holds .*graph\.g2o"):
         folder.require("map.las")
+
+
+@pytest.mark.parametrize(
+    "reason", ["the map is empty: no depth passed the filters", "fusion is switched off (mapping.enabled)"]
+)
+def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
+    folder = make_run()
+    (folder.path / "map_mesh.ply").unlink()
+    folder.write_metrics(folder.metrics() | {"map": {"triangles": None, "triangles_reason": reason}})
+    with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
+        folder.require("map_mesh.ply")

@@ -5,7 +5,7 @@ COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ def write_colmap(
     T_world_camera: FloatArray,
     points_world: FloatArray,
     colours: NDArray[np.uint8],
+    without_image: Collection[int] = (),
 ) -> None:
     """Write the three files; points have no tracks.
 
@@ -37,11 +38,12 @@ def write_colmap(
         T_world_camera: poses ``(N, 4, 4)``; image k is ``<k>.png`` with six digits, as KITTI names it.
         points_world: ``(P, 3)``.
         colours: ``(P, 3)`` RGB.
+        without_image: numbers of poses that have none, which are left out.
 
     Raises:
         RunError: a file cannot be written.
     """
-    contents = _camera(intrinsics), _images(T_world_camera), _points(points_world, colours)
+    contents = _camera(intrinsics), _images(T_world_camera, without_image), _points(points_world, colours)
     for name, lines in zip(MODEL_FILES, contents, strict=True):
         _write(folder / name, lines)
 
@@ -66,13 +68,14 @@ def _camera(camera: Intrinsics) -> list[str]:
     return [_HEADER, f"1 PINHOLE {camera.width} {camera.height} {numbers}"]
 
 
-def _images(T_world_camera: FloatArray) -> list[str]:
+def _images(T_world_camera: FloatArray, without_image: Collection[int]) -> list[str]:
     T_camera_world = invert(T_world_camera)
     quaternions_xyzw = Rotation.from_matrix(T_camera_world[:, :3, :3]).as_quat(canonical=True)
     rows = np.concatenate([quaternions_xyzw[:, [3, 0, 1, 2]], T_camera_world[:, :3, 3]], axis=1)
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of its points (none)"]
     for k, row in enumerate(rows):
-        lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", ""]
+        if k not in without_image:
+            lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", ""]
     return lines
 
 

@@ -145,7 +145,12 @@ class RunFolder:
         path = self.path / name
         if not path.is_file():
             present = ", ".join(sorted(p.name for p in self.path.iterdir() if not p.name.startswith(".")))
-            no_map = (self.metrics().get("map") or {}).get("triangles_reason") or "it ran without a map"
-            why = no_map if name.endswith(".ply") else f"it holds {present}"
+            why = self._without_map() if name.endswith(".ply") else f"it holds {present}"
             raise RunError(f"{self.path} has no {name}: {why}")
         return path
+
+    def _without_map(self) -> str:
+        metrics = self.metrics()
+        numbers = metrics.get("map") or {}
+        reasons = numbers.get("triangles_reason"), metrics.get("map_reason"), metrics.get("reason")
+        return next((reason for reason in reasons if reason), "it ran without a map")

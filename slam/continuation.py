@@ -25,33 +25,37 @@ logger = logging.getLogger(__name__)
 _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops", "window")
 
 
-def provenance_to_resume(continues: Path, output: Path | None, recording: Mapping[str, str]) -> dict[str, Any] | None:
+def provenance_to_resume(
+    continues: Path, known: Mapping[str, Any], output: Path | None, recording: Mapping[str, str]
+) -> dict[str, Any] | None:
     """What a run that did not end was run on, where it is to go on in its own folder; else None.
 
     Args:
         continues: its folder.
+        known: its ``metrics.json``.
         output: where to write; None or the same folder to go on.
         recording: the options that name the recording; none, or those of the run.
 
     Raises:
-        RunError: a damaged folder, or one that was killed before it wrote what it is run on.
+        RunError: it was killed before it wrote what it is run on.
     """
-    metrics = RunFolder.open(continues).metrics()
-    if metrics.get("status", "ok") == "ok" or (output is not None and output.resolve() != continues.resolve()):
+    if known.get("status", "ok") == "ok" or (output is not None and output.resolve() != continues.resolve()):
         return None
-    provenance = metrics.get("provenance")
+    provenance = known.get("provenance")
     if provenance is None or provenance.get("recording") is None:
         raise RunError(f"{continues} does not record what it was run on: run the sequence again")
     return dict(provenance) if not recording or recording == provenance["recording"] else None
 
 
-def inputs_to_continue(folder: Path, gps: Path | None, seed: int | None) -> tuple[Path | None, int]:
-    """GPS track and seed for the frames that follow a run: as given, else its own.
+def inputs_to_continue(
+    folder: Path, known: Mapping[str, Any], gps: Path | None, seed: int | None
+) -> tuple[Path | None, int]:
+    """GPS track and seed for the frames that follow a run: as given, else by ``known``, its ``metrics.json``.
 
     Raises:
         RunError: its track is not there any more.
     """
-    provenance = RunFolder(folder).metrics().get("provenance")
+    provenance = known.get("provenance")
     track, _ = lookup(provenance, "recording", "gps")
     if gps is None and track is not None:
         gps = Path(track)
@@ -112,10 +116,10 @@ def require_other_output(continues: Path, output: Path | None) -> None:
         )
 
 
-def warn_of_other_noise(folder: Path, noise_sha256: str) -> None:
-    """Say that a run had another noise model: its whole drive is solved again, by the one that is there now."""
-    known: dict[str, Any] = RunFolder(folder).metrics().get("provenance") or {}
-    if "noise_sha256" in known and (known["noise_sha256"] or "") != noise_sha256:
+def warn_of_other_noise(folder: Path, known: Mapping[str, Any], noise_sha256: str | None) -> None:
+    """Say that a run, by its ``metrics.json``, had another noise model: its whole drive is solved by the new one."""
+    provenance = known.get("provenance") or {}
+    if "noise_sha256" in provenance and provenance["noise_sha256"] != noise_sha256:
         logger.warning(
             "noise.yaml of the weights is not that of %s: the whole drive is solved with the new one", folder
         )

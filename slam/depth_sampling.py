@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from slam.frames import DepthMap
 
 _SURFACE_STEP = 0.12  # relative depth step between neighbouring pixels of one surface
+_TIE_PX = np.float32(1e-3)  # of two pixels equally near that right and below, on a road the nearer one
 
 
 def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:
@@ -24,7 +25,7 @@ def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32
     column, row = np.floor(u), np.floor(v)
     least, most = (_nearest(bound(inverse, pixels, anchor=(0, 0)), column, row) for bound in (cv2.erode, cv2.dilate))
     between = cv2.remap(inverse, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    sampled = _nearest(depth, u, v)
+    sampled = _nearest(depth, u + _TIE_PX, v + _TIE_PX)
     is_one_surface = (least > 0) & (most <= (1 + _SURFACE_STEP) * least)
     np.divide(1, between, out=sampled, where=is_one_surface)
     return sampled

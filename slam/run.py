@@ -144,8 +144,10 @@ def run_slam(
 
 def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
     """Check everything, then make the folder of a new run, or go on in that of one that did not end."""
+    known: dict[str, Any] = {}
     if request.continues is not None:
-        provenance = provenance_to_resume(request.continues, request.output, _recording(request))
+        _, known = RunFolder.open_with_metrics(request.continues)
+        provenance = provenance_to_resume(request.continues, known, request.output, _recording(request))
         if provenance is not None:
             lock.take(whole_place(request.continues))
             return _resume(request, request.continues, provenance)
@@ -155,9 +157,11 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
                 "end goes on without, in its own folder"
             )
         require_other_output(request.continues, request.output)
-        gps, seed = inputs_to_continue(request.continues, request.gps, request.seed)
+        gps, seed = inputs_to_continue(request.continues, known, request.gps, request.seed)
         request = replace(request, gps=gps, seed=seed)
     job = _prepare(request)
+    if request.continues is not None:
+        warn_of_other_noise(request.continues, known, job.provenance.noise_sha256)
     return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
 
 
@@ -170,6 +174,7 @@ def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tup
     seed = provenance["seed"] if request.seed is None else request.seed
     same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
     job = _prepare(same, place)
+    warn_of_other_noise(place, {"provenance": provenance}, job.provenance.noise_sha256)
     logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
     return job, RunFolder.resume(place)
 
@@ -196,14 +201,11 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     undistort = None if lens is None else lens.apply_to_depth
     source = open_depth(settings.depth, recording.intrinsics, _frame_numbers(following, first), undistort)
     sha256 = mixed_sha256(networks.sha256, source)
-    before = resumes or request.continues
     if checkpoint is not None and checkpoint.weights_sha256 != sha256:
         raise RunError(
-            f"{before} was run with other weights or another depth source: continue it with the "
+            f"{resumes or request.continues} was run with other weights or another depth source: continue it with the "
             "same --weights and depth.source"
         )
-    if before is not None:
-        warn_of_other_noise(before, networks.noise_sha256)
     predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     rest = get_or_compute, checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)

@@ -36,4 +36,10 @@ def video_name(video: Path) -> str:
     """The name of the folder, as `recording_name`; of one of several videos its own name, too: ``my_drive/clip2``."""
     folder = video.absolute().parent
     name = recording_name(folder)
-    return f"{name}/{video.stem}" if len(list_videos(folder)) > 1 else name
+    return f"{name}/{clip_name(video)}" if len(list_videos(folder)) > 1 else name
+
+
+def clip_name(video: Path) -> str:
+    """The name of a video in its folder: without its suffix, unless another one differs from it in that alone."""
+    stems = [path.stem for path in list_videos(video.absolute().parent)]
+    return video.stem if stems.count(video.stem) < 2 else video.name

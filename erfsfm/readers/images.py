@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.errors import DataError
+from erfsfm.errors import DataError, OneLineError
 from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
 
 Image = NDArray[np.uint8]
+T = TypeVar("T")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
 _PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
 _TWELVE_BITS = 4096
+_COMPARED_IMAGES = 3
 _NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
 
 
@@ -112,17 +114,31 @@ def image_size(path: Path) -> tuple[int, int]:
     return height, width
 
 
-def first_readable(files: Sequence[Path]) -> tuple[Path, Image]:
-    """The first image that can be read, and its file; where none can, raises as `read_image` of the first."""
-    for file in files:
-        with suppress(DataError):
-            return file, read_image(file)
-    return files[0], read_image(files[0])
+def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
+    """The first readable image, and its place: of three, one of the size of most.
+
+    Args:
+        places: of images of one size, as a rule: recorders and people put another picture in front.
+        read: one of them, or a one-line error.
+
+    Raises:
+        OneLineError: that of the first one, where none can be read.
+    """
+    found: dict[tuple[int, ...], tuple[T, Image]] = {}
+    for place in places:
+        with suppress(OneLineError):
+            image = read(place)
+            if image.shape in found:
+                return found[image.shape]
+            found[image.shape] = place, image
+            if len(found) == _COMPARED_IMAGES:
+                break
+    return next(iter(found.values())) if found else (places[0], read(places[0]))
 
 
 def first_size(files: Sequence[Path]) -> tuple[int, int]:
-    """Height and width of the first image that can be read; raises as `first_readable`."""
-    height, width = first_readable(files)[1].shape[:2]
+    """Height and width of the first readable image of the usual size; raises as `first_usual`."""
+    height, width = first_usual(files, read_image)[1].shape[:2]
     return height, width
 
 

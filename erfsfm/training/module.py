@@ -198,23 +198,19 @@ class SelfSupervision(lightning.LightningModule):
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
         """Photometric error of every snippet; depth and pose errors where ground truth is known.
 
-        Nothing is measured of a network that was never trained.
+        A network that was never trained is not run.
         """
         target, sources = to_network_range(batch["target"]), to_network_range(batch["sources"])
-        disparity = self.depth_net(target).float()
-        vectors = self.pose_net(target, list(sources.unbind(dim=1))).float()
-        T_source_target = pose_vector_to_matrix(vectors)
-        if self.known == "both":
+        disparity = T_source_target = None
+        if self.known != "pose":
+            disparity = self.depth_net(target).float()
+            self._note_depth(disparity, batch.get("depth"))
+        if self.known != "depth":
+            T_source_target = pose_vector_to_matrix(self.pose_net(target, list(sources.unbind(dim=1))).float())
+            self._note_poses(T_source_target, batch.get("T_source_target"))
+        if disparity is not None and T_source_target is not None:
             with torch.autocast(self.device.type, enabled=False):
                 self._note("photometric", _reconstruction_error(batch, disparity, T_source_target))
-        if self.known != "pose":
-            self._note_depth(disparity, batch.get("depth"))
-        if self.known != "depth" and "T_source_target" in batch:
-            predicted = snippet_from_network(T_source_target[0].double().cpu().numpy())[None]
-            true = snippet_from_network(batch["T_source_target"][0].cpu().numpy())[None]
-            errors = snippet_errors(predicted, true)
-            self._note("snippet_ate", errors.ate_mean)
-            self._note("snippet_re", errors.re_mean)
 
     def _note_depth(self, disparity: Tensor, true_depth: Tensor | None) -> None:
         self._note("disparity_spread", float(disparity.std() / disparity.mean()))
@@ -226,6 +222,14 @@ class SelfSupervision(lightning.LightningModule):
         if errors is not None:
             self._note("abs_rel", errors.abs_rel)
             self._note("depth_scale", errors.scale)
+
+    def _note_poses(self, T_source_target: Tensor, true_poses: Tensor | None) -> None:
+        if true_poses is None:
+            return
+        predicted = snippet_from_network(T_source_target[0].double().cpu().numpy())[None]
+        errors = snippet_errors(predicted, snippet_from_network(true_poses[0].cpu().numpy())[None])
+        self._note("snippet_ate", errors.ate_mean)
+        self._note("snippet_re", errors.re_mean)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Note which networks were trained."""

@@ -26,6 +26,8 @@ from slam.sequences.recording import ImageSource
 from slam.sequences.undistortion import Undistortion
 from slam.storage.files import write_atomically
 
+_MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated
+
 
 @dataclass(frozen=True)
 class CalibrationFiles:
@@ -58,16 +60,13 @@ def calibrate_camera(
     """
     if output.suffix not in (".yaml", ".yml"):
         raise CalibrationError(f"--output {output} must end in .yaml: it is the camera file that run reads")
-    _refuse_other_kind(output)
     picture = output.with_suffix(".pdf" if _among_images(output) else ".png")
+    _refuse_other_kind(output, picture)
     require_figure(picture)
     images, own_fps = _open(recording)
     views = chosen(find_views(images, board, progress))
     fit = calibrate(views, images.width, images.height, model)
-    source = (
-        f"erfsfm-slam calibrate: {len(fit.views)} views of a {board.describe()}, reprojection error "
-        f"{fit.error_px:.3f} pixels"
-    )
+    source = f"{_MARK}: {len(fit.views)} views of a {board.describe()}, reprojection error {fit.error_px:.3f} pixels"
     camera = CameraFile(
         width=fit.width,
         height=fit.height,
@@ -83,20 +82,23 @@ def calibrate_camera(
     )
     Undistortion(camera)  # refuses a lens that cannot be undistorted
     text = yaml.safe_dump(camera.model_dump(mode="json"), sort_keys=False, width=1000)
-    write_picture(picture, fit, camera, images)
     write_atomically(output, lambda path: path.write_text(text, encoding="utf-8"), CalibrationError)
+    write_picture(picture, fit, camera, images)
     return CalibrationFiles(fit, camera, output, picture)
 
 
-def _refuse_other_kind(output: Path) -> None:
+def _refuse_other_kind(output: Path, picture: Path) -> None:
+    """A picture is replaced beside a camera file that was calibrated."""
     if output.is_dir():
         raise CalibrationError(f"--output {output} is a folder: give the name of a file to write")
-    if not output.is_file() or not output.stat().st_size:
-        return
-    try:
-        read_camera_file(output)
-    except DataError as error:
-        raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
+    source = None
+    if output.is_file() and output.stat().st_size:
+        try:
+            source = read_camera_file(output).source
+        except DataError as error:
+            raise CalibrationError(f"{output} exists and is no camera file: choose another --output") from error
+    if picture.exists() and not (source or "").startswith(_MARK):
+        raise CalibrationError(f"{picture} exists and is of no earlier calibration: choose another --output")
 
 
 def _among_images(output: Path) -> bool:

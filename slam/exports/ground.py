@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,17 +59,21 @@ def ground_along(points: FloatArray, T_world_camera: FloatArray, camera_height: 
     chosen = _spread(T_world_camera, _ANCHOR_STEP * camera_height)
     cameras, up = T_world_camera[chosen, :3, 3], -T_world_camera[chosen, :3, 1]
     tree = cKDTree(points[:, :2])
-    near = tree.query_ball_point(cameras[:, :2], _RADIUS * camera_height)
-    below = [-((points[rows] - camera) @ axis) for rows, camera, axis in zip(near, cameras, up, strict=True)]
+
+    def around() -> Iterator[tuple[FloatArray, FloatArray]]:  # twice: all at once take 0.7 GB a kilometre
+        for camera, axis in zip(cameras, up, strict=True):
+            near = points[tree.query_ball_point(camera[:2], _RADIUS * camera_height)]
+            yield near, -((near - camera) @ axis)
+
     limits = _NEAREST * camera_height, _FURTHEST * camera_height
-    found = [d[(d > limits[0]) & (d < limits[1])] for d in below]
-    medians = [float(np.median(d)) for d in found if len(d) >= _MIN_POINTS]
+    found = (depth[(depth > limits[0]) & (depth < limits[1])] for _, depth in around())
+    medians = [float(np.median(depth)) for depth in found if len(depth) >= _MIN_POINTS]
     if not medians:
         raise RunError("the map has no ground below the cameras, so free and occupied cannot be told apart")
     height = float(np.median(medians))
     anchors, slopes = [], []
-    for rows, depth, camera, axis in zip(near, below, cameras, up, strict=True):
-        ground = points[rows][np.abs(depth - height) < _BAND * height]
+    for (near, depth), camera, axis in zip(around(), cameras, up, strict=True):
+        ground = near[np.abs(depth - height) < _BAND * height]
         start = camera - height * axis
         anchor, slope = _plane(ground, start, -axis[:2] / axis[2], _RADIUS * height)
         anchors.append(anchor)

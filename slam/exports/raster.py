@@ -22,6 +22,7 @@ from slam.storage.files import remove, write_atomically
 
 RASTER = "raster.yaml"
 GEOTIFFS = ("height.tif", "colour.tif")
+RASTER_FILES = ("height.png", "colour.png", "height.pgw", "colour.pgw", *GEOTIFFS, RASTER)
 _HEIGHT_STEPS = 65535  # of a 16-bit image; 0 is unknown
 _FINEST_STEP = 0.001
 _OPAQUE = 255
@@ -112,6 +113,12 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     description |= {} if raster.crs is None else {"crs": raster.crs}
     text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=200)
     _write_text(output / RASTER, text)
+
+
+def is_own_raster(folder: Path) -> bool:
+    """Whether the raster in a folder is one that `write_raster` described."""
+    path = folder / RASTER
+    return path.is_file() and b"heights: {file: height.png" in path.read_bytes()
 
 
 def _to_east_north(heading_deg: float) -> FloatArray:

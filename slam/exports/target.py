@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slam.errors import RunError
 from slam.exports.nerfstudio import POINTS
-from slam.exports.raster import GEOTIFFS, RASTER
+from slam.exports.raster import RASTER_FILES, is_own_raster
 from slam.formats.colmap import MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
@@ -18,9 +18,9 @@ _FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a ra
 _NAMES = {
     "colmap": MODEL_FILES,
     "nerfstudio": ("images", POINTS, TRANSFORMS),
-    "raster": ("height.png", "colour.png", *GEOTIFFS),
+    "raster": RASTER_FILES,
 }
-_OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": lambda output: (output / RASTER).is_file()}
+_OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": is_own_raster}
 _BEGINNINGS = {
     "mesh": {".ply": b"ply", ".obj": b"# erfsfm-slam", ".glb": b"glTF", ".gltf": b"{"},
     "cloud": {".ply": b"ply", ".las": b"LASF", ".laz": b"LASF"},
@@ -43,14 +43,21 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
         if others and not _OURS[what](output):
             raise RunError(f"{output / others[0]} is none of ours and would be replaced: choose another --output")
         return
+    files = [output]
     if what == "trajectory":
         check_replaced_trajectory(output)
     else:
         check_replaced(output, _BEGINNINGS[what])
-    if what == "occupancy" and output.suffix.lower() == ".yaml" and output.is_file() and not describes_map(output):
-        raise RunError(f"{output} exists and is no map of ROS: choose another --output")
-    if output.is_file() and _is_in_recording(folder, output):
-        raise RunError(f"{output} belongs to the recording of the run: choose another --output")
+    if what == "occupancy" and output.suffix.lower() in _BEGINNINGS[what]:
+        files = [output.with_suffix(suffix) for suffix in _BEGINNINGS[what]]
+        present = [path for path in files if path.exists() and path.stat().st_size]
+        if present and not describes_map(files[0]):
+            raise RunError(f"{present[0]} exists and is no map of ROS: choose another --output")
+        for path in files:
+            check_replaced(path, _BEGINNINGS[what])
+    for path in files:
+        if path.is_file() and _is_in_recording(folder, path):
+            raise RunError(f"{path} belongs to the recording of the run: choose another --output")
 
 
 def _is_in_recording(folder: RunFolder, output: Path) -> bool:

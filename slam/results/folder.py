@@ -72,6 +72,11 @@ class RunFolder:
         Raises:
             RunError: no run there.
         """
+        return cls.open_with_metrics(path)[0]
+
+    @classmethod
+    def open_with_metrics(cls, path: str | Path) -> tuple[RunFolder, dict[str, Any]]:
+        """As `open`, with its `metrics`, which are read once."""
         path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
             what = "no such folder" if not path.exists() else f"it holds no {METRICS}"
@@ -80,7 +85,7 @@ class RunFolder:
         metrics = folder.metrics()
         if metrics.get("status", "ok") != "ok":
             logger.warning("%s: %s: files that are there are whole", path, metrics.get("reason", metrics["status"]))
-        return folder
+        return folder, metrics
 
     def publish(self) -> None:
         """Replace the earlier run, if there is one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,8 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, require_stamps
 from slam.sequences.undistortion import calibrated
+
+logger = logging.getLogger(__name__)
 
 _CAMERAS = ("cam0", "cam1")
 _TRUTH = "state_groundtruth_estimate0"
@@ -133,6 +136,11 @@ def _true_poses(folder: Path, stamps: FloatArray, camera: Path) -> FloatArray | 
     """
     table = folder / "data.csv"
     if not table.exists():
+        return None
+    if not camera.exists():
+        logger.warning(
+            "the true poses in %s are not used: %s, which says where the camera sits, is missing", table, camera
+        )
         return None
     rows = _rows(table)
     known = np.array([_stamp(row[0], table) for row in rows])

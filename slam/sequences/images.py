@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from erfsfm.readers.images import first_readable, read_image
+from erfsfm.readers.images import first_usual, read_image
 from erfsfm.readers.numbering import NumberedFiles
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Image
@@ -11,10 +11,10 @@ MAX_GAP_FRAMES = 100
 
 
 class ImageFiles:
-    """Images on disk, one row a number, all of the size of the first that can be read."""
+    """Images on disk, one row a number, all of the size of the first readable ones."""
 
     def __init__(self, files: NumberedFiles) -> None:
-        """Read the first readable image for its size.
+        """Read the first readable images for their size.
 
         Raises:
             DataError: if none can be read.
@@ -25,7 +25,7 @@ class ImageFiles:
             if last - first + 1 > MAX_GAP_FRAMES:
                 raise too_long(files, first, last)
         self._paths = dict(zip(files.rows, files.paths))
-        self._sized_by, image = first_readable(files.paths)
+        self._sized_by, image = first_usual(files.paths, read_image)
         self.height, self.width = image.shape[:2]
 
     def __len__(self) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.readers.folder import video_name
+from erfsfm.readers.folder import clip_name, video_name
 from erfsfm.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
@@ -34,7 +34,7 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
     images, intrinsics = calibrated(frames, camera, str(path))
     return RecordedSequence(
-        name=path.stem,
+        name=clip_name(path),
         images=images,
         intrinsics=intrinsics,
         stamps=_stamps(path, frames, camera.fps),
@@ -67,7 +67,7 @@ def _stamps(path: Path, frames: VideoFrames, fps: float) -> FloatArray:
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:
     files = [path] if path.is_file() else list_videos(path)
     videos = (file for file in files if file.suffix.lower() in VIDEO_SUFFIXES)
-    return {video.stem: partial(open_video, video, asked.camera) for video in videos}
+    return {clip_name(video): partial(open_video, video, asked.camera) for video in videos}
 
 
 LOADER = Loader("video", "a video", _find)

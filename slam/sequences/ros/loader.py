@@ -6,15 +6,15 @@ import functools
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from erfsfm.errors import DataError
 from erfsfm.readers.camera_file import CameraFile
+from erfsfm.readers.images import first_usual
 from slam.errors import SequenceError
 from slam.frames import Image
 from slam.se3 import FloatArray
@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 _ODOMETRY, _TRANSFORM = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped"
 _TRUTH = re.compile(r"ground_?truth|(?:^|[/_])gt(?:$|[/_])|vicon|mocap|optitrack", re.IGNORECASE)
 _CACHED_FRAMES = 32
+_SOUGHT_IMAGES = 100  # one of which must be readable
 _SKIPPED_FRAMES = 30
 _SCAN_DELAY_S = 0.05
 _NANOSECONDS = 10**9
@@ -99,18 +100,18 @@ class StampedMessages:
 
 
 class BagImages:
-    """The images of a topic, all of the size of the first that can be read. Not for use from several threads."""
+    """The images of a topic, all of the size of the first readable ones. Not for use from several threads."""
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the stamps of all and the first readable image for its size.
+        """Read the stamps of all and the first readable images for their size.
 
         Raises:
-            SequenceError, DataError: the bag is damaged, or no image can be read.
+            SequenceError, DataError: the bag is damaged, or none of its first 100 images can be read.
         """
         self.messages = StampedMessages(bag, topic)
         self._where = f"an image of {topic} in {bag.path}"
         self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
-        self.height, self.width = self._first().shape[:2]
+        self.height, self.width = first_usual(range(len(self))[:_SOUGHT_IMAGES], self._cached)[1].shape[:2]
 
     def __len__(self) -> int:
         """Number of images."""
@@ -120,19 +121,13 @@ class BagImages:
         """One image ``(height, width, 3)`` uint8 RGB.
 
         Raises:
-            SequenceError, DataError: it cannot be read, or has another size than the first.
+            SequenceError, DataError: it cannot be read, or has another size than the first ones.
         """
         image = self._cached(index)
         if image.shape[:2] != (self.height, self.width):
             height, width = image.shape[:2]
-            raise SequenceError(f"{self._where} is {width}x{height}, the first is {self.width}x{self.height}")
+            raise SequenceError(f"{self._where} is {width}x{height}, the first are {self.width}x{self.height}")
         return image.copy()
-
-    def _first(self) -> Image:
-        for index in range(len(self)):
-            with suppress(SequenceError, DataError):
-                return self._cached(index)
-        return self._cached(0)
 
     def _decode(self, index: int) -> Image:
         return image_of(self.messages.read(index), self._where)

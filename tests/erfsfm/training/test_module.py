@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from erfsfm.config import ExperimentConfig, NetworkConfig, TrainingConfig
+from erfsfm.config import ExperimentConfig, NetworkConfig, TeacherConfig, TrainingConfig
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.training.module import SelfSupervision
 
@@ -55,3 +55,17 @@ def test_an_untrained_pose_network_keeps_its_weights_and_norm_statistics():
         name.split(".")[0] for name, value in module.state_dict().items() if not torch.equal(value, before[name])
     }
     assert changed == {"depth_net"}
+
+
+@pytest.mark.parametrize("networks", ["depth", "pose", "both"])
+def test_validation_runs_no_network_that_was_never_trained(networks):
+    network = NetworkConfig(depth="depthnet", pose="posenet", depth_width=0.0625, pose_width=0.125, sources=2)
+    training, teacher = TrainingConfig(networks=networks), TeacherConfig(views="many", rotation_weight=1.0)
+    module = SelfSupervision(ExperimentConfig(network=network, training=training, teacher=teacher)).eval()
+    ran = []
+    for kind in ("depth", "pose"):
+        module.network(kind).register_forward_hook(lambda *_, kind=kind: ran.append(kind))
+    K = torch.tensor([[[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]])
+    with torch.no_grad():
+        module.validation_step({"target": torch.rand(1, 3, 32, 64), "sources": torch.rand(1, 2, 3, 32, 64), "K": K}, 0)
+    assert ran == (["depth", "pose"] if networks == "both" else [networks])

@@ -132,13 +132,15 @@ def test_the_folder_can_be_used(small: Small, world: Path, held_out: Path, tmp_p
     assert any(row["validation/abs_rel"] for row in rows)
 
 
-def test_five_frames_are_validated_by_the_snippet_protocol(small: Small, held_out: Path, tmp_path: Path) -> None:
+def test_five_frames_are_validated_by_the_snippet_protocol(
+    small: Small, world: Path, held_out: Path, tmp_path: Path
+) -> None:
     small["network"]["sources"] = 4
     config = configure(small, [held_out], training={"steps": 2}, data={"validation": ["simulated/500[0:5]"]})
     config = config.model_copy(update={"data": config.data.model_copy(update={"ranges": {"simulated/500": "5:8"}})})
     with pytest.raises(DataError, match="5 consecutive frames"):
         train(config, tmp_path / "short", device="cpu")
-    config = configure(small, [held_out, held_out.parent / "world"], training={"steps": 2})
+    config = configure(small, [held_out, world], training={"steps": 2})
     metrics = load_model(train(config, tmp_path / "run", device="cpu")).record.metrics
     assert {"snippet_ate", "snippet_re"} <= metrics.keys()
 

@@ -135,12 +135,15 @@ def test_errors_are_clear_and_leave_nothing(
         ("trajectory", "camera.yaml", r"exists and does not end in \.txt or \.tum"),
         ("graph", "camera.yaml", r"exists and does not end in \.g2o"),
         ("occupancy", "camera.yaml", "exists and is no map of ROS"),
+        ("occupancy", "camera.pgm", "camera.yaml exists and is no map of ROS"),
+        ("occupancy", "drive/photo.yaml", "photo.pgm exists and is no map of ROS"),
         ("mesh", "drive/thesis.ply", "thesis.ply exists and is a file of another kind"),
         ("trajectory", "drive/images.txt", "images.txt exists and is a file of another kind"),
         ("trajectory", "drive/truth.txt", "truth.txt belongs to the recording of the run"),
         ("nerfstudio", "drive", "drive/images is none of ours"),
         ("colmap", "drive", "drive/images.txt is none of ours"),
         ("raster", "drive", "drive/height.png is none of ours"),
+        ("raster", "terrain", "terrain/raster.yaml is none of ours"),
     ],
 )
 def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, name: str, why: str) -> None:
@@ -150,16 +153,18 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
         (tmp_path / "drive" / other).write_text("another program's")
     (tmp_path / "camera.yaml").write_text("width: 40\n")
     (tmp_path / "drive/thesis.ply").write_text("my own")
+    (tmp_path / "drive/photo.pgm").write_bytes(b"P5\n1 1\n255\n0")
+    (tmp_path / "terrain").mkdir()
+    (tmp_path / "terrain/raster.yaml").write_text("heights: my own\n")
     shutil.copy(folder.path / "reference.kitti.txt", tmp_path / "drive/truth.txt")
     metrics = folder.metrics()
     metrics["provenance"]["recording"] = {"dataset": str(tmp_path / "drive")}
     folder.write_metrics(metrics)
     folder.write_text("config.yaml", "")
-    before = {path: path.read_bytes() for path in folder.path.iterdir()}
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(RunError, match=why):
         export(folder, what, tmp_path / name)
-    assert {path: path.read_bytes() for path in folder.path.iterdir()} == before
-    assert (tmp_path / "camera.yaml").read_text() == "width: 40\n"
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,11 @@ from slam.errors import RunError, SlamError
 from slam.frames import Frame
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
+from slam.results import folder as run_folder
 from slam.results.folder import RunFolder
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.storage.json_file import read_json
 
 SAME = (
     *(f"trajectory_{name}.tum.txt" for name in ("network", "odometry", "optimised")),
@@ -64,8 +66,13 @@ def go_on(kitti_root: Path, begun: RunFolder, tmp_path: Path) -> Callable[..., R
     return go
 
 
-def test_every_file_has_the_bytes_of_a_run_in_one_go(whole: RunFolder, go_on: Callable[..., RunFolder]) -> None:
+def test_every_file_has_the_bytes_of_a_run_in_one_go(
+    whole: RunFolder, begun: RunFolder, go_on: Callable[..., RunFolder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[Path] = []
+    monkeypatch.setattr(run_folder, "read_json", lambda path, kind: read.append(path) or read_json(path, kind))
     continued = go_on()
+    assert read.count(begun.path / "metrics.json") == 1
     assert [name for name in SAME if (continued.path / name).read_bytes() != (whole.path / name).read_bytes()] == []
     metrics, wanted = continued.metrics(), whole.metrics()
     assert (metrics["sequence"].pop("continued_at"), wanted["sequence"].pop("continued_at")) == (8, 0)

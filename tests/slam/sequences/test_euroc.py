@@ -1,6 +1,7 @@
 """EuRoC's layout: distorted images, stamps in nanoseconds, true poses of the body, rows without an image."""
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_rows_without_an_image_are_gaps(flight: Path) -> None:
 
 
 def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
-    flight: Path, tmp_path: Path, camera_yaml: str
+    flight: Path, tmp_path: Path, camera_yaml: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     given = tmp_path / "mine.yaml"
     given.write_text(camera_yaml)
@@ -94,7 +95,10 @@ def test_a_camera_file_replaces_the_calibration_and_one_beside_gives_the_height(
     sensor.write_text(SENSOR.replace("radial-tangential", "omni"))  # a lens that is not known
     assert open_sequence(flight, camera=given).intrinsics.fx == 30
     sensor.unlink()
-    assert open_sequence(flight, camera=given).intrinsics.fx == 30
+    write_truth(flight, 0, FRAMES)
+    sequence = open_sequence(flight, camera=given)
+    assert sequence.intrinsics.fx == 30 and sequence.reference is None
+    assert re.search(r"true poses in .* are not used: .*sensor\.yaml, which says where", caplog.text)
     sensor.write_text(SENSOR)
     (flight.parent / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.2\n")
     sequence = open_sequence(flight)

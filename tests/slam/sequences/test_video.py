@@ -1,3 +1,4 @@
+import shutil
 import struct
 from fractions import Fraction
 from functools import partial
@@ -7,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.data.discovery import discover
 from erfsfm.readers import video as reader
 from erfsfm.readers.video import VideoFrames
 from slam.errors import SequenceError
 from slam.sequences import video
-from slam.sequences.catalogue import open_sequence
+from slam.sequences.catalogue import open_sequence, sequence_names
 from slam.sequences.continued import missing_between
 
 
@@ -51,6 +53,17 @@ def test_the_next_clip_of_a_folder_follows(tmp_path: Path, camera_64: str, caplo
     assert first.provenance() == ("folder/trip/clip1[0:20]",)
     assert missing_between(first.provenance(), following.provenance()) == 0
     assert "folder/trip/clip2[0:20] is assumed to follow folder/trip/clip1[0:20]" in caplog.text
+
+
+def test_videos_that_differ_in_their_suffix_alone(tmp_path: Path, camera_64: str) -> None:
+    write_video(tmp_path / "trip" / "clip.avi")
+    shutil.copy(tmp_path / "trip/clip.avi", tmp_path / "trip/clip.mkv")
+    write_video(tmp_path / "trip" / "other.avi")
+    (tmp_path / "trip" / "camera.yaml").write_text(camera_64)
+    assert sequence_names(tmp_path / "trip") == ["clip.avi", "clip.mkv", "other"]
+    sequence = open_sequence(tmp_path / "trip", "clip.mkv", frames="0:20")
+    assert (sequence.name, sequence.provenance()) == ("clip.mkv", ("folder/trip/clip.mkv[0:20]",))
+    assert len({recording.name for recording in discover(tmp_path / "trip")}) == 3
 
 
 def test_errors(tmp_path: Path, camera_64: str, camera_yaml: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -220,18 +220,28 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
         open_sequence(tmp_path / "walk.bag")
 
 
-@pytest.mark.parametrize("damaged", [0, 1])
-def test_a_damaged_image_is_one_frame_alone(new_bag: NewBag, kind: str, damaged: int) -> None:
+def compressed(new_bag: NewBag, kind: str, count: int, damaged: Collection[int]) -> Path:
+    """A bag of PNG pictures, of which some are cut off."""
     bag = new_bag(kind)
     bag.camera_info("/c/camera_info", CAMERA, "", ())
-    for k in range(4):
+    for k in range(count):
         data = cv2.imencode(".png", picture(k, 3))[1].ravel()
-        cut = data[: len(data) // 2] if k == damaged else data
+        cut = data[: len(data) // 2] if k in damaged else data
         header = bag.header(FIRST_NS + k * STEP_NS, "c")
         message = bag.make("sensor_msgs/msg/CompressedImage", header=header, format="png", data=cut)
         bag.write("/c/image/compressed", FIRST_NS + k * STEP_NS, message)
-    sequence = open_sequence(bag.close())
+    return bag.close()
+
+
+@pytest.mark.parametrize("damaged", [0, 1])
+def test_a_damaged_image_is_one_frame_alone(new_bag: NewBag, kind: str, damaged: int) -> None:
+    sequence = open_sequence(compressed(new_bag, kind, 4, {damaged}))
     with pytest.raises(SequenceError, match=r"an image of /c/image/compressed in .* is truncated"):
         sequence.frame(damaged)
     for k in {2, 0, 1, 3} - {damaged}:
         assert np.array_equal(sequence.frame(k).image, picture(k, 3)[:, :, ::-1])
+
+
+def test_a_bag_of_damaged_images_is_not_decoded_to_its_end(new_bag: NewBag) -> None:
+    with pytest.raises(SequenceError, match=r"an image of /c/image/compressed in .* is truncated"):
+        open_sequence(compressed(new_bag, "ros1", 101, range(100)))

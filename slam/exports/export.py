@@ -11,7 +11,7 @@ import numpy as np
 from slam import se3
 from slam.errors import RunError
 from slam.exports.map_file import has_map, map_file
-from slam.exports.nerfstudio import write_scene
+from slam.exports.nerfstudio import interpolated, write_scene
 from slam.exports.occupancy import occupancy_grid
 from slam.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
 from slam.exports.raster import height_raster, write_raster
@@ -111,14 +111,14 @@ def _export_map(
 
 
 def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress | None) -> None:
-    """Poses of all frames, the run's camera, and the cloud of the map where there is one."""
+    """Poses of all frames with a usable image, the run's camera, and the cloud of the map where there is one."""
     trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
     cloud = _cloud(folder, up, options, progress)
     points = np.zeros((0, 3)) if cloud is None else cloud.points
     colours = None if cloud is None else cloud.colours
     if colours is None:
         colours = np.full(points.shape, 128, np.uint8)
-    write_colmap(output, camera, trajectory.T_world_camera, points, colours)
+    write_colmap(output, camera, trajectory.T_world_camera, points, colours, interpolated(folder))
 
 
 def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:

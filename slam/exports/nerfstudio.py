@@ -59,7 +59,7 @@ def write_scene(
     """
     sequence, rows = _recording(folder, trajectory, dataset)
     poses: dict[str, FloatArray] = {}
-    left_out = _interpolated(folder)
+    left_out = interpolated(folder)
     for k, row in enumerate(rows):
         if progress is not None:
             progress("images", k + 1, len(rows))
@@ -141,7 +141,8 @@ def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
     return {"dataset": place, "name": recorded.get("sequence"), "camera": camera}
 
 
-def _interpolated(folder: RunFolder) -> set[int]:
+def interpolated(folder: RunFolder) -> set[int]:
+    """Frames of a run without a usable image."""
     gaps, _ = lookup(folder.metrics(), "sequence", "bridged")
     return {k for gap in gaps or () for k in range(gap["first"], gap["last"] + 1)}
 

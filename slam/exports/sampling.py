@@ -88,7 +88,13 @@ def samples(mesh: Ply, grid: Grid) -> Iterator[Samples]:
     """The surface in equal parts of each triangle, so small that no cell is skipped."""
     assert mesh.triangles is not None
     points, colours = mesh.points, colours_or_grey(mesh)
-    corners = points[mesh.triangles]  # (T, 3, 3)
+    for start in range(0, len(mesh.triangles), _CHUNK_SAMPLES):
+        chosen = mesh.triangles[start : start + _CHUNK_SAMPLES]
+        yield from _samples(points[chosen], colours[chosen], grid)
+
+
+def _samples(corners: FloatArray, colours: FloatArray, grid: Grid) -> Iterator[Samples]:
+    """Of triangles by the positions and colours of their corners ``(T, 3, 3)``."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.sqrt((edges**2).sum(axis=2)).max(axis=1)
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -101,7 +107,7 @@ def samples(mesh: Ply, grid: Grid) -> Iterator[Samples]:
             chosen = triangles[start : start + step]
             yield Samples(
                 (weights @ corners[chosen]).reshape(-1, 3),
-                (weights @ colours[mesh.triangles[chosen]]).reshape(-1, 3),
+                (weights @ colours[chosen]).reshape(-1, 3),
                 np.repeat(areas[chosen] / len(weights), len(weights)),
             )
 

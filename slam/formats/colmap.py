@@ -5,6 +5,7 @@ COLMAP writes ``T_camera_world``, quaternions wxyz, and puts (0.5, 0.5) at the c
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ def write_colmap(
     T_world_camera: FloatArray,
     points_world: FloatArray,
     colours: NDArray[np.uint8],
+    without_image: Collection[int] = (),
 ) -> None:
     """Write the three files; points have no tracks.
 
@@ -36,13 +38,14 @@ def write_colmap(
         T_world_camera: poses ``(N, 4, 4)``; image k is ``<k>.png`` with six digits, as KITTI names it.
         points_world: ``(P, 3)``.
         colours: ``(P, 3)`` RGB.
+        without_image: numbers of poses that have none, which are left out.
 
     Raises:
         RunError: a file cannot be written.
     """
-    contents = _camera(intrinsics), _images(T_world_camera), _points(points_world, colours)
-    for name, text in zip(MODEL_FILES, contents, strict=True):
-        _write(folder / name, text)
+    contents = _camera(intrinsics), _images(T_world_camera, without_image), _points(points_world, colours)
+    for name, lines in zip(MODEL_FILES, contents, strict=True):
+        _write(folder / name, lines)
 
 
 def is_own_model(folder: Path) -> bool:
@@ -51,28 +54,32 @@ def is_own_model(folder: Path) -> bool:
     return path.is_file() and path.read_bytes().startswith(_HEADER.encode())
 
 
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write_text(text, encoding="ascii"), RunError)
+def _write(path: Path, lines: Iterable[str]) -> None:
+    def fill(partial: Path) -> None:
+        with partial.open("w", encoding="ascii") as file:
+            file.writelines(f"{line}\n" for line in lines)
+
+    write_atomically(path, fill, RunError)
 
 
-def _camera(camera: Intrinsics) -> str:
+def _camera(camera: Intrinsics) -> list[str]:
     principal = [camera.cx + _HALF_PIXEL, camera.cy + _HALF_PIXEL]
     numbers = " ".join(map(repr, [float(value) for value in (camera.fx, camera.fy, *principal)]))
-    return f"{_HEADER}\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
+    return [_HEADER, f"1 PINHOLE {camera.width} {camera.height} {numbers}"]
 
 
-def _images(T_world_camera: FloatArray) -> str:
+def _images(T_world_camera: FloatArray, without_image: Collection[int]) -> list[str]:
     T_camera_world = invert(T_world_camera)
     quaternions_xyzw = Rotation.from_matrix(T_camera_world[:, :3, :3]).as_quat(canonical=True)
     rows = np.concatenate([quaternions_xyzw[:, [3, 0, 1, 2]], T_camera_world[:, :3, 3]], axis=1)
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of its points (none)"]
     for k, row in enumerate(rows):
-        lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", ""]
-    return "\n".join(lines) + "\n"
+        if k not in without_image:
+            lines += [f"{k + 1} {' '.join(map(repr, row.tolist()))} 1 {k:06d}.png", ""]
+    return lines
 
 
-def _points(points_world: FloatArray, colours: NDArray[np.uint8]) -> str:
-    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK (none)"]
-    for k, (point, colour) in enumerate(zip(points_world.tolist(), colours.tolist(), strict=True)):
-        lines.append(f"{k + 1} {' '.join(f'{x:.9g}' for x in point)} {' '.join(map(str, colour))} 0")
-    return "\n".join(lines) + "\n"
+def _points(points_world: FloatArray, colours: NDArray[np.uint8]) -> Iterator[str]:
+    yield "# POINT3D_ID X Y Z R G B ERROR TRACK (none)"
+    for k, (point, colour) in enumerate(zip(points_world, colours, strict=True)):
+        yield f"{k + 1} {' '.join(f'{x:.9g}' for x in point.tolist())} {' '.join(map(str, colour.tolist()))} 0"

@@ -99,6 +99,12 @@ def test_frames_without_a_usable_image_are_left_out(
     assert "2 of 8 frames have no usable image" in caplog.text
 
 
+def test_interpolated_frames_are_no_images_of_a_colmap_model(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    model = export(make_recorded(bridged=(5,)), "colmap", tmp_path / "model")
+    images = [line.split() for line in (model / "images.txt").read_text().splitlines()[1::2]]
+    assert [(row[0], row[-1]) for row in images] == [(str(k + 1), f"{k:06d}.png") for k in range(8) if k != 5]
+
+
 @pytest.mark.parametrize(
     ("rows", "continued_at", "frames", "numbers", "first_shade"),
     [(11, 3, None, range(3, 11), 0), (7, 3, "2:6", range(3, 7), 20), (8, 3, None, range(8), 0)],

@@ -6,47 +6,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import shutil
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from pydantic import ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import nn
 
 from erfsfm.config import NetworkConfig
-from erfsfm.config_tree import Section, dump_yaml, first_problem
+from erfsfm.config_tree import dump_yaml
 from erfsfm.errors import CheckpointError, ConfigError
 from erfsfm.files import write_atomically
+from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record
 from erfsfm.networks.presets import PRESETS, NetworkKind, build
-from erfsfm.yaml_file import YamlError, read_yaml
 
-FORMAT: Literal[1] = 1
-SHIPPED = Path(__file__).parent / "weights"
 KINDS: tuple[NetworkKind, NetworkKind] = ("depth", "pose")
-FILES = ("depth.safetensors", "pose.safetensors")
-
-
-class ModelRecord(Section):
-    """Metadata of a pair of networks: all but their weights."""
-
-    model_config = ConfigDict(allow_inf_nan=True)  # a metric may be undefined
-
-    format: Literal[1] = FORMAT
-    network: NetworkConfig
-    networks: Literal["both", "depth", "pose"] = Field(default="both", description="which of the two are there")
-    trained_on: list[str] = Field(description="recordings and frame ranges seen in training: the leak record")
-    licence: str = Field("unknown: depends on the training data", description="of the weights")
-    step: int = 0
-    metrics: dict[str, float] = Field(default_factory=dict, description="of the last validation")
-    version: str = ""
-    commit: str = ""
-    command: str = ""
 
 
 @dataclass(frozen=True)
@@ -152,62 +128,9 @@ def load_model(name_or_folder: str | Path) -> Model:
     return Model(record, nets[0].eval(), nets[1].eval())
 
 
-def find_weights(name_or_folder: str | Path) -> Path:
-    """The folder of a shipped name or of a path.
-
-    Raises:
-        CheckpointError: neither.
-    """
-    folder = Path(name_or_folder)
-    if (folder / "model.yaml").is_file():
-        return folder
-    shipped = sorted(p.parent.name for p in SHIPPED.glob("*/model.yaml"))
-    if str(name_or_folder) in shipped:
-        return SHIPPED / str(name_or_folder)
-    if folder.is_dir():
-        raise CheckpointError(
-            f"{folder} holds no model.yaml: it is not an output folder of 'erfsfm train' (or training has not "
-            "written weights yet)"
-        )
-    raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
-
-
-def weights_sha256(folder: Path) -> str:
-    """SHA-256 of both weight files together, and of the alignment of poses, which changes what they give."""
-    digest = hashlib.sha256()
-    for path in (folder / name for name in FILES):
-        digest.update(path.read_bytes() if path.is_file() else b"")
-    alignment = read_record(folder / "model.yaml").network.alignment
-    digest.update(b"" if alignment == "none" else alignment.encode())
-    return digest.hexdigest()
-
-
-def commit() -> str:
-    """The revision of the source tree this runs from; empty outside a checkout or without git."""
-    root = Path(__file__).resolve().parents[1]
-    if not (root / ".git").exists() or shutil.which("git") is None:
-        return ""
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
 def _stored(key: str, value: torch.Tensor, half: bool) -> torch.Tensor:
     statistics = "running_" in key or not value.is_floating_point()
     return value.detach().cpu().contiguous() if statistics or not half else value.detach().cpu().half().contiguous()
-
-
-def read_record(path: Path) -> ModelRecord:
-    """Read a ``model.yaml``.
-
-    Raises:
-        CheckpointError: damaged, or of another format.
-    """
-    try:
-        return ModelRecord.model_validate(read_yaml(path))
-    except YamlError as error:
-        raise CheckpointError(str(error)) from error
-    except ValidationError as error:
-        raise CheckpointError(f"{path} is not a model record of format {FORMAT}: {first_problem(error)}") from error
 
 
 def fill_network(net: nn.Module, tensors: dict[str, torch.Tensor], origin: Path, wanted_by: str) -> None:

@@ -278,9 +278,9 @@ def calibrate_noise(
 
     Example: erfsfm calibrate-noise --weights sim --dataset worlds/600 --dataset KITTI
     """
-    from erfsfm.checkpoint import find_weights
     from erfsfm.evaluation.noise_fit import calibrate
     from erfsfm.inference import DepthPosePredictor
+    from erfsfm.model_record import find_weights
     from erfsfm.pose_noise import NOISE_FILE, write_pose_noise
 
     folder = find_weights(weights)

@@ -21,9 +21,10 @@ from pydantic import ValidationError
 from torch import Tensor
 
 import erfsfm
-from erfsfm.checkpoint import Absent, Model, ModelRecord, build_networks, commit, fill_network, save_model
+from erfsfm.checkpoint import Absent, Model, build_networks, fill_network, save_model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import CheckpointError
+from erfsfm.model_record import ModelRecord, commit
 from erfsfm.networks.presets import NetworkKind
 
 _DEFORMABLE: dict[NetworkKind, dict[tuple[int, ...], str]] = {  # stages with offsets -> preset

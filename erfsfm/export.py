@@ -20,7 +20,7 @@ from erfsfm.checkpoint import Absent, Model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import ExportError
 from erfsfm.files import write_atomically
-from erfsfm.networks.onnx_graph import exported
+from erfsfm.networks.onnx_export import exported
 from erfsfm.networks.presets import NetworkKind
 from erfsfm.onnx_session import open_session
 

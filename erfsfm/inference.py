@@ -3,43 +3,54 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Sequence
+from ctypes.util import find_library
 from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Literal, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from scipy.spatial.transform import Rotation
 
-from erfsfm.checkpoint import FILES, Model, find_weights, load_model, weights_sha256
-from erfsfm.checkpoint import commit as commit  # for slam, which imports only this module
-from erfsfm.data.splits import overlapping as overlapping  # likewise
+from erfsfm.data.splits import overlapping as overlapping  # for slam, which imports only this module
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.files import write_atomically
-from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.networks.lite0_pose import Lite0PoseNet
+from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
+from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 from erfsfm.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.readers.images import resize_image
+from erfsfm.threads import usable_cores
+
+if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
+    from torch import nn
+
+    from erfsfm.checkpoint import Model
 
 logger = logging.getLogger(__name__)
 
 F = TypeVar("F", np.float32, np.float64)
+Array = NDArray[np.float32]
+Device = Literal["cpu", "cuda"]
 DeviceChoice = Literal["auto", "cpu", "cuda"]
-Network = Callable[..., Tensor]
-NETWORK_THREADS = max(torch.get_num_threads() - 1, 1)  # one core stays free for other threads
+Runtime = Literal["torch", "onnx"]
+Network = Callable[..., Array]
+NETWORK_THREADS = max(usable_cores() - 1, 1)  # one core stays free for other threads
 
 
 def limit_torch_threads() -> None:
-    """Let PyTorch in this thread use all cores but one, which stays free for other threads."""
-    torch.set_num_threads(NETWORK_THREADS)
+    """Let PyTorch, where it is used, take all cores but one in this thread, which stays free for other threads."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(NETWORK_THREADS)
 
 
-def choose_device(choice: str) -> torch.device:
+def choose_device(choice: str) -> Device:
     """``auto`` is the GPU where there is one.
 
     Raises:
@@ -47,9 +58,19 @@ def choose_device(choice: str) -> torch.device:
     """
     if choice not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device must be auto, cpu or cuda; got '{choice}'")
-    if choice == "cuda" and not torch.cuda.is_available():
+    available = choice != "cpu" and _has_gpu()
+    if choice == "cuda" and not available:
         raise ConfigError("device cuda is not available on this machine or in this build of torch; use cpu")
-    return torch.device("cuda" if choice != "cpu" and torch.cuda.is_available() else "cpu")
+    return "cuda" if available else "cpu"
+
+
+def _has_gpu() -> bool:
+    """Whether PyTorch can use one; it is asked only where it was built for GPUs and their driver is installed."""
+    if version("torch").endswith("+cpu") or not (find_library("cuda") or find_library("nvcuda")):
+        return False
+    import torch
+
+    return torch.cuda.is_available()
 
 
 @dataclass
@@ -59,26 +80,37 @@ class PreparedImage:
     ``features`` are those of a pose network that encodes each image by itself, once they were asked for.
     """
 
-    tensor: Tensor
-    features: Tensor | None = None
+    array: Array
+    features: Array | None = None
 
 
 class _Networks(NamedTuple):
     depth: Network
     pose: Network
-    features: Network | None  # of one image, for a pose network that encodes each by itself
-
-    def as_graphs(self, identity: str) -> _Networks:
-        features = self.features and _graph(self.features, identity and f"features {identity}")
-        depth, pose = (_graph(getattr(self, name), identity and f"{name} {identity}") for name in ("depth", "pose"))
-        return _Networks(depth, pose, features)
+    features: Network | None = None  # of one image, for a pose network that encodes each by itself
 
 
-def _graph(network: Network, identity: str) -> Network:
-    return OnnxGraph(network, NETWORK_THREADS, identity) if isinstance(network, nn.Module) else network
+@lru_cache(maxsize=1)
+def _graphs(folder: Path, sha256: str) -> _Networks:
+    """Of the weights with this digest, each made by PyTorch only where it is not kept on disk."""
+    network = read_record(folder / "model.yaml").network
 
+    @cache
+    def parts() -> dict[str, nn.Module]:
+        from erfsfm.checkpoint import load_model
+        from erfsfm.networks.torch_network import inference_parts
 
-_graphs: dict[tuple[object, str], _Networks] = {}  # of the last weights in this process
+        model = load_model(folder)
+        return inference_parts(model.depth_net, model.pose_net)
+
+    names = ("depth", "pose", "features") if network.encodes_single_images else ("depth", "pose")
+    graphs = {
+        name: OnnxGraph(partial(lambda name: parts()[name], name), NETWORK_THREADS, f"{name} {sha256} {network!r}")
+        for name in names
+    }
+    if not graphs["depth"].is_kept((1, 3, network.height, network.width)):
+        parts()  # damaged weights are found before the first image
+    return _Networks(**graphs)
 
 
 class DepthPosePredictor:
@@ -93,30 +125,51 @@ class DepthPosePredictor:
     pose_sha256: str = ""
     origin: str = "these weights"
 
-    def __init__(self, model: Model, device: str = "cpu", sha256: str = "") -> None:
-        self.device = choose_device(device)
-        self.record = model.record
+    def __init__(self, record: ModelRecord, networks: _Networks, device: Device, sha256: str = "") -> None:
+        self.device = device
+        self.record = record
         self.sha256 = sha256
-        self.sources: int = model.record.network.sources
-        depth_net, pose_net = model.depth_net, model.pose_net
-        for network in (depth_net, pose_net):
-            network.eval().to(self.device)
-            if self.device.type == "cpu":  # images are channels-last, and small kernels are faster so
-                network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._networks = _Networks(depth_net, pose_net, None)
-        if isinstance(pose_net, Lite0PoseNet):
-            self._networks = _Networks(depth_net, _Motion(pose_net).eval(), _Features(pose_net).eval())
+        self.sources: int = record.network.sources
+        self._networks = networks
 
     @classmethod
-    def from_weights(cls, name_or_dir: str | Path, device: str = "cpu") -> DepthPosePredictor:
+    def of(cls, model: Model, device: str = "cpu", sha256: str = "") -> DepthPosePredictor:
+        """Of networks in memory, by PyTorch.
+
+        Raises:
+            ConfigError: a device that is not there.
+        """
+        from erfsfm.networks.torch_network import TorchNetwork, inference_parts
+
+        chosen = choose_device(device)
+        parts = inference_parts(model.depth_net, model.pose_net)
+        networks = _Networks(**{name: TorchNetwork(part, chosen) for name, part in parts.items()})
+        return cls(model.record, networks, chosen, sha256)
+
+    @classmethod
+    def from_weights(
+        cls, name_or_dir: str | Path, device: str = "cpu", runtime: Runtime = "torch"
+    ) -> DepthPosePredictor:
         """Load a shipped model by name or a training output folder.
+
+        Args:
+            name_or_dir: the weights.
+            device: auto, cpu or cuda.
+            runtime: on a CPU, ``onnx`` gives the same outputs up to rounding in less time. Its graphs are made at the
+                first call, in some two seconds, and kept on disk; from then on PyTorch is not imported.
 
         Raises:
             CheckpointError: missing or damaged weights, or a damaged noise.yaml beside them.
             ConfigError: a device that is not there.
         """
-        folder = find_weights(name_or_dir)
-        predictor = cls(load_model(folder), device, weights_sha256(folder))
+        folder, chosen = find_weights(name_or_dir), choose_device(device)
+        sha256 = weights_sha256(folder)
+        if runtime == "onnx" and chosen == "cpu":
+            predictor = cls(read_record(folder / "model.yaml"), _graphs(folder, sha256), chosen, sha256)
+        else:
+            from erfsfm.checkpoint import load_model
+
+            predictor = cls.of(load_model(folder), chosen, sha256)
         predictor.origin = str(folder)
         predictor.pose_sha256 = file_sha256(folder / FILES[1])
         noise = read_pose_noise(folder)
@@ -128,20 +181,6 @@ class DepthPosePredictor:
         elif noise is not None:
             predictor.noise, predictor.noise_sha256 = noise, file_sha256(folder / NOISE_FILE)
         return predictor
-
-    def freeze(self) -> Self:
-        """On a CPU, run the networks by ONNX Runtime: the same outputs up to rounding, in less time.
-
-        The graphs are made at the first call, in some two seconds, and kept on disk and for the next predictor of these
-        weights.
-        """
-        if self.device.type == "cpu":
-            key = (self.sha256 or object(), repr(self.record.network))
-            if key not in _graphs:
-                _graphs.clear()
-                _graphs[key] = self._networks.as_graphs(self.sha256 and " ".join(map(str, key)))
-            self._networks = _graphs[key]
-        return self
 
     def leaks(self, names: Sequence[str]) -> list[str]:
         """Those of the given recordings (``kitti_odometry/00[0:300]``) that were trained on."""
@@ -164,17 +203,14 @@ class DepthPosePredictor:
         """An image ``(H, W, 3)`` uint8 RGB as the networks take it, for several calls on the same image."""
         return PreparedImage(self._input(image))
 
-    @torch.inference_mode()
     def disparity(self, image: NDArray[np.uint8] | PreparedImage) -> NDArray[np.float32]:
         """Unscaled 1/depth of an image ``(H, W, 3)`` uint8 RGB, float32 at the networks' own size.
 
         Raises:
             CheckpointError: the network's output is not finite.
         """
-        disparity: NDArray[np.float32] = self._networks.depth(self._tensor(image))[0, 0].float().cpu().numpy()
-        return self._finite(disparity, "depth")
+        return self._finite(self._networks.depth(self._array(image))[0, 0], "depth")
 
-    @torch.inference_mode()
     def poses(self, images: Sequence[NDArray[np.uint8] | PreparedImage]) -> NDArray[np.float64]:
         """Poses of a snippet's sources.
 
@@ -194,9 +230,11 @@ class DepthPosePredictor:
         middle = self.sources // 2
         inputs = [self._pose_input(image) for image in images]
         target = inputs.pop(middle)
-        vectors = self._networks.pose(target, inputs)[0].double()
-        T_source_target: NDArray[np.float64] = pose_vector_to_matrix(vectors).cpu().numpy()
-        return self._finite(T_source_target, "pose")
+        vectors = self._finite(self._networks.pose(target, inputs)[0].astype(np.float64), "pose")
+        T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
+        T_source_target[:, :3, :3] = Rotation.from_euler("XYZ", vectors[:, 3:]).as_matrix()
+        T_source_target[:, :3, 3] = vectors[:, :3]
+        return T_source_target
 
     def _finite(self, output: NDArray[F], kind: str) -> NDArray[F]:
         """The output of a network, refused where it is not finite: float16 weights may overflow in a forward pass."""
@@ -207,51 +245,25 @@ class DepthPosePredictor:
             )
         return output
 
-    def _input(self, image: NDArray[np.uint8]) -> Tensor:
+    def _input(self, image: NDArray[np.uint8]) -> Array:
         """An image at the networks' size, in [-1, 1], ``(1, 3, H, W)``."""
         require_image(image)
         resized = resize_image(image, self.record.network.height, self.record.network.width)
-        tensor = torch.from_numpy(resized.astype(np.float32)).to(self.device)
-        return tensor.permute(2, 0, 1)[None].contiguous() / 127.5 - 1
+        scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
+        return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
 
-    def _pose_input(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
+    def _pose_input(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
         """The image, or its features where the pose network encodes each image by itself."""
         features = self._networks.features
         if features is None:
-            return self._tensor(image)
+            return self._array(image)
         prepared = image if isinstance(image, PreparedImage) else self.prepare(image)
         if prepared.features is None:
-            prepared.features = features(prepared.tensor)
+            prepared.features = features(prepared.array)
         return prepared.features
 
-    def _tensor(self, image: NDArray[np.uint8] | PreparedImage) -> Tensor:
-        return image.tensor if isinstance(image, PreparedImage) else self._input(image)
-
-
-class _Features(nn.Module):
-    """What a pose network sees of one image."""
-
-    def __init__(self, network: Lite0PoseNet) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, image: Tensor) -> Tensor:
-        """``(1, 3, h, w)`` to ``(1, C, h / 16, w / 16)``."""
-        return self.network.features(image)
-
-
-class _Motion(nn.Module):
-    """Pose vectors ``(1, N, 6)`` from the features of a target and of its sources."""
-
-    def __init__(self, network: Lite0PoseNet) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, target: Tensor, sources: list[Tensor]) -> Tensor:
-        """Translation (unscaled) and XYZ Euler angles of each source."""
-        vectors = self.network.motion(target, sources)
-        assert isinstance(vectors, Tensor)  # a list in training alone
-        return vectors
+    def _array(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
+        return image.array if isinstance(image, PreparedImage) else self._input(image)
 
 
 def require_image(image: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,6 +15,14 @@ from erfsfm.memory import require_memory
 
 _LINEAR_ALGEBRA_BYTES = 192 * 2**20
 _LARGE_MATRIX = 64  # rows; smaller ones are decomposed without it
+
+
+def usable_cores() -> int:
+    """Those that this process may run on, or what ``OMP_NUM_THREADS`` says, as PyTorch counts them."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdecimal() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

@@ -188,7 +188,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     settings = _settings(request, resumes)
     dataset = None if request.dataset is None else Path(request.dataset)
     recording = open_sequence(dataset, request.sequence, request.camera, request.frames)
-    networks = DepthPosePredictor.from_weights(request.weights, request.device).freeze()
+    networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording
     if resumes is not None:

@@ -144,7 +144,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--cache", type=Path, help="cache folder of the images' measurements")
     options = parser.parse_args(words)
     try:
-        networks = DepthPosePredictor.from_weights(options.weights, "cpu").freeze()
+        networks = DepthPosePredictor.from_weights(options.weights, runtime="onnx")
         drives = [measure(name, networks, options.cache) for name in options.drives]
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error

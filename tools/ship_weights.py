@@ -9,7 +9,8 @@ import argparse
 import json
 from pathlib import Path
 
-from erfsfm.checkpoint import FILES, SHIPPED, Model, load_model, save_model
+from erfsfm.checkpoint import Model, load_model, save_model
+from erfsfm.model_record import FILES, SHIPPED
 
 LARGEST_MB = 20
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from erfsfm.checkpoint import ModelRecord
 from erfsfm.config import Fidelity
 from erfsfm.data.split_file import read_split_file
 from erfsfm.errors import DataError
@@ -18,6 +17,7 @@ from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_erro
 from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
 from erfsfm.files import read_text
+from erfsfm.model_record import ModelRecord
 from erfsfm.readers.images import read_image, resize_image
 
 _STILL_M = 0.1

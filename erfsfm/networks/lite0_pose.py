@@ -108,7 +108,7 @@ class Lite0PoseNet(nn.Module):
         count = len(sources) // len(target)
         (coarse, fine), (coarse_source, fine_source) = _split(target), _split(sources)
         context = self.encoder.stages[-1](coarse)
-        h, w = coarse.shape[-2:]
+        h, w = map(int, coarse.shape[-2:])  # in a graph quotients of sizes would be double
         rays = cell_rays(h, w, (1 / h, 1 / w), coarse.device)
         placed = torch.cat([context, _as_map(rays[None, :, :2], h, w).expand(len(context), -1, -1, -1)], dim=1)
         inverse_depth, sigma = self._depth(placed)
@@ -148,7 +148,7 @@ class _Fine:
         self.target = target
         self.source = source
         self.surroundings = surroundings
-        self.size = (target.shape[-2], target.shape[-1])
+        self.size = (int(target.shape[-2]), int(target.shape[-1]))
         self.cell = (1 / self.size[0], 1 / self.size[1])
         self.rays = cell_rays(*self.size, self.cell, target.device)
         self.steps = offsets(_REACH, (self.cell[0] / FOCAL[1], self.cell[1] / FOCAL[0]), target.device)
@@ -158,7 +158,7 @@ class _Fine:
         cls, network: Lite0PoseNet, fine: Tensor, fine_source: Tensor, context: Tensor, depth: tuple[Tensor, Tensor]
     ) -> _Fine:
         """Features ``(B, C, h, w)`` of targets and ``(B * N, C, h, w)`` of sources; depth as the latter."""
-        count, size = len(fine_source) // len(fine), fine.shape[-2:]
+        count, size = len(fine_source) // len(fine), tuple(map(int, fine.shape[-2:]))
         rays = cell_rays(size[0], size[1], (1 / size[0], 1 / size[1]), fine.device)
         places = _as_map(rays[None, :, :2], *size).expand(len(fine), -1, -1, -1)
         surroundings = network.surroundings(torch.cat([fine, context, places], dim=1))

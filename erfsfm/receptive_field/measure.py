@@ -82,7 +82,7 @@ def measure_fields(
     snippet: Sequence[NDArray[np.uint8]],
     offsets_px: float = 1.0,
     learned: tuple[str, Model] | None = None,
-    device: torch.device | None = None,
+    device: str = "cpu",
 ) -> list[FieldRow]:
     """Fields of presets; with the default dilated pose network also the paper's, which skips three pixels of four.
 
@@ -92,7 +92,7 @@ def measure_fields(
         snippet: five images ``(H, W, 3)`` uint8 RGB in time order; depth networks see the middle one.
         offsets_px: outward offset of deformable taps, pixels.
         learned: name and weights to take effective fields from, for the presets that they are of.
-        device: where to compute; None is the CPU.
+        device: where to compute.
 
     Raises:
         ConfigError: an unknown name, or a snippet that is not five images.
@@ -104,7 +104,7 @@ def measure_fields(
         wanted.append((name, fidelity))
         if name == "erf-posenet-dilated" and fidelity == "default":
             wanted.append((name, "paper"))
-    return [_row(*which, snippet, offsets_px, learned, device or torch.device("cpu")) for which in wanted]
+    return [_row(*which, snippet, offsets_px, learned, device) for which in wanted]
 
 
 def field_table(rows: Sequence[FieldRow]) -> str:
@@ -124,7 +124,7 @@ def _row(
     snippet: Sequence[NDArray[np.uint8]],
     offsets_px: float,
     learned: tuple[str, Model] | None,
-    device: torch.device,
+    device: str,
 ) -> FieldRow:
     probe = build(name, fidelity, _PROBE_WIDTH).to(device)
     size = snippet[0].shape[:2]

@@ -109,7 +109,7 @@ def train(
 
 
 def _require_devices(wanted: int, device: str) -> None:
-    on_cpu = choose_device(device).type == "cpu"
+    on_cpu = choose_device(device) == "cpu"
     there = (os.cpu_count() or 1) if on_cpu else torch.cuda.device_count()
     if wanted > there:
         raise ConfigError(
@@ -147,7 +147,7 @@ def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: 
         draws,
         config.training.batch,
         num_workers=workers,
-        pin_memory=choose_device(device).type == "cuda",
+        pin_memory=choose_device(device) == "cuda",
         worker_init_fn=_single_threaded_worker,
         persistent_workers=workers > 0,
     )
@@ -222,7 +222,7 @@ def _trainer(
     done_steps: int,
 ) -> lightning.Trainer:
     training = config.training
-    on_cpu = choose_device(device).type == "cpu"
+    on_cpu = choose_device(device) == "cpu"
     precision = training.precision
     if on_cpu and precision == "16-mixed":
         logger.warning("training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU")

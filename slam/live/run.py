@@ -97,7 +97,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         import_rerun()
     settings = load_config(request.config, request.overrides)
     _refuse_what_needs_the_whole(settings)
-    networks = DepthPosePredictor.from_weights(request.weights, request.device).freeze()
+    networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     source = open_source(request.source, request.wait_s)
     camera = calibration_of(request.source, request.calibration, source)
     source.fps = camera.fps

@@ -127,7 +127,7 @@ class Slam:
         _check(intrinsics, camera_height_m, config)
         depth = (config or SlamConfig()).depth
         source = open_depth(depth, intrinsics, None)
-        networks = DepthPosePredictor.from_weights(name_or_dir, device).freeze()
+        networks = DepthPosePredictor.from_weights(name_or_dir, device, "onnx")
         predictor, _ = make_predictor(networks, source, depth, intrinsics)
         return cls(
             predictor,

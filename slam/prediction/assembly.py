@@ -59,7 +59,7 @@ def make_predictor(
     else:
         disk, code = DiskCache(cache), code_fingerprint()
         # outputs of GPU and CPU differ a little and share no entries
-        identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device.type} {code}"
+        identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device} {code}"
         get_or_compute = CacheNamespace(disk, code).get_or_compute
         own = NetworkPredictor(networks, intrinsics, get_or_compute, CacheNamespace(disk, identity).get_or_compute)
         if isinstance(source, OnnxDepth):

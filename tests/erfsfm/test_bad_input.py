@@ -12,9 +12,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+from erfsfm.checkpoint import Model, build_networks, save_model
 from erfsfm.cli import main
 from erfsfm.config import NetworkConfig, dump_yaml, load_experiment
+from erfsfm.model_record import ModelRecord
 
 Refusal = Callable[..., str]
 WriteRoot = Callable[..., Path]

@@ -11,19 +11,12 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-import erfsfm.checkpoint as checkpoint
-from erfsfm.checkpoint import (
-    Model,
-    ModelRecord,
-    build_networks,
-    find_weights,
-    load_model,
-    save_model,
-    weights_sha256,
-)
+import erfsfm.model_record as model_record
+from erfsfm.checkpoint import Model, build_networks, load_model, save_model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import CheckpointError
 from erfsfm.files import write_atomically
+from erfsfm.model_record import ModelRecord, find_weights, weights_sha256
 
 FILES = ("depth.safetensors", "pose.safetensors")
 
@@ -163,7 +156,7 @@ def test_misspelt_key_in_the_record(folder: Path) -> None:
 
 def test_unknown_name_lists_the_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save_model(tmp_path / "small", fresh())
-    monkeypatch.setattr(checkpoint, "SHIPPED", tmp_path)
+    monkeypatch.setattr(model_record, "SHIPPED", tmp_path)
     assert "one of small" in refusal("smal")
     assert find_weights("small") == tmp_path / "small"
     assert load_model("small").record.step == 12
@@ -174,7 +167,7 @@ def test_a_folder_without_weights(tmp_path: Path) -> None:
 
 
 def test_every_shipped_model_loads() -> None:
-    for record in checkpoint.SHIPPED.glob("*/model.yaml"):
+    for record in model_record.SHIPPED.glob("*/model.yaml"):
         model = load_model(record.parent.name)
         assert model.record.trained_on, "the leak record"
         assert model.record.licence

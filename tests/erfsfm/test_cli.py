@@ -17,9 +17,10 @@ import pytest
 import torch
 
 import erfsfm
-from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+from erfsfm.checkpoint import Model, build_networks, save_model
 from erfsfm.cli import main
 from erfsfm.config import NetworkConfig
+from erfsfm.model_record import ModelRecord
 from erfsfm.networks.presets import PRESETS
 
 Run = Callable[..., tuple[int, str, str]]
@@ -147,9 +148,9 @@ def test_errors_are_one_line(
     arguments: list[str],
     words: str,
 ) -> None:
-    import erfsfm.checkpoint
+    import erfsfm.model_record
 
-    monkeypatch.setattr(erfsfm.checkpoint, "SHIPPED", tmp_path / "none")
+    monkeypatch.setattr(erfsfm.model_record, "SHIPPED", tmp_path / "none")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     write_root(tmp_path / "root", frames=5)

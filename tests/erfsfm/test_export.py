@@ -13,10 +13,11 @@ import torch
 from torch import nn
 
 import erfsfm.export
-from erfsfm.checkpoint import Absent, Model, ModelRecord, build_networks
+from erfsfm.checkpoint import Absent, Model, build_networks
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import ConfigError, ExportError
 from erfsfm.export import export_onnx, pose_path
+from erfsfm.model_record import ModelRecord
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.presets import PRESETS
 

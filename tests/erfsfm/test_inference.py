@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+from erfsfm.checkpoint import Model, build_networks, save_model
 from erfsfm.config import NetworkConfig
 from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.inference import (
@@ -22,19 +25,20 @@ from erfsfm.inference import (
     save_depth,
     save_image,
 )
+from erfsfm.model_record import FILES, ModelRecord
 
 RNG = np.random.default_rng(3)
 
 
-def model(sources: int = 4) -> Model:
-    config = NetworkConfig(depth_width=0.0625, pose_width=0.125, height=32, width=64, sources=sources)  # type: ignore[arg-type]
+def model(sources: Literal[2, 4] = 4, pose: str = "posenet") -> Model:
+    config = NetworkConfig(depth_width=0.0625, pose=pose, pose_width=0.125, height=32, width=64, sources=sources)
     torch.manual_seed(0)
     return Model(ModelRecord(network=config, trained_on=["kitti_odometry/00[0:250]"]), *build_networks(config))
 
 
 @pytest.fixture
 def predictor() -> DepthPosePredictor:
-    return DepthPosePredictor(model())
+    return DepthPosePredictor.of(model())
 
 
 def image(height: int = 40, width: int = 70) -> NDArray[np.uint8]:
@@ -65,9 +69,9 @@ class Echo(nn.Module):
         return torch.stack(rows, dim=1)
 
 
-def echo(sources: int = 4) -> tuple[DepthPosePredictor, Echo]:
+def echo(sources: Literal[2, 4] = 4) -> tuple[DepthPosePredictor, Echo]:
     net = Echo()
-    return DepthPosePredictor(Model(model(sources).record, net, net)), net
+    return DepthPosePredictor.of(Model(model(sources).record, net, net)), net
 
 
 def test_a_reused_buffer_is_a_new_image(predictor: DepthPosePredictor) -> None:
@@ -157,7 +161,7 @@ def test_other_arrays_are_refused(predictor: DepthPosePredictor, wrong: NDArray[
 def test_a_prepared_image_gives_the_bytes_of_the_image(predictor: DepthPosePredictor) -> None:
     frames = [image() for _ in range(5)]
     prepared = [predictor.prepare(frame) for frame in frames]
-    assert prepared[0].tensor.shape == (1, 3, 32, 64)
+    assert prepared[0].array.shape == (1, 3, 32, 64)
     np.testing.assert_array_equal(predictor.disparity(prepared[0]), predictor.disparity(frames[0]))
     np.testing.assert_array_equal(predictor.poses(prepared), predictor.poses(frames))
     mixed = [prepared[0], *frames[1:4], prepared[4]]
@@ -172,12 +176,41 @@ def test_a_prepared_image_does_not_change_with_the_buffer_it_came_from(predictor
     assert np.abs(predictor.disparity(buffer) - expected).max() > 0
 
 
-def test_a_frozen_predictor_has_the_same_outputs_up_to_rounding() -> None:
+@pytest.mark.parametrize("pose", ["posenet", "posenet-lite0"])
+def test_onnx_runtime_has_the_same_outputs_up_to_rounding(tmp_path: Path, pose: str) -> None:
     frames = [image() for _ in range(5)]
-    plain, frozen = DepthPosePredictor(model()), DepthPosePredictor(model()).freeze()
+    save_model(tmp_path, model(pose=pose))
+    plain = DepthPosePredictor.from_weights(tmp_path)
     for _ in range(2):
-        np.testing.assert_allclose(frozen.depth(frames[0]), plain.depth(frames[0]), rtol=1e-4)
-        np.testing.assert_allclose(frozen.poses(frames), plain.poses(frames), atol=1e-6)
+        fast = DepthPosePredictor.from_weights(tmp_path, runtime="onnx")
+        np.testing.assert_allclose(fast.depth(frames[0]), plain.depth(frames[0]), rtol=1e-4)
+        np.testing.assert_allclose(fast.poses(frames), plain.poses(frames), atol=1e-4)
+
+
+def test_kept_graphs_need_no_torch(tmp_path: Path) -> None:
+    save_model(tmp_path / "weights", model())
+    program = """
+import sys
+import numpy as np
+from erfsfm.inference import DepthPosePredictor
+predictor = DepthPosePredictor.from_weights(sys.argv[1], "auto", "onnx")
+image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
+print("torch" in sys.modules, predictor.depth(image).sum(), predictor.poses([image] * 5).sum())
+"""
+    command = [sys.executable, "-c", program, str(tmp_path / "weights")]
+    place = os.environ | {"TORCH_HOME": str(tmp_path / "torch")}
+    first, second = (
+        subprocess.run(command, env=place, capture_output=True, text=True, check=True).stdout.split() for _ in range(2)
+    )
+    assert (first[0], second[0]) == ("True", "False")
+    assert first[1:] == second[1:]
+
+
+def test_weights_without_kept_graphs_are_checked_at_once(tmp_path: Path) -> None:
+    save_model(tmp_path, model())
+    (tmp_path / FILES[1]).write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="damaged"):
+        DepthPosePredictor.from_weights(tmp_path, runtime="onnx")
 
 
 def test_array_views_are_accepted(predictor: DepthPosePredictor) -> None:
@@ -198,7 +231,7 @@ def test_from_weights(tmp_path: Path) -> None:
     save_model(tmp_path, made)
     loaded = DepthPosePredictor.from_weights(tmp_path)
     frame = image()
-    np.testing.assert_array_equal(loaded.depth(frame), DepthPosePredictor(made).depth(frame))
+    np.testing.assert_array_equal(loaded.depth(frame), DepthPosePredictor.of(made).depth(frame))
     assert len(loaded.sha256) == 64
     assert loaded.sources == 4
     assert DepthPosePredictor.from_weights(str(tmp_path)).record == loaded.record
@@ -215,8 +248,8 @@ def test_leaks(predictor: DepthPosePredictor) -> None:
 
 
 def test_devices() -> None:
-    assert choose_device("cpu").type == "cpu"
-    assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+    assert choose_device("cpu") == "cpu"
+    assert choose_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
     with pytest.raises(ConfigError, match="auto, cpu or cuda"):
         choose_device("tpu")
 
@@ -224,7 +257,7 @@ def test_devices() -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_no_gpu_here() -> None:
     with pytest.raises(ConfigError, match="use cpu"):
-        DepthPosePredictor(model(), "cuda")
+        DepthPosePredictor.of(model(), "cuda")
 
 
 def test_images_and_depth_on_disk(tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from erfsfm.checkpoint import read_record
 from erfsfm.config import ExperimentConfig
 from erfsfm.errors import DataError
 from erfsfm.evaluation.eigen import eigen_protocol
 from erfsfm.evaluation.protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.model_record import read_record
 from erfsfm.training.run import train
 
 Small = dict[str, dict[str, Any]]

@@ -184,8 +184,9 @@ def write_weights() -> Callable[..., Path]:
     def write(folder: Path, trained_on: tuple[str, ...] = ("simulated/17",), sources: int = 4) -> Path:
         import torch
 
-        from erfsfm.checkpoint import Model, ModelRecord, build_networks, save_model
+        from erfsfm.checkpoint import Model, build_networks, save_model
         from erfsfm.config import NetworkConfig
+        from erfsfm.model_record import ModelRecord
 
         torch.manual_seed(0)
         network = NetworkConfig(depth_width=0.1, pose_width=0.125, height=64, width=208, sources=sources)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.checkpoint import ModelRecord
 from erfsfm.config import NetworkConfig
 from erfsfm.data.splits import overlapping
 from erfsfm.errors import DataError
@@ -18,6 +17,7 @@ from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import depth_protocol
 from erfsfm.inference import DepthPosePredictor
+from erfsfm.model_record import ModelRecord
 
 DRIVE = "2011_09_26_drive_0099"
 Write = Callable[..., Path]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from erfsfm.checkpoint import find_weights
+from erfsfm.model_record import find_weights
 from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
 from slam.config import load_config

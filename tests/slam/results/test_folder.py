@@ -224,5 +224,5 @@ def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -
     with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
         folder.require("map_mesh.ply")
     folder.write_metrics(folder.metrics() | {"map": None, "map_reason": "the run ended before its map was whole"})
-    with pytest.raises(RunError, match="has no map_mesh.ply: the run ended before its map was whole"):
+    with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
         folder.require("map_mesh.ply")

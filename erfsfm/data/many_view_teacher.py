@@ -27,19 +27,21 @@ from erfsfm.data.recordings import Recording
 from erfsfm.errors import DataError, TrainingError
 from erfsfm.files import write_atomically
 from erfsfm.geometry.camera import Camera
-from erfsfm.multiview import Grey
 from erfsfm.readers.video import VideoFrames
 from erfsfm.teacher.drive_poses import drive_poses
 from erfsfm.teacher.many_views import NEIGHBOURS, label
 from erfsfm.teacher.structure import TeacherStructure
 
 VERSION = 1
-LARGEST_WIDTH = 832  # pixels of the images that are measured: finer flow is slower and no surer
+# pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift
+# labels, sampled by nearest, by half a pixel
+LARGEST_WIDTH = 800
 LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
 
 Progress = Callable[[str, int, int], None]
 Measures = Literal["depth and poses", "poses"]
+Guess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,8 @@ class DriveLabels:
         """Write the poses ``(N, 4, 4)`` of all frames."""
         write_atomically(self.poses_file, lambda path: _save(path, T_world_camera))
 
-    def measure_labels(self, targets: Sequence[int]) -> int:
-        """Measure and keep the labels of some frames; returns their number.
+    def measure_labels(self, targets: Sequence[int], guess: Guess | None = None) -> int:
+        """Measure and keep the labels of some frames, around a guess of their depth; returns their number.
 
         Neighbours that cannot be read are left out. Of a frame that cannot be read, or has less than two, nothing is
         known.
@@ -154,13 +156,15 @@ class DriveLabels:
         camera = camera.resized(round(camera.width * ratio), round(camera.height * ratio))
         for target in targets:
             near = [n for n in (target + k for k in NEIGHBOURS) if 0 <= n < len(self.recording)]
-            grey = {n: image for n in (target, *near) if (image := self._grey(n, camera)) is not None}
+            images = {n: image for n in (target, *near) if (image := self._image(n, camera)) is not None}
             nothing = np.zeros((camera.height, camera.width), np.float32)
             bounds = nothing, np.full_like(nothing, np.inf)
-            if target in grey and len(grey) > LEAST_NEIGHBOURS:
+            if target in images and len(images) > LEAST_NEIGHBOURS:
+                guessed = None if guess is None else guess(images[target])
+                grey = {n: np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for n, image in images.items()}
                 image = grey.pop(target)
                 T_neighbour_target = np.linalg.inv(self.T_world_camera[[*grey]]) @ self.T_world_camera[target]
-                bounds = label(image, [*grey.values()], camera.K.astype(np.float64), T_neighbour_target)
+                bounds = label(image, [*grey.values()], camera.K.astype(np.float64), T_neighbour_target, guessed)
             least, most = (
                 cv2.resize(values, self.size[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
                 for values in bounds
@@ -168,13 +172,12 @@ class DriveLabels:
             write_atomically(self.label_file(target), lambda p: _compress(p, least=least, most=most), sync=False)  # noqa: B023
         return len(targets)
 
-    def _grey(self, index: int, camera: Camera) -> Grey | None:
+    def _image(self, index: int, camera: Camera) -> NDArray[np.uint8] | None:
         """A frame at a camera's size; None where it cannot be read."""
         try:
-            image = self.recording.image(index, camera.height, camera.width)
+            return self.recording.image(index, camera.height, camera.width)
         except DataError:
             return None
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
 def snippet_motion(T_world_camera: NDArray[np.float64], first: int, sources: int) -> NDArray[np.float32]:
@@ -199,6 +202,7 @@ class ManyViewTeacher:
         stride: every how many frames there is one.
         cache_mb: memory for labels that were read.
         measures: with ``poses`` alone there are no labels, every frame may be a target, and no depth is bounded.
+        guess: of the depth of an image, around which it is measured; it has to be one that processes can be given.
     """
 
     def __init__(
@@ -208,8 +212,10 @@ class ManyViewTeacher:
         stride: int,
         cache_mb: int = 0,
         measures: Measures = "depth and poses",
+        guess: Guess | None = None,
     ) -> None:
         self.measures = measures
+        self._guess = guess
         self._folder = folder
         self._size = size
         self._stride = stride if measures == "depth and poses" else 1
@@ -253,7 +259,9 @@ class ManyViewTeacher:
             return
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(os.cpu_count(), context) as pool:
-            running: list[Future[int]] = [pool.submit(drive.measure_labels, chunk) for drive, chunk in tasks]
+            running: list[Future[int]] = [
+                pool.submit(drive.measure_labels, chunk, self._guess) for drive, chunk in tasks
+            ]
             try:
                 for future in as_completed(running):
                     done += future.result()

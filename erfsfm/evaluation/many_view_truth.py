@@ -20,6 +20,7 @@ from erfsfm.evaluation.protocols import PoseDepthNetworks, named_recordings, ref
 CAP_HEIGHTS = 50.0  # camera heights: some 80 m from a car's roof
 LARGEST_RATIO = 1.3  # of the bounds of a pixel's depth; wider ones are no truth
 SLAM_WEIGHTS = "default"
+TRUTH_FOLDER = "truth"
 _RATIOS = ("abs_rel", "rmse_log", "a1", "a2", "a3")  # errors without a unit: the scale is fitted
 
 
@@ -62,7 +63,8 @@ def many_view_protocol(
     for recording, leak in zip(recordings, leaks):
         width, height = recording.camera.width, recording.camera.height
         ratio = min(1.0, LARGEST_WIDTH / width)
-        teacher = ManyViewTeacher(cache, (round(height * ratio), round(width * ratio)), every)
+        # the teacher's labels are measured around a network's depth, and truth without any
+        teacher = ManyViewTeacher(cache / TRUTH_FOLDER, (round(height * ratio), round(width * ratio)), every)
         teacher.prepare([recording], networks.sources, SLAM_WEIGHTS, progress)
         errors, known = _compare(networks, recording, teacher)
         if not errors:

@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
+from erfsfm.inference import DepthPosePredictor
 from erfsfm.training.progress import stage_bars
+
+
+@dataclass(frozen=True)
+class GuessedDepth:
+    """Inverse depth of images by the networks whose poses the teacher uses."""
+
+    weights: str
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """``(H, W)``, unscaled, of an image ``(H, W, 3)``."""
+        return np.reciprocal(_predictor(self.weights).depth(image))
+
+
+@lru_cache(maxsize=1)
+def _predictor(weights: str) -> DepthPosePredictor:
+    """In this process."""
+    return DepthPosePredictor.from_weights(weights, "cpu", "onnx")
 
 
 def measured_views(
@@ -27,7 +50,8 @@ def measured_views(
     size = (config.network.height, config.network.width)
     measures: Measures = "poses" if config.training.networks == "pose" else "depth and poses"
     cache_mb = labels_mb(config.data)
-    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, cache_mb, measures)
+    guess = GuessedDepth(config.teacher.slam_weights)
+    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, cache_mb, measures, guess)
     with stage_bars(quiet) as show:
         teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
     return teacher

@@ -1,5 +1,6 @@
 """Labels from many views against the simulated world, whose depth and poses are exact."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,11 +15,11 @@ def street() -> SimulatedStreet:
     return SimulatedStreet(SimulationOptions(frames=250, seed=703))
 
 
-def _label(street, index):
+def _label(street, index, guess=None):
     T = np.linalg.inv(street.T_world_camera[[index + k for k in NEIGHBOURS]]) @ street.T_world_camera[index]
     T[:, :3, 3] /= street.camera_height_m
     grey = [street.render(index + k).image[..., 1].copy() for k in (0, *NEIGHBOURS)]
-    return label(grey[0], grey[1:], street.K, T)
+    return label(grey[0], grey[1:], street.K, T, guess)
 
 
 def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth(street):
@@ -31,6 +32,21 @@ def test_bounds_are_narrow_in_camera_heights_and_hold_the_truth(street):
         assert np.median(np.abs(middle / truth[narrow] - 1)) < 0.03
         widened = (0.9 * least[narrow] < truth[narrow]) & (truth[narrow] < 1.1 * most[narrow])
         assert widened.mean() > 0.85
+
+
+def test_around_a_rough_guess_in_any_unit_more_is_known_and_it_is_as_right(street):
+    for index in (60, 150):
+        depth = street.render(index).depth
+        true = np.where(depth > 0, street.camera_height_m / np.maximum(depth, 1e-6), 0)
+        guess = 7 * cv2.GaussianBlur(true, (0, 0), 4).astype(np.float32) ** 0.9 + np.float32(0.05)
+        known, errors = [], []
+        for given in (None, guess):
+            least, most = _label(street, index, given)
+            narrow = (least > 0) & (most < 1.5 * least) & (depth > 0)
+            known.append(narrow.mean())
+            errors.append(np.mean(np.abs(np.sqrt(least[narrow] * most[narrow]) / true[narrow] - 1)))
+        assert known[1] > known[0] + 0.05
+        assert errors[1] < errors[0] + 0.005
 
 
 def test_the_sky_is_far_and_nothing_below_the_horizon_is_sky():

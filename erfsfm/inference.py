@@ -41,6 +41,7 @@ Device = Literal["cpu", "cuda"]
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 Runtime = Literal["torch", "onnx"]
 Network = Callable[..., Array]
+_GPU_DRIVERS = ("nvidiactl", "dxg", "kfd")  # of Nvidia, of WSL, and of AMD
 NETWORK_THREADS = max(usable_cores() - 1, 1)  # one core stays free for other threads
 
 
@@ -58,19 +59,20 @@ def choose_device(choice: str) -> Device:
     """
     if choice not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device must be auto, cpu or cuda; got '{choice}'")
-    available = choice != "cpu" and _has_gpu()
+    available = choice == "cuda" or (choice == "auto" and _may_have_gpu())
+    if available:
+        import torch
+
+        available = torch.cuda.is_available()
     if choice == "cuda" and not available:
         raise ConfigError("device cuda is not available on this machine or in this build of torch; use cpu")
     return "cuda" if available else "cpu"
 
 
-def _has_gpu() -> bool:
-    """Whether PyTorch can use one; it is asked only where it was built for GPUs and their driver is installed."""
-    if version("torch").endswith("+cpu") or not (find_library("cuda") or find_library("nvcuda")):
-        return False
-    import torch
-
-    return torch.cuda.is_available()
+def _may_have_gpu() -> bool:
+    """Whether PyTorch was built for one and a driver is there; otherwise it need not be imported to be asked."""
+    has_driver = any(Path("/dev", name).exists() for name in _GPU_DRIVERS) or find_library("cuda")
+    return not version("torch").endswith("+cpu") and bool(has_driver or find_library("nvcuda"))
 
 
 @dataclass

@@ -10,6 +10,7 @@ from torch import Tensor
 MAX_BOUND_RATIO = 1.5  # most over least
 FARTHEST = 100.0  # camera heights: weights do not grow beyond
 STEPS_PX = (1, 2, 4, 8)
+LEAST_HALF_WIDTH = 1e-3  # of bounds, log inverse depth: those of exact depth have none
 STILL = 0.01  # network units: added to the length of a step, against division by zero
 
 
@@ -41,9 +42,11 @@ class Bounds:
         return difference / narrow.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
 
 
-def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
-    """Mean log distance of a disparity from the bounds, over pixels with a bound; zero between them.
+def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
+    """Mean Huber loss of log disparity, over pixels with a bound.
 
+    Between both bounds it is the square of the distance from their middle, outside it is linear with slope 1: a pixel
+    is drawn to what was measured, the less the wider its bounds. One bound alone counts only where it is violated.
     Far surfaces are few pixels beside near ones, so a pixel weighs by the square root of its depth.
 
     Args:
@@ -51,14 +54,19 @@ def outside(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:
         bounds: of the same size.
         log_scale: log of the disparity's scale over that of the bounds, ``(B, 1, 1, 1)``.
     """
-    has_most = torch.isfinite(bounds.most)
+    has_most, has_least = torch.isfinite(bounds.most), bounds.least > 0
     scaled = disparity.log() - log_scale
-    below = (bounds.least.clamp(min=1e-6).log() - scaled).clamp(min=0)
-    above = (scaled - bounds.most.clamp(min=1e-6).log()).clamp(min=0)
+    least, most = (bound.clamp(min=1e-6).log() for bound in (bounds.least, bounds.most))
+    both = has_least & has_most
+    middle = torch.where(both, (least + most) / 2, 0)
+    half = torch.where(both, (most - least) / 2, 1).clamp(min=LEAST_HALF_WIDTH)
+    apart = (scaled - middle).abs()
+    huber = torch.where(apart < half, apart.square() / (2 * half), apart - half / 2)
+    one_sided = (least - scaled).clamp(min=0) * has_least + (scaled - most).clamp(min=0)
     nearest = torch.where(has_most, bounds.most, bounds.least).clamp(min=1 / FARTHEST)
-    weight = torch.where(has_most | (bounds.least > 0), nearest.rsqrt(), 0)
-    distance: Tensor = (weight * (below + above)).sum() / weight.sum().clamp(min=1)
-    return distance
+    weight = torch.where(has_most | has_least, nearest.rsqrt(), 0)
+    mean: Tensor = (weight * torch.where(both, huber, one_sided)).sum() / weight.sum().clamp(min=1)
+    return mean
 
 
 def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:

@@ -22,7 +22,7 @@ from erfsfm.losses.regularisation import (
     explainability_prior,
     second_order_smoothness,
 )
-from erfsfm.losses.structure import Bounds, outside, step_disagreement, translation_disagreement
+from erfsfm.losses.structure import Bounds, disagreement, step_disagreement, translation_disagreement
 
 PoseFunction = Callable[[Tensor, Sequence[Tensor]], list[Tensor] | Tensor]
 
@@ -221,7 +221,7 @@ def _teacher_terms(
         terms["unit"] = (log_scale - math.log(HEIGHTS)).abs().mean()
         unit = unit if config.teacher.views == "many" else log_scale.detach()
         scales = config.loss.scales
-        structure = [outside(disparities[k], bounds.strided(2**k), unit) for k in range(scales)]
+        structure = [disagreement(disparities[k], bounds.strided(2**k), unit) for k in range(scales)]
         terms["structure"] = torch.stack(structure).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from erfsfm.losses.structure import Bounds, outside, step_disagreement, translation_disagreement
+from erfsfm.losses.structure import Bounds, disagreement, step_disagreement, translation_disagreement
 
 
 def bounds(least: float, most: float) -> Bounds:
@@ -13,14 +13,28 @@ def bounds(least: float, most: float) -> Bounds:
 ZERO = torch.zeros(1, 1, 1, 1)
 
 
+HALF = math.log(1.5) / 2  # width of the bounds below
+
+
 @pytest.mark.parametrize(
-    ("disparity", "expected"),
-    [(0.2, 0.0), (0.25, 0.0), (0.1, 0.6931), (0.6, 0.6931)],
-    ids=["least", "in", "far", "near"],
+    ("ratio", "expected"),
+    [(0, 0.0), (HALF / 2, HALF / 8), (-HALF, HALF / 2), (HALF + 1, 1 + HALF / 2), (-HALF - 1, 1 + HALF / 2)],
+    ids=["middle", "in", "least", "near", "far"],
 )
-def test_distance_from_an_interval_is_a_log_ratio(disparity, expected):
-    distance = outside(torch.full((1, 1, 4, 4), disparity), bounds(0.2, 0.3), ZERO)
-    assert distance.item() == pytest.approx(expected, abs=1e-4)
+def test_between_bounds_the_middle_draws_and_beyond_them_the_loss_is_linear(ratio, expected):
+    disparity = torch.full((1, 1, 4, 4), math.sqrt(0.2 * 0.3) * math.exp(ratio), requires_grad=True)
+    distance = disagreement(disparity, bounds(0.2, 0.3), ZERO)
+    assert distance.item() == pytest.approx(expected, abs=1e-5)
+    distance.backward()
+    assert disparity.grad is not None
+    slope = (disparity.grad * disparity).sum().item()  # of the loss by log disparity
+    assert slope == pytest.approx(max(-1, min(1, ratio / HALF)), abs=1e-4)
+
+
+def test_exact_bounds_have_gradients():
+    disparity = torch.full((1, 1, 4, 4), 0.2, requires_grad=True)
+    disagreement(disparity, bounds(0.2, 0.2), ZERO).backward()
+    assert disparity.grad is not None and torch.isfinite(disparity.grad).all()
 
 
 @pytest.mark.parametrize("size", [(128, 416), (94, 310), (75, 248)])
@@ -38,7 +52,7 @@ def test_the_scale_is_removed_first():
     interval = bounds(0.24, 0.26)
     log_scale = interval.log_scale(disparity)
     assert log_scale.exp().item() == pytest.approx(3, rel=1e-2)
-    assert outside(disparity, interval, log_scale).item() == 0
+    assert disagreement(disparity, interval, log_scale).item() == pytest.approx(0, abs=1e-4)
 
 
 def test_unbounded_pixels_affect_neither_loss_nor_gradients():
@@ -46,7 +60,7 @@ def test_unbounded_pixels_affect_neither_loss_nor_gradients():
     least, most = torch.zeros(1, 1, 4, 4), torch.full((1, 1, 4, 4), torch.inf)
     most[..., 0, 0] = 0.25  # something far: only bounded from above
     interval = Bounds(least, most)
-    distance = outside(disparity, interval, interval.log_scale(disparity))
+    distance = disagreement(disparity, interval, interval.log_scale(disparity))
     assert distance.item() == pytest.approx(0.6931, abs=1e-4)
     distance.backward()
     assert disparity.grad is not None and torch.isfinite(disparity.grad).all()
@@ -56,7 +70,7 @@ def test_unbounded_pixels_affect_neither_loss_nor_gradients():
 def test_a_lower_bound_alone_penalises_farther_depth():
     disparity = torch.tensor([[[[0.05, 0.2]]]], requires_grad=True)
     interval = Bounds(torch.full((1, 1, 1, 2), 0.1), torch.full((1, 1, 1, 2), torch.inf))
-    distance = outside(disparity, interval, ZERO)
+    distance = disagreement(disparity, interval, ZERO)
     assert distance.item() == pytest.approx(0.6931 / 2, abs=1e-4)
     distance.backward()
     assert disparity.grad is not None and disparity.grad[0, 0, 0, 0] < 0 and disparity.grad[0, 0, 0, 1] == 0
@@ -64,7 +78,7 @@ def test_a_lower_bound_alone_penalises_farther_depth():
 
 def test_no_bounds_no_loss():
     assert (
-        outside(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0
+        disagreement(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0
     )
 
 

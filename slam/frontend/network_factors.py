@@ -79,7 +79,8 @@ def calibrated_factors(
     Args:
         snippets: measured by the network.
         geometric: measured by image geometry, unscaled, with its full noise.
-        noise: of this network; scaled from 20 common steps on.
+        noise: of this network, scaled by at least 20 common measurements. With fewer it says too little of this drive:
+            only pairs that image geometry did not measure have factors.
     """
     pairs = pair_poses([(s.target, s.sources, s.T_source_target, s.residuals) for s in snippets])
     if not pairs:
@@ -89,11 +90,14 @@ def calibrated_factors(
     student_t_dof = STUDENT_T_DOF if len(steps) >= _NOISE_STEPS else math.inf
     from_geometry = _from_geometry(pairs, steps)
     scaling = _scaling(pairs, from_geometry / law, _NOISE_STEPS)
-    sigmas = np.hypot(scaling * law, _noise_of_geometry(pairs, steps))
+    redundant = np.isfinite(from_geometry).all(axis=1)
+    usable = np.logical_or(np.isfinite(scaling).all(axis=1), ~redundant)
+    sigmas = np.hypot(np.nan_to_num(scaling, nan=1.0) * law, _noise_of_geometry(pairs, steps))
     correlated_sigmas = _persistence(pairs, from_geometry / sigmas, _NOISE_STEPS) * sigmas
     return [
         RelativePose(pair.first, pair.last, pair.T_first_last, own, NETWORK_SOURCE, chained, student_t_dof)
-        for pair, own, chained in zip(pairs, sigmas, correlated_sigmas, strict=True)
+        for pair, own, chained, use in zip(pairs, sigmas, correlated_sigmas, usable, strict=True)
+        if use
     ]
 
 
@@ -112,9 +116,9 @@ def _from_geometry(pairs: Sequence[PairPose], steps: Mapping[Ends, RelativePose]
 def _scaling(pairs: Sequence[PairPose], whitened: FloatArray, least: int) -> FloatArray:
     """Factors ``(P, 6)`` on the sigmas of pairs, by ``whitened`` ``(P, 6)`` differences from image geometry.
 
-    One for each distance in frames and, with enough measurements, each tertile of the turn rate; 1 with few.
+    One for each distance in frames and, with enough measurements, each tertile of the turn rate; NaN with few.
     """
-    scaling = np.ones_like(whitened)
+    scaling = np.full_like(whitened, np.nan)
     frames = np.array([pair.last - pair.first for pair in pairs])
     turn_rates = np.array([pair.turn for pair in pairs]) / frames
     measured = np.isfinite(whitened).all(axis=1)

@@ -54,6 +54,14 @@ def check(run: RunFolder, measured: Measured) -> None:
 
 
 @pytest.mark.data
+def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp_path: Path) -> None:
+    options = {"weights": "sim", "frames": "0:20", "overrides": QUICK, "output": tmp_path / "run"}
+    found = run_slam(data_root / "kitti_odometry", "02", **options).metrics()["trajectories"]
+    before, after = (found[kind]["align"]["none"]["ate_rmse_m"] for kind in ("odometry", "optimised"))
+    assert after < 1.2 * before < 0.3
+
+
+@pytest.mark.data
 @pytest.mark.slow
 @pytest.mark.parametrize("measured", KITTI, ids=str)
 def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:

@@ -101,17 +101,12 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     assert found[1, 2].student_t_dof == np.inf
 
 
-@pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None)])
+@pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None), ("calibrated", NOISE)])
 def test_network_factors_are_used_where_no_path_of_steps_exists(use: str, noise: PoseNoise | None) -> None:
     found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale(), use=use, noise=noise)
     pairs = {tuple(sorted(f.ends)) for f in found if f.source == NETWORK_SOURCE}
     assert {(2, 3), (3, 4), (4, 5), (2, 4), (3, 5), (7, 8), (7, 9), (6, 8)} <= pairs
     assert not pairs & {(0, 1), (1, 2), (0, 2), (5, 6), (6, 7), (5, 7), (8, 9)}
-
-
-def test_with_calibrated_noise_every_pair_has_a_factor() -> None:
-    found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale())
-    assert {(5, 6), (6, 7), (7, 8)} <= {f.ends for f in found if f.source == NETWORK_SOURCE}
 
 
 def network_trajectory() -> FloatArray:

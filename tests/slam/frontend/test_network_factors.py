@@ -207,6 +207,14 @@ def test_a_drive_scales_calibrated_noise_up_and_down():
     assert {f.student_t_dof for f in few} == {np.inf}  # as calibrated
 
 
+def test_noise_that_a_short_drive_cannot_check_is_for_gaps_alone():
+    T = drive(21)
+    steps = exact_geometry(T)
+    assert calibrated_factors(snippets_of(T)[:15], steps, NOISE) == []
+    gap = calibrated_factors(snippets_of(T), steps[:8] + steps[9:], NOISE)
+    assert pairs_of(gap) == {(8, 9), (7, 9), (8, 10)}
+
+
 def test_steps_that_skip_frames_scale_the_noise_of_pairs_as_far_apart():
     """Geometry leads over two frames at a time: pairs of neighbours keep the noise beside the weights."""
     T = drive(300)

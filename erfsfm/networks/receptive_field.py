@@ -134,6 +134,8 @@ def measured(
         if isinstance(module, nn.BatchNorm2d):
             module.reset_running_stats()
             module.reset_parameters()
+        elif isinstance(module, nn.ReLU6):
+            module.max_val = math.inf  # a white image saturates it
     predictors = _set_offsets(encoder, offsets_px)
     for module in encoder.modules():
         if isinstance(module, nn.Conv2d) and module not in predictors:

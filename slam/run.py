@@ -184,7 +184,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.output is not None:
         check_output(request.output)
     if request.rerun is not None:
-        import_rerun()
+        import_rerun("--rerun")
     settings = _settings(request, resumes)
     dataset = None if request.dataset is None else Path(request.dataset)
     recording = open_sequence(dataset, request.sequence, request.camera, request.frames)

@@ -47,6 +47,8 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
         if list(sequences) != ["all"]:
             raise SequenceError(f"{manifest_or_root} names its sequences itself: leave out --sequence")
         return _manifest(manifest_or_root, options)
+    if manifest_or_root.suffix.lower() in MANIFESTS and not manifest_or_root.exists():
+        raise SequenceError(f"no manifest {manifest_or_root}: check the path")
     known = sequence_names(manifest_or_root)
     if not known:
         raise SequenceError(f"{manifest_or_root} is no manifest ({', '.join(MANIFESTS)}) and holds no sequences")
@@ -54,8 +56,11 @@ def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequenc
     if missing:
         raise SequenceError(f"{manifest_or_root} has no sequence {missing[0]}: it has {', '.join(known)}")
     chosen = known if "all" in sequences else sequences
-    root = manifest_or_root.absolute()
-    drives = [Drive(name, root.parent, ("--dataset", str(root), "--sequence", name, *options)) for name in chosen]
+    # KITTI may be named by the environment alone
+    root = manifest_or_root.absolute() if manifest_or_root.exists() else manifest_or_root
+    drives = [
+        Drive(name, root.absolute().parent, ("--dataset", str(root), "--sequence", name, *options)) for name in chosen
+    ]
     return _named([("", drive) for drive in drives], root)
 
 

@@ -47,8 +47,8 @@ def export(
     from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
 
-    folder = RunFolder.open(run)
     options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
+    folder = RunFolder.open(run)
     with progress_bar() as progress:
         written = export_run(folder, what, output, up, options, progress)
     typer.echo(f"{what} of {run} in {written}")

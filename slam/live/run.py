@@ -94,7 +94,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     if request.output is not None:
         check_output(request.output)
     if request.view:
-        import_rerun()
+        import_rerun("--view")
     settings = load_config(request.config, request.overrides)
     _refuse_what_needs_the_whole(settings)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")

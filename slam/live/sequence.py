@@ -13,7 +13,7 @@ from slam.frames import Frame, Image, Intrinsics
 from slam.live.reader import Arrival, Reader
 from slam.live.source import Source
 from slam.pipeline.growing import GrowingSequence
-from slam.sequences.camera_file import explicit_camera, find_camera_file
+from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.undistortion import Undistortion
 
 
@@ -60,9 +60,13 @@ def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFil
         return explicit_camera(given, source, source.fps)
     path = Path(camera)
     places = (path, path.absolute().parent) if path.is_dir() else (path.absolute().parent,) if path.is_file() else ()
-    if not places:
-        raise SequenceError(f"camera {camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70")
-    return find_camera_file(None, *places, wanted_by=camera, images=source)
+    found = beside(*places)
+    if found is None:
+        looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
+        raise SequenceError(
+            f"camera {camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70{looked}"
+        )
+    return found
 
 
 def _as_they_are(image: Image) -> Image:

@@ -21,7 +21,7 @@ class Viewer:
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         """Start it; ``SlamError`` where rerun is not installed."""
-        self._rr = import_rerun()
+        self._rr = import_rerun("--view")
         self._intrinsics = intrinsics
         self._positions: list[FloatArray] = []
         self._stream = self._rr.RecordingStream("erfsfm-slam live")

@@ -44,8 +44,8 @@ def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_
         )
     if mode == "camera-height" and sequence.camera_height_m is None:
         raise SlamError(
-            f"scale mode camera-height needs a known height; {sequence.name} has none: add camera_height_m "
-            "to camera.yaml or choose scale.mode=none"
+            f"scale mode camera-height needs a known height; {sequence.name} has none: give a camera.yaml "
+            "with camera_height_m (fov=DEGREES has none) or choose scale.mode=none"
         )
     if mode == "gps" and not has_gps:
         raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")

@@ -105,7 +105,8 @@ def unit_notes(metrics: Mapping[str, Any]) -> list[str]:
     if mode == "none" and unit == CAMERA_HEIGHTS:
         notes.append(
             "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
-            "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres."
+            "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres. "
+            "For metres: camera_height_m in camera.yaml, a GPS track or scale.mode=known."
         )
     elif unit != METRES:
         reason = lookup(metrics, "scale", "value")[1]

@@ -53,6 +53,7 @@ class Table:
 
 ALIGNMENTS = ("none", "first", "scale", "6dof", "7dof")
 MOST_LOOPS = 40
+_STAGES = {"journal": "journal, from which run --continue goes on"}
 _PER_ALIGNMENT = (
     ("ate_rmse_m", "ATE RMSE, m", 3),
     ("t_rel_percent", "t_rel, %", 2),
@@ -193,15 +194,17 @@ def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
     tree, _ = lookup(metrics, "loops")
     if tree is None:
         return None
-    stages = ("candidates", "verified", "accepted")
-    groups = (("accepted", _details(loops_file, "accepted")), ("rejected", tree.get("rejected") or []))
+    stages, details = ("candidates", "verified", "accepted"), _details(loops_file)
+    groups = (("accepted", details.get("accepted", [])), ("rejected", tree.get("rejected") or []))
     rows = [
         (str(loop.get("from")), str(loop.get("to")), verdict, str(loop.get("reason") or ""))
         for verdict, entries in groups
         for loop in entries
         if isinstance(loop, Mapping)
     ]
-    more = [f"{len(rows) - MOST_LOOPS} more in {loops_file.name}."] if len(rows) > MOST_LOOPS else []
+    left_out = details.get("rejected_left_out")
+    where = loops_file.name + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
+    more = [f"{len(rows) - MOST_LOOPS} more in {where}."] if len(rows) > MOST_LOOPS else []
     head = ("from frame", "to frame", "verdict", "reason")
     return {
         "counts": ", ".join(f"{number(tree, stage).text} {stage}" for stage in stages),
@@ -253,7 +256,9 @@ def timing(metrics: Metrics) -> Table | None:
     stages, _ = lookup(metrics, "timing", "stages")
     if not stages:
         return None
-    total = max(float(lookup(metrics, "timing", "seconds_total")[0] or 0.0), sum(stages.values()), 1e-9)
+    timed = sum(stages.values())
+    total = max(float(lookup(metrics, "timing", "seconds_total")[0] or 0.0), timed, 1e-9)
+    stages = {_STAGES.get(name, name): seconds for name, seconds in stages.items()} | {"everything else": total - timed}
     longest = max(*stages.values(), 1e-9)
     rows = [
         [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
@@ -305,12 +310,12 @@ def notes_on(reasons: Iterable[str]) -> list[str]:
     return [f"{MISSING}  {'; '.join(distinct)}."] if distinct else []
 
 
-def _details(loops_file: Path, verdict: str) -> list[Any]:
-    """One list of ``loops.json``; empty where the file is missing or damaged."""
+def _details(loops_file: Path) -> dict[str, Any]:
+    """``loops.json``; empty where the file is missing or damaged."""
     try:
-        return list(read_json(loops_file, LoopsFile).get(verdict, []))
+        return read_json(loops_file, LoopsFile)
     except (OSError, RunError):
-        return []
+        return {}
 
 
 def _depth_source(metrics: Metrics) -> str:

@@ -35,7 +35,7 @@ def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics) -> None:
     Raises:
         SlamError: rerun is not installed, or the file cannot be written.
     """
-    rr = import_rerun()
+    rr = import_rerun("--rerun")
 
     def fill(partial: Path) -> None:
         stream = rr.RecordingStream("erfsfm-slam")

@@ -169,3 +169,4 @@ class LoopsFile(_Part):
 
     accepted: list[LoopEnds] = []
     rejected: list[LoopEnds] = []
+    rejected_left_out: int = 0

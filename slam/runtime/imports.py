@@ -25,9 +25,9 @@ def import_open3d() -> ModuleType:
         raise SlamError(f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package") from error
 
 
-def import_rerun() -> ModuleType:
-    """Import the rerun SDK, an optional extra; `SlamError` if it cannot be loaded."""
-    (rerun,) = _import_extra("--rerun needs rerun", "'erfsfm-slam[rerun]', or rerun-sdk", "rerun")
+def import_rerun(option: str) -> ModuleType:
+    """Import the rerun SDK, an optional extra that ``option`` needs; `SlamError` if it cannot be loaded."""
+    (rerun,) = _import_extra(f"{option} needs rerun", "'erfsfm-slam[rerun]', or rerun-sdk", "rerun")
     return rerun
 
 

@@ -81,7 +81,7 @@ def read_explicit(path: Path) -> CameraFile:
         SequenceError: if it does not exist or is wrong.
     """
     if not path.is_file():
-        raise SequenceError(f"no camera file {path}: --camera needs a {CAMERA_FILE}, or fov=DEGREES")
+        raise SequenceError(f"no camera file {path}: give a {CAMERA_FILE}, or fov=DEGREES")
     return read_camera_file(path)
 
 
@@ -115,7 +115,7 @@ def beside(*folders: Path) -> CameraFile | None:
 
 
 def is_field_of_view(given: Path) -> bool:
-    """Whether ``--camera`` names a field of view, not a file."""
+    """Whether the user named a field of view, not a file."""
     return str(given).startswith("fov=")
 
 
@@ -130,7 +130,7 @@ def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
     least, most = _FOV_LIMITS_DEG
     if not (least <= fov_deg <= most and fps > 0):
         raise SequenceError(
-            f"--camera {text} is no field of view: write fov=70 for 70 degrees from the left edge of the image to the "
+            f"{text} is no field of view: write fov=70 for 70 degrees from the left edge of the image to the "
             f"right, {least:g} to {most:g}, or fov=70,fps=30 for 30 frames a second as well"
         )
     focal_px = images.width / 2 / math.tan(math.radians(fov_deg) / 2)
@@ -144,4 +144,4 @@ def _of_field_of_view(text: str, images: Sized, fps: float) -> CameraFile:
         "fps": fps,
         "source": f"a horizontal field of view of {fov_deg:g} degrees",
     }
-    return camera_of(keys, f"--camera {text}")
+    return camera_of(keys, text)

@@ -116,13 +116,13 @@ def _root(dataset: Path | None, name: str | None) -> Path:
                 f"{wanted} is looked for in ${KITTI_VARIABLE}, which is not set: set it to a KITTI odometry "
                 f"root or give --dataset ROOT"
             )
-        path, origin = Path(variable).expanduser(), f"${KITTI_VARIABLE}"
+        path, origin = Path(variable).expanduser(), f" (${KITTI_VARIABLE})"
     else:
-        path, origin = dataset.expanduser(), "--dataset"
+        path, origin = dataset.expanduser(), ""
     if not path.exists():
-        raise SequenceError(f"no data set at {path} ({origin}): check the path")
+        raise SequenceError(f"no data set at {path}{origin}: check the path")
     if not (path.is_file() or path.is_dir()):
-        raise SequenceError(f"{path} ({origin}) is neither a file nor a folder: give a recording")
+        raise SequenceError(f"{path}{origin} is neither a file nor a folder: give a recording")
     return path
 
 

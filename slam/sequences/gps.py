@@ -36,7 +36,10 @@ def read_gps(path: Path) -> GpsTrack:
     """
     try:
         text = read_text(path, "utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        reason = error.strerror or error
+        raise SequenceError(f"{path} cannot be read as a GPS track: {reason}; give a file with --gps") from error
+    except UnicodeDecodeError as error:
         raise SequenceError(f"{path} cannot be read as a GPS track: {error}") from error
     lines = text.splitlines()
     try:

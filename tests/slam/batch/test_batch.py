@@ -70,6 +70,15 @@ def test_sequences_of_a_data_set(kitti_root: Path) -> None:
     assert drive.name == "sim" and drive.arguments[:2] == ("--dataset", str(kitti_root.absolute()))
     with pytest.raises(SequenceError, match="has no sequence 12: it has sim"):
         drives_of(kitti_root, ["12"], [])
+    with pytest.raises(SequenceError, match=r"no manifest .*none\.yaml: check the path"):
+        drives_of(kitti_root / "none.yaml", ["all"], [])
+
+
+def test_the_data_set_of_the_environment(kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KITTI_ODOMETRY", str(kitti_root))
+    monkeypatch.chdir(tmp_path)
+    (drive,) = drives_of(Path("KITTI"), ["all"], [])
+    assert drive.folder == tmp_path and drive.arguments[:2] == ("--dataset", "KITTI")
 
 
 def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:

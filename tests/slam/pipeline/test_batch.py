@@ -157,7 +157,7 @@ def test_auto_without_a_height_is_none() -> None:
         (30, "scale.mode=lidar", "scale.mode=lidar needs LiDAR scans of neighbouring frames"),
         (30, "lidar.factors=true", "lidar.factors=true needs LiDAR scans of neighbouring frames"),
         (30, "scale.mode=reference", "drive has none"),
-        (30, "scale.mode=camera-height", "add camera_height_m to camera.yaml"),
+        (30, "scale.mode=camera-height", "give a camera.yaml with camera_height_m"),
     ],
 )
 def test_what_cannot_work_is_refused_before_any_frame_is_read(frames: int, setting: str, words: str) -> None:

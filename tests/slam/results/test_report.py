@@ -194,6 +194,18 @@ def test_a_damaged_loops_file_leaves_the_rest_of_the_report(make_run: MakeRun) -
     assert "12 candidates" in parsed(folder)[0]
 
 
+def test_loops_and_time_add_up(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
+    metrics = make_metrics()
+    metrics["loops"]["rejected"] = [{"from": k, "to": 300, "reason": "few inliers"} for k in range(200)]
+    metrics["timing"] |= {"seconds_total": 64.0, "stages": {"geometry": 40.0, "journal": 7.0}}
+    folder = make_run(metrics=metrics)
+    folder.write_text("loops.json", '{"accepted": [], "rejected": [], "rejected_left_out": 39}')
+    write_report(folder, [], None)
+    words = " ".join(parsed(folder)[1].words)
+    assert "160 more in loops.json, without 39 rejected ones of fewest inliers." in words
+    assert "everything else 17.0 s" in words and "journal, from which run --continue goes on 7.0 s" in words
+
+
 def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:
     folder = make_run()
     late = folder.trajectory("odometry")

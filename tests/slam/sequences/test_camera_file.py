@@ -47,5 +47,5 @@ def test_what_is_no_field_of_view_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_a_single_pixel_is_no_image_of_a_camera(tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match=r"^--camera fov=70: width, height: images of 1x1 are none"):
+    with pytest.raises(SequenceError, match=r"^fov=70: width, height: images of 1x1 are none"):
         find_camera_file(Path("fov=70"), tmp_path, wanted_by="images", images=replace(IMAGES, width=1, height=1))

@@ -70,7 +70,7 @@ def test_unknown_folders(tmp_path: Path, content: list[str], message: str) -> No
 
 
 def test_unknown_paths(tmp_path: Path, camera_yaml: str) -> None:
-    with pytest.raises(SequenceError, match=r"no data set at .*nowhere \(--dataset\)"):
+    with pytest.raises(SequenceError, match=r"no data set at .*nowhere: check the path"):
         open_sequence(tmp_path / "nowhere", None, None, None)
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(SequenceError, match=r"notes\.txt is no video \(mp4, avi, mov, mkv\)"):

@@ -73,5 +73,5 @@ def test_what_is_no_track(tmp_path: Path, text: str, said: str) -> None:
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match="cannot be read as a GPS track"):
+    with pytest.raises(SequenceError, match=r"cannot be read as a GPS track: No such file or directory; give"):
         read_gps(tmp_path / "none.csv")

@@ -77,9 +77,8 @@ def test_a_lower_bound_alone_penalises_farther_depth():
 
 
 def test_no_bounds_no_loss():
-    assert (
-        disagreement(torch.ones(2, 1, 4, 4), Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf)), ZERO) == 0
-    )
+    unbounded = Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf))
+    assert disagreement(torch.ones(2, 1, 4, 4), unbounded, ZERO) == 0
 
 
 def test_coarser_bounds_are_pixels_of_the_finest():

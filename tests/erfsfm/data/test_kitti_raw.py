@@ -6,8 +6,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
 from erfsfm.data.discovery import discover
@@ -80,8 +78,7 @@ def test_missing_files(tmp_path: Path, write_raw: WriteDrive) -> None:
 
 
 def test_images_of_another_camera(tmp_path: Path, write_raw: WriteDrive) -> None:
-    drive = write_raw(tmp_path)
-    cv2.imwrite(str(drive / "image_02/data/0000000000.png"), np.zeros((64, 64, 3), np.uint8))
+    write_raw(tmp_path, stored=(64, 64))
     error = refusal(tmp_path)
     assert "the images are 64x64, but camera 02 in" in error
     assert "is 96x64: the images were cropped or are of another camera" in error

@@ -429,7 +429,8 @@ def test_many_views_have_one_unit_that_depth_and_motion_must_have(batch: Snippet
     right = replace(batch, T_source_target=T_source_target, bounds=Bounds(0.098 * half, 0.102 * half))
     assert evaluate(right, _many_views(), 0.5, vectors).total.item() == pytest.approx(0, abs=1e-3)
     twice = evaluate(right, _many_views(), 1.0, vectors)
-    assert twice.terms["structure"].item() == pytest.approx(math.log(2 / 1.02), rel=1e-3)
+    middle, half_width = math.sqrt(0.098 * 0.102), math.log(0.102 / 0.098) / 2
+    assert twice.terms["structure"].item() == pytest.approx(math.log(0.2 / middle) - half_width / 2, rel=1e-3)
     assert twice.terms["translation"].item() == pytest.approx(0, abs=1e-3)  # the unit is not the depth's
 
 

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.refinement.projection import Projection
+
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float32]
 
@@ -23,7 +25,6 @@ ROUND_TRIP_PX = 0.5
 OFF_LINE_PX = 1.0
 OUTLIER_SIGMAS = 3.0  # from the median of the neighbours
 LEAST_VIEWS = 2
-LEAST_Z = 1e-3  # of the unit ray
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,9 @@ def measure(
         if guess is None:
             flow, trusted = optical_flow(target, image, fine)
         else:
-            flow, trusted = guided_flow(target, image, fine, predicted_pixels(guess, T, K))
+            flow, trusted = guided_flow(
+                target, image, fine, np.dstack(Projection(K, T, *target.shape).pixels(guess)[:2])
+            )
         d, sigma, off_line_px = triangulate(flow, T, K)
         sigma[~trusted | (off_line_px > OFF_LINE_PX)] = np.inf
         values.append(d)
@@ -102,15 +105,6 @@ def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[
         back, u + there[..., 0], v + there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1e3
     )
     return there, np.linalg.norm(there + back_there, axis=-1) < ROUND_TRIP_PX
-
-
-def predicted_pixels(inverse_depth: Array, T_second_first: NDArray[np.float64], K: NDArray[np.floating]) -> Array:
-    """Where the first image's pixels lie in the second if their inverse depth ``(H, W)`` is right, ``(H, W, 2)``."""
-    height, width = inverse_depth.shape
-    R, t = T_second_first[:3, :3].astype(np.float32), T_second_first[:3, 3].astype(np.float32)
-    x, y, z = np.moveaxis(rays(height, width, K) @ R.T + inverse_depth[..., None] * t, -1, 0)
-    z = np.maximum(z, LEAST_Z)
-    return np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], axis=-1).astype(np.float32)
 
 
 def guided_flow(first: Grey, second: Grey, fine: bool, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -107,6 +107,7 @@ class DeformableConv2d(nn.Module):
         )
 
 
+@torch.inference_mode()
 def has_large_sampling(network: nn.Module, *inputs: Tensor | list[Tensor]) -> bool:
     """Whether any deformable layer of a network is large enough for the compiled path with these inputs."""
     met: list[bool] = []

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from erfsfm.multiview import combine, guided_flow, measure, predicted_pixels, rays, triangulate
+from erfsfm.multiview import combine, guided_flow, measure, rays, triangulate
+from erfsfm.refinement.projection import Projection
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 
@@ -35,7 +36,8 @@ def test_flow_around_predicted_pixels_is_the_flow_itself(street, shift):
     first, second = (street.render(k).image[..., 1].copy() for k in (120, 124))
     T = np.linalg.inv(street.T_world_camera[124]) @ street.T_world_camera[120]
     depth = street.render(120).depth
-    exact = predicted_pixels((1 / np.where(depth > 0, depth, 1e3)).astype(np.float32), T, street.K)
+    inverse = (1 / np.where(depth > 0, depth, 1e3)).astype(np.float32)
+    exact = np.dstack(Projection(street.K, T, *depth.shape).pixels(inverse)[:2])
     pixels = exact if shift is None else exact + np.float32(shift)
     flow, trusted = guided_flow(first, second, True, pixels)
     v, u = np.mgrid[:128, :416].astype(np.float32)

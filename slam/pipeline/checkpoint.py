@@ -21,6 +21,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.motion import Motion
@@ -115,7 +116,7 @@ class SessionCheckpoint:
 
 SERIALISER = Serialiser(
     *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
-    *(Corners, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
+    *(Corners, DepthError, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
     *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
 )

@@ -6,6 +6,7 @@ ratio of learned to triangulated depth; perspective-n-point against learned dept
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ import numpy as np
 from slam.config import GeometryConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -23,9 +25,10 @@ from slam.frontend.visual.epipolar import (
     triangulated_depth,
 )
 from slam.frontend.visual.motion import Motion, pose_sigmas
-from slam.frontend.visual.motion_history import MotionHistory, usual_error
+from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.visual.step_check import Step, most_credible
 from slam.frontend.visual.tracking import CornerTracker, TrackerState, Tracks
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import (
@@ -37,10 +40,11 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimator,
 )
 from slam.resection import consensus, refine
-from slam.robust import mad_sigma, weighted_median
+from slam.robust import MAD_TO_SIGMA
 from slam.se3 import FloatArray, invert, make
 from slam.storage.cache import GetOrCompute, without_cache
 
+logger = logging.getLogger(__name__)
 ESSENTIAL_SOURCE = "essential"
 PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
@@ -52,6 +56,7 @@ _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 _LEAST_ROTATION_SIGMA = np.deg2rad(0.01)
 _REPROJECTION_PX = 2.0  # largest reprojection error of a PnP inlier, pixels
 _MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
+_ROAD_TOLERANCE = 0.2  # largest deviation of a corner on the road from the camera's height, in camera heights
 _STILL_FLOW_PX = 0.3  # median optical flow below which the camera stands still, pixels
 _MIN_PARALLAX_PX = 0.8  # least median optical flow that remains after rotation is removed, pixels
 _MIN_POINT_PARALLAX_PX = 2.0  # least parallax of a point used for step lengths, pixels
@@ -69,6 +74,7 @@ class OdometryState:
     tracker: TrackerState
     dynamic_mask: DynamicMask
     history: MotionHistory
+    depth_error: DepthError
     last: Motion | None = None
     points: TriangulatedPoints | None = None
 
@@ -94,6 +100,7 @@ class VisualOdometry:
             self._tracker.state(),
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
             MotionHistory(),
+            DepthError(),
         )
 
     def state(self) -> OdometryState:
@@ -126,7 +133,7 @@ class VisualOdometry:
             ends = (previous.index, current.index)
             measured = (
                 self._still(ends, tracks, depth)
-                or self._by_essential(ends, tracks, learned, depth)
+                or self._by_essential((previous, current), tracks, learned, height_unscaled)
                 or self._by_points(ends, tracks, depth)
             )
         self._state = replace(self._state, last=measured if isinstance(measured, Motion) else None)
@@ -150,15 +157,14 @@ class VisualOdometry:
         if known is None:
             return lambda: None
         find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
-        mask, history = self._state.dynamic_mask, self._state.history
-        depth_error = usual_error(history.depth_relative_errors, DEPTH_RELATIVE_SIGMA)
+        mask, error = self._state.dynamic_mask, self._state.depth_error
 
         def measure() -> RelativeRotation | None:
             tracks = find()
             if len(tracks) < self._config.min_inliers:
                 return None
-            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), mask)
-            found = self._two_views.refined(matches, known[0], depth_error)
+            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), None, mask, error)
+            found = self._two_views.refined(matches, known[0])
             if found is None or found.inliers.sum() < self._config.min_inliers:
                 return None
             sigmas = np.sqrt(np.diag(found.covariance)[:3])
@@ -181,9 +187,15 @@ class VisualOdometry:
         farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
         return np.where(depth < farthest, depth, np.nan)
 
-    def _matches(self, tracks: Tracks, learned: FloatArray, mask: DynamicMask) -> Matches:
+    def _matches(
+        self, tracks: Tracks, learned: FloatArray, height: float | None, mask: DynamicMask, error: DepthError
+    ) -> Matches:
         rays_previous, rays_current = self._intrinsics.rays(tracks.previous), self._intrinsics.rays(tracks.current)
-        return Matches(rays_previous, rays_current, learned, mask.weights(tracks.previous))
+        depth, sigma = error.corrected(learned), np.maximum(error.sigma(learned), DEPTH_RELATIVE_SIGMA)
+        on_road = np.zeros(len(tracks), dtype=bool)
+        if height is not None:
+            on_road = np.abs(rays_previous[:, 1] * depth / height - 1.0) < _ROAD_TOLERANCE
+        return Matches(rays_previous, rays_current, depth, sigma, on_road, mask.weights(tracks.previous))
 
     def _still(self, ends: Ends, tracks: Tracks, depth: FloatArray) -> Motion | None:
         flow = float(np.median(np.linalg.norm(tracks.current - tracks.previous, axis=1)))
@@ -195,29 +207,60 @@ class VisualOdometry:
         sigmas = np.repeat([_LEAST_ROTATION_SIGMA, translation], 3)
         return Motion(RelativePose(*ends, np.eye(4), sigmas, STILL_SOURCE))
 
-    def _by_essential(self, ends: Ends, tracks: Tracks, learned: FloatArray, depth: FloatArray) -> Motion | None:
+    def _by_essential(
+        self, frames: tuple[Frame, Frame], tracks: Tracks, learned: FloatArray, height: float | None
+    ) -> Motion | MeasurementFailure | None:
         """Rotation and direction from the essential matrix, None where it is not well conditioned."""
-        matches = self._matches(tracks, learned, self._state.dynamic_mask)
+        matches = self._matches(tracks, learned, height, self._state.dynamic_mask, self._state.depth_error)
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         # the translation of an essential matrix is arbitrary under pure rotation: only used with enough parallax
         R_current_previous = rotation_between(rays_previous, rays_current)
         unexplained = parallax_px(rays_previous, rays_current, R_current_previous, self._intrinsics)
         if np.median(unexplained) < _MIN_PARALLAX_PX:
             return None
-        estimated = self._two_views.estimate(matches, self._state.history)
-        if estimated is None or estimated[0].inliers.sum() < self._config.min_inliers:
+        history = self._state.history
+        ends, seconds = (frames[0].index, frames[1].index), frames[1].stamp - frames[0].stamp
+
+        def step(corners: Matches, before: MotionHistory) -> Step | None:
+            two_view = self._two_views.estimate(corners, before)
+            if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
+                return None
+            return self._triangulated(ends, tracks, corners, self._trusted(learned, height), two_view)
+
+        usual = step(matches, history)
+        if usual is None:
             return None
-        two_view, history = estimated
-        motion = self._triangulated(ends, tracks, matches, depth, two_view)
-        if motion is not None:
-            mask = self._state.dynamic_mask.updated(tracks.current, two_view.inliers)
-            self._state = replace(self._state, dynamic_mask=mask, history=history)
-        return motion
+        chosen = usual
+        is_possible = history.is_possible_speed(usual.speed(height, seconds), seconds)
+        if history.is_sudden_loss(usual.inlier_ratio) or is_possible is False:
+            # what depth, mask and history say may be what is wrong
+            alone = step(matches.by_geometry_alone(), MotionHistory())
+            credible = most_credible([usual, alone], matches, height, seconds, history)
+            if credible is None:
+                return MeasurementFailure("the step contradicts the road and the steps before")
+            chosen = credible
+            logger.info("geometry %d -> %d: %s", *ends, "as usual" if chosen is usual else "by corners alone")
+        self._learn(tracks, matches, learned, chosen, chosen.speed(height, seconds))
+        return chosen.motion
+
+    def _learn(self, tracks: Tracks, matches: Matches, learned: FloatArray, step: Step, speed: float) -> None:
+        """Learn from a trusted step where objects move, how the camera moves, and the error of learned depth."""
+        state, two_view = self._state, step.two_view
+        still = two_view.inliers & (matches.weights > 0.5)
+        rays_previous, rays_current = matches.rays_previous[still], matches.rays_current[still]
+        nearness = 1.0 / triangulated_depth(rays_previous, rays_current, two_view.unit_pose)
+        self._state = replace(
+            state,
+            dynamic_mask=state.dynamic_mask.updated(tracks.current, two_view.inliers),
+            history=state.history.with_step(two_view.unit_pose, step.inlier_ratio, speed),
+            depth_error=state.depth_error.with_step(learned[still], nearness, step.motion.length_unscaled),
+            points=step.points,
+        )
 
     def _triangulated(
         self, ends: Ends, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
-    ) -> Motion | None:
-        """The motion with its length by learned depth, None with too few points for that."""
+    ) -> Step | None:
+        """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
         unit_pose = two_view.unit_pose
         parallax = parallax_px(rays_previous, rays_current, unit_pose.R_current_previous, self._intrinsics)
@@ -227,7 +270,10 @@ class VisualOdometry:
         if measures.sum() < _MIN_RATIOS:
             return None
         relative_sigma = INLIER_PX / np.maximum(parallax, 1e-9)
-        length, spread = _length(depth[measures] / depth_previous[measures], relative_sigma[measures])
+        error = self._state.depth_error
+        length, spread = error.length(depth[measures], depth_previous[measures], relative_sigma[measures])
+        # errors of learned depth are correlated in patches: one in ten counts as independent
+        spread *= MAD_TO_SIGMA * CORNER_CORRELATION / float(np.sqrt(max(measures.sum() / 10.0, 1.0)))
         T_previous_current = invert(make(unit_pose.R_current_previous, length * unit_pose.direction))
         rotation, direction = self._essential_sigmas(two_view)
         depth_current = depth_in_current(rays_previous, depth_previous, unit_pose)
@@ -238,9 +284,9 @@ class VisualOdometry:
         last, earlier = self._state.last, self._state.points
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
-        self._state = replace(self._state, points=triangulated)
         sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
-        return Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio)
+        motion = Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio)
+        return Step(motion, two_view, triangulated)
 
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:
         """Sigmas of rotation and direction ``(3,)`` each, in the current camera, where GTSAM perturbs."""
@@ -254,7 +300,8 @@ class VisualOdometry:
         known = np.isfinite(depth)
         if known.sum() < self._config.min_inliers:
             return MeasurementFailure(f"only {int(known.sum())} corners have a trusted depth")
-        points_previous = self._intrinsics.rays(tracks.previous[known]) * depth[known, None]
+        corrected = self._state.depth_error.corrected(depth[known])
+        points_previous = self._intrinsics.rays(tracks.previous[known]) * corrected[:, None]
         pixels, K = tracks.current[known], self._intrinsics.K
         found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
         count = 0 if found is None else len(found[2])
@@ -285,16 +332,3 @@ def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
     v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
     sampled = depth[v, u].astype(np.float64)
     return np.where(np.isfinite(sampled) & (sampled > 0), sampled, np.nan)
-
-
-def _length(ratios: FloatArray, triangulation_relative_sigma: FloatArray) -> tuple[float, float]:
-    """Weighted median of learned over triangulated depth, and its relative sigma.
-
-    A point weighs by the relative variance of both depths; the median is robust to moving cars.
-    """
-    logarithms = np.log(ratios)
-    weights = 1.0 / (_LEARNED_RELATIVE_SIGMA**2 + triangulation_relative_sigma**2)
-    centre = weighted_median(logarithms, weights)
-    deviation = mad_sigma(logarithms - centre)
-    # errors of learned depth are correlated in patches: one in ten counts as independent
-    return float(np.exp(centre)), CORNER_CORRELATION * deviation / float(np.sqrt(max(len(ratios) / 10.0, 1.0)))

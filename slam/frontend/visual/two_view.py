@@ -9,7 +9,7 @@ usual direction of motion.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,10 @@ from slam.frontend.visual.epipolar import (
     unit_pose_by_essential,
     unit_pose_by_pnp,
 )
-from slam.frontend.visual.motion_history import MotionHistory, MotionPrior, usual_error
+from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
+from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
-from slam.robust import mad_sigma
+from slam.robust import mad_sigma, weighted_median
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
 
@@ -37,6 +38,9 @@ _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0
 # inlier bound along the epipolar line, sigmas
 _ALONG_SIGMAS = 2.5
+# parallax of a corner that is an inlier against its learned depth, in sigmas of the corners' noise: triangulated to a
+# twentieth, four times as well as learned depth is known at best
+_PARALLAX_SIGMAS = 20.0
 # an outlier costs as much as this half-squared residual
 _OUTLIER_COST = 3.0
 # errors of learned depth are correlated in patches: its sigma is widened by this near a known motion
@@ -54,13 +58,20 @@ DEPTH_RELATIVE_SIGMA = 0.2  # least relative sigma of learned depth along an epi
 class Matches:
     """``M`` corners in two images: rays ``(M, 3)`` with z = 1 in both, learned ``depth_previous`` ``(M,)`` or NaN.
 
-    ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects.
+    Learned depth is without its bias and has the relative ``depth_sigma`` ``(M,)``; by it the corners ``on_road``
+    ``(M,)`` lie at the height of the road. ``weights`` ``(M,)`` in (0, 1] are lower on dynamic objects.
     """
 
     rays_previous: FloatArray
     rays_current: FloatArray
     depth_previous: FloatArray
+    depth_sigma: FloatArray
+    on_road: NDArray[np.bool_]
     weights: FloatArray
+
+    def by_geometry_alone(self) -> Matches:
+        """The same corners without what learned depth and the steps before say of them."""
+        return replace(self, depth_previous=np.full(len(self.weights), np.nan), weights=np.ones(len(self.weights)))
 
 
 @dataclass(frozen=True)
@@ -68,12 +79,13 @@ class TwoViewEstimate:
     """A ``unit_pose`` with its noise and support.
 
     ``covariance`` ``(6, 6)``: rotation then direction, both in the current camera, radians.
-    ``inliers`` ``(M,)`` marks the corners that fit it and their learned depth.
+    ``inliers`` ``(M,)`` marks the corners that fit it, ``agreeing`` ``(M,)`` those whose learned depth fits it too.
     """
 
     unit_pose: UnitRelativePose
     covariance: FloatArray
     inliers: NDArray[np.bool_]
+    agreeing: NDArray[np.bool_]
 
 
 class TwoViewEstimator:
@@ -91,32 +103,31 @@ class TwoViewEstimator:
         self._get_or_compute = get_or_compute
         self._seed = seed
 
-    def estimate(self, matches: Matches, history: MotionHistory) -> tuple[TwoViewEstimate, MotionHistory] | None:
-        """Rotation and direction of the next motion, and the history with it; None without a consensus."""
+    def estimate(self, matches: Matches, history: MotionHistory) -> TwoViewEstimate | None:
+        """Rotation and direction of the next motion; None without a consensus."""
         reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         proposed = self._by_essential(first, second)
-        prior = self._prior(matches, proposed, history)
+        if history.last is None and proposed is not None:
+            matches = self._with_first_sigma(matches, proposed)
+        prior = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
         candidates = [self._refined(matches, proposed, prior)]
-        if candidates[0] is None or candidates[0].inliers.mean() < _EARLY_EXIT_INLIER_RATIO:
+        if candidates[0] is None or candidates[0].agreeing.mean() < _EARLY_EXIT_INLIER_RATIO:
             by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
             candidates += [self._refined(matches, other, prior) for other in (by_points, history.last)]
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
             return None
-        best = max(found, key=lambda candidate: _support(candidate, prior))
-        error = self._depth_relative_error(matches, best.unit_pose)
-        return best, history.with_step(best.unit_pose, error)
+        return max(found, key=lambda candidate: _support(candidate, prior))
 
-    def refined(self, matches: Matches, start: UnitRelativePose, depth_relative_error: float) -> TwoViewEstimate | None:
+    def refined(self, matches: Matches, start: UnitRelativePose) -> TwoViewEstimate | None:
         """The motion refined from a well-known ``start``.
 
         Learned depth has a small weight: it is needed only to choose between motions.
         """
-        sigma = float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG))
-        return self._refined(
-            matches, start, MotionPrior(_PATCH_WIDENING * depth_relative_error, start.direction, sigma)
-        )
+        matches = replace(matches, depth_sigma=_PATCH_WIDENING * matches.depth_sigma)
+        prior = MotionPrior(start.direction, float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
+        return self._refined(matches, start, prior)
 
     def _by_essential(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
         tolerance = INLIER_PX / self._focal_px
@@ -142,31 +153,6 @@ class TwoViewEstimator:
         known = self._get_or_compute(kind, given, answer)
         return UnitRelativePose(*known) if known else None
 
-    def _prior(self, matches: Matches, proposed: UnitRelativePose | None, history: MotionHistory) -> MotionPrior:
-        """The prior from the history; without one, the error of learned depth is that under the proposed motion."""
-        errors = history.depth_relative_errors
-        if not errors and proposed is not None:
-            errors = (self._depth_relative_error(matches, proposed),)
-        error = usual_error(errors, DEPTH_RELATIVE_SIGMA)
-        return history.prior(error, float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
-
-    def _depth_relative_error(self, matches: Matches, unit_pose: UnitRelativePose) -> float:
-        """Relative error of learned depth against triangulated depth of inlier corners, scale aside."""
-        ratios = self._ratios(matches, unit_pose, self._residuals(matches))
-        if len(ratios) < _LEAST_POINTS:
-            return np.nan
-        return mad_sigma(ratios - np.median(ratios))
-
-    def _ratios(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> FloatArray:
-        """Logarithms of learned over triangulated depth, of corners near their epipolar lines with parallax."""
-        distance, _ = residuals.across(unit_pose, tangent_of(unit_pose.direction))
-        depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
-        rotated = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
-        shift_px = np.hypot(*(matches.rays_current.T[:2] - rotated)) * self._focal_px
-        usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
-        usable &= np.isfinite(matches.depth_previous)
-        return np.asarray(np.log(matches.depth_previous[usable] / depth[usable]))
-
     def _residuals(self, matches: Matches) -> Residuals:
         return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
 
@@ -178,43 +164,44 @@ class TwoViewEstimator:
             found = self._fitted(matches, start, prior)
             if found is None:
                 return ()
-            return found.unit_pose.R_current_previous, found.unit_pose.direction, found.covariance, found.inliers
+            unit_pose = found.unit_pose
+            return unit_pose.R_current_previous, unit_pose.direction, found.covariance, found.inliers, found.agreeing
 
-        settings = repr(
-            (
-                prior.depth_relative_error,
-                prior.axis_sigma,
-                INLIER_PX,
-                _ALONG_PX,
-                self._focal_px,
-            )
-        )
-        corners = (matches.rays_previous, matches.rays_current, matches.depth_previous, matches.weights)
+        settings = repr((prior.axis_sigma, INLIER_PX, _ALONG_PX, self._focal_px))
+        depth = matches.depth_previous, matches.depth_sigma
+        corners = (matches.rays_previous, matches.rays_current, *depth, matches.weights)
         begin = (start.R_current_previous, start.direction, prior.axis)
         known = self._get_or_compute("two-view refinement", (*corners, *begin, settings), refine)
-        return TwoViewEstimate(UnitRelativePose(known[0], known[1]), known[2], known[3].astype(bool)) if known else None
+        if not known:
+            return None
+        R_current_previous, direction, covariance, inliers, agreeing = known
+        unit_pose = UnitRelativePose(R_current_previous, direction)
+        return TwoViewEstimate(unit_pose, covariance, inliers.astype(bool), agreeing.astype(bool))
 
     def _fitted(self, matches: Matches, start: UnitRelativePose, prior: MotionPrior) -> TwoViewEstimate | None:
         """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
-        Across its epipolar line a corner has the noise of the image, along it that of learned depth.
+        Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
+        parallax is an inlier whatever its learned depth says: its own shift is the better measurement. Without parallax
+        the corner is far away or moves along with the camera, which learned depth alone can tell apart.
         """
         residuals = self._residuals(matches)
-        ratios = self._ratios(matches, start, residuals)
-        if len(ratios) < _LEAST_POINTS:
+        begin = self._length(matches, start, residuals)
+        if begin is None:
             return None
-        unit_pose, length = start, float(np.exp(np.median(ratios)))
+        unit_pose, length = start, begin
         known = np.isfinite(matches.depth_previous)
         for iteration in range(_ITERATIONS):
             tangent = tangent_of(unit_pose.direction)
             across, by_motion = residuals.across(unit_pose, tangent)
             along, by_all, shift_px = residuals.along(unit_pose, length, tangent)
             near = np.abs(across) < INLIER_PX
-            sigma_along = np.hypot(_ALONG_PX, prior.depth_relative_error * shift_px)
-            inliers = near & (~known | (np.abs(along) < _ALONG_SIGMAS * sigma_along))
+            sigma = max(mad_sigma(across[near]), 1e-3 * INLIER_PX) if near.any() else INLIER_PX
+            sigma_along = np.hypot(_ALONG_PX, matches.depth_sigma * shift_px)
+            seen_px = shift_px - along
+            agreeing, inliers = self._inliers(matches, near, shift_px, seen_px, _PARALLAX_SIGMAS * sigma)
             if inliers.sum() < _LEAST_POINTS:
                 return None
-            sigma = max(mad_sigma(across[near]), 1e-3 * INLIER_PX)
             weights = inliers * matches.weights / (1.0 + (across / (2.0 * sigma)) ** 2)
             weights_along = known * weights / (sigma_along**2 * (1.0 + (along / (2.0 * sigma_along)) ** 2))
             weights = weights / sigma**2
@@ -234,14 +221,76 @@ class TwoViewEstimator:
             length = max(length + float(step[5]), 0.2 * length)
         lift = np.zeros((6, 5))
         lift[:3, :3], lift[3:, 3:] = np.eye(3), tangent
-        return TwoViewEstimate(unit_pose, lift @ np.linalg.inv(normal)[:5, :5] @ lift.T, inliers)
+        return TwoViewEstimate(unit_pose, lift @ np.linalg.inv(normal)[:5, :5] @ lift.T, inliers, agreeing)
+
+    def _inliers(
+        self, matches: Matches, near: NDArray[np.bool_], shift_px: FloatArray, seen_px: FloatArray, parallax_px: float
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Which corners near their epipolar lines fit learned depth ``(M,)``, and which are inliers ``(M,)``.
+
+        The majority of the parallax in the image decides on the length by which learned depth is compared, not the
+        majority of corners: those far away are many at times, and their depth is the least certain.
+
+        Args:
+            matches: corners.
+            near: whether they are near their lines ``(M,)``.
+            shift_px: shift along them by learned depth ``(M,)``.
+            seen_px: shift along them as it is ``(M,)``.
+            parallax_px: a larger shift is inlier against learned depth.
+        """
+        known = np.isfinite(matches.depth_previous)
+        measured = near & known & (seen_px > 1.0) & (shift_px > 0)
+        by_parallax = (
+            weighted_median(seen_px[measured] / shift_px[measured], seen_px[measured]) if measured.any() else 1.0
+        )
+        expected_px = by_parallax * shift_px
+        tolerance_px = _ALONG_SIGMAS * np.hypot(_ALONG_PX, matches.depth_sigma * expected_px)
+        agreeing = near & (~known | (np.abs(seen_px - expected_px) < tolerance_px))
+        contradicting = near & ~agreeing
+        pixels = self._focal_px * matches.rays_previous[:, :2]
+        moving = moving_corners(pixels, matches.on_road, agreeing, contradicting, expected_px, seen_px)
+        return agreeing, agreeing | (contradicting & ~moving & (seen_px > parallax_px))
+
+    def _with_first_sigma(self, matches: Matches, proposed: UnitRelativePose) -> Matches:
+        """Before the drive has told the error of learned depth, it is that under the motion by corners alone."""
+        ratios, _ = self._ratios(matches, proposed, self._residuals(matches))
+        if len(ratios) < _LEAST_POINTS:
+            return matches
+        logarithms = np.log(ratios)
+        error = mad_sigma(logarithms - np.median(logarithms))
+        return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
+
+    def _length(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> float | None:
+        """Length in the unit of learned depth, by corners with parallax near their epipolar lines; None with few.
+
+        Without learned depth the length does not matter.
+        """
+        if not np.isfinite(matches.depth_previous).any():
+            return 1.0
+        ratios, shift_px = self._ratios(matches, unit_pose, residuals)
+        return weighted_median(ratios, shift_px) if len(ratios) >= _LEAST_POINTS else None
+
+    def _ratios(
+        self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals
+    ) -> tuple[FloatArray, FloatArray]:
+        """Learned over triangulated depth of corners with parallax near their epipolar lines, and that parallax."""
+        distance, _ = residuals.across(unit_pose, tangent_of(unit_pose.direction))
+        depth = triangulated_depth(matches.rays_previous, matches.rays_current, unit_pose)
+        rotated = _image(unit_pose.R_current_previous @ matches.rays_previous.T)
+        shift_px = np.hypot(*(matches.rays_current.T[:2] - rotated)) * self._focal_px
+        usable = (np.abs(distance) < INLIER_PX) & (depth > 0) & (shift_px > 1.0)
+        usable &= np.isfinite(matches.depth_previous)
+        return np.asarray(matches.depth_previous[usable] / depth[usable]), np.asarray(shift_px[usable])
 
 
 def _support(candidate: TwoViewEstimate, prior: MotionPrior) -> float:
-    """Number of inliers, less the cost of a deviation from the usual axis, forwards or backwards."""
+    """Number of inliers that agree with learned depth, less the cost of leaving the usual axis.
+
+    Forwards and backwards are equal.
+    """
     cosine = abs(float(prior.axis @ candidate.unit_pose.direction))
     deviation = float(np.arccos(min(cosine, 1.0))) / prior.axis_sigma
-    return float(candidate.inliers.sum()) - 0.5 * deviation**2 / _OUTLIER_COST
+    return float(candidate.agreeing.sum()) - 0.5 * deviation**2 / _OUTLIER_COST
 
 
 def _image(points: FloatArray) -> FloatArray:

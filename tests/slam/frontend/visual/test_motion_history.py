@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.frontend.visual.motion_history import MotionHistory, usual_error
+from slam.frontend.visual.motion_history import MotionHistory
 
 
 def heading(aside_deg: float) -> UnitRelativePose:
@@ -14,46 +14,55 @@ def heading(aside_deg: float) -> UnitRelativePose:
     return UnitRelativePose(np.eye(3), np.array([np.sin(aside), 0.0, -np.cos(aside)]))
 
 
-def history_of(asides_deg: np.ndarray, error: float = 0.1) -> MotionHistory:
+def history_of(asides_deg: np.ndarray, speed: float = 6.0) -> MotionHistory:
     history = MotionHistory()
     for aside_deg in asides_deg:
-        history = history.with_step(heading(aside_deg), error)
+        history = history.with_step(heading(aside_deg), 0.9, speed)
     return history
 
 
 def test_a_step_is_kept_as_measured() -> None:
     before = history_of(np.zeros(3))
-    after = before.with_step(heading(4.0), 0.2)
+    after = before.with_step(heading(4.0), 0.8, 7.0)
     np.testing.assert_array_equal(after.directions[-1], heading(4.0).direction)
     assert after.last is not None
     np.testing.assert_array_equal(after.last.direction, heading(4.0).direction)
-    assert after.depth_relative_errors == (0.1, 0.1, 0.1, 0.2)
+    assert after.inlier_ratios == (0.9, 0.9, 0.9, 0.8) and after.speeds == (6.0, 6.0, 7.0)
     assert len(before.directions) == 3  # a history is a value
 
 
 def test_few_steps_give_no_usual_direction() -> None:
-    prior = history_of(np.zeros(9)).prior(0.15, 0.01)
-    assert prior.depth_relative_error == 0.15 and prior.axis_sigma == np.inf
+    prior = history_of(np.zeros(9)).prior(0.01)
+    assert prior.axis_sigma == np.inf
     np.testing.assert_array_equal(prior.axis, np.zeros(3))
 
 
 def test_the_usual_direction_and_its_sigma_are_those_of_the_steps() -> None:
     asides = 3.0 + 2.0 * np.random.default_rng(0).normal(size=90)
     asides[::30] = 80.0  # slides
-    prior = history_of(asides).prior(0.15, np.deg2rad(1.0))
+    prior = history_of(asides).prior(np.deg2rad(1.0))
     assert np.rad2deg(np.arctan2(prior.axis[0], -prior.axis[2])) == pytest.approx(3.0, abs=1.0)
     assert np.rad2deg(prior.axis_sigma) == pytest.approx(np.hypot(2.0, 1.0), rel=0.3)
-    straight = history_of(np.zeros(20)).prior(0.15, np.deg2rad(1.0))
+    straight = history_of(np.zeros(20)).prior(np.deg2rad(1.0))
     assert straight.axis_sigma == pytest.approx(np.deg2rad(1.0))
 
 
 def test_only_the_last_steps_are_kept() -> None:
     history = history_of(np.concatenate([np.full(50, 30.0), np.zeros(100)]))
-    assert len(history.directions) == len(history.depth_relative_errors) == 100
+    assert len(history.directions) == 100
     np.testing.assert_allclose(history.directions[0], heading(0.0).direction)
 
 
-def test_the_usual_error_of_depth_is_a_median_that_ignores_unknown_ones() -> None:
-    assert usual_error((), 0.1) == 0.1
-    assert usual_error((0.01, 0.02, np.nan), 0.1) == 0.1
-    assert usual_error((0.3, 0.5, np.nan, 0.3), 0.1) == 0.3
+def test_a_step_that_loses_a_third_of_its_inliers_is_noticed() -> None:
+    history = history_of(np.zeros(20))
+    assert history.is_sudden_loss(0.55) and not history.is_sudden_loss(0.65)
+    assert not history_of(np.zeros(5)).is_sudden_loss(0.1)
+
+
+def test_a_car_brakes_with_no_more_than_ten_metres_a_second_squared() -> None:
+    history = history_of(np.zeros(20), speed=6.0)  # camera heights a second, 10 m/s
+    assert history.is_possible_speed(5.0, 0.1) and history.is_possible_speed(7.0, 0.1)
+    assert history.is_possible_speed(2.5, 0.1) is False
+    assert history.is_possible_speed(2.5, 0.5)
+    assert history_of(np.zeros(2)).is_possible_speed(2.5, 0.1) is None
+    assert history_of(np.zeros(20), speed=np.nan).is_possible_speed(2.5, 0.1) is None

@@ -28,7 +28,13 @@ def estimated(matches: Matches, history: MotionHistory = NO_HISTORY, seed: int =
     """The motion of one step after some history."""
     found = TwoViewEstimator(CONFIG, FOCAL_PX, seed=seed).estimate(matches, history)
     assert found is not None
-    return found[0]
+    return found
+
+
+def matches_of(previous: np.ndarray, current: np.ndarray, learned: np.ndarray) -> Matches:
+    count = len(learned)
+    sigma = np.full(count, DEPTH_RELATIVE_SIGMA)
+    return Matches(previous, current, learned, sigma, np.zeros(count, bool), np.ones(count))
 
 
 def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> tuple[Matches, np.ndarray]:
@@ -48,7 +54,7 @@ def corner_with_a_car(seed: int, turn_deg: float = 4.0, error: float = 0.15) -> 
     previous[:, :2] += noise[0]
     current[:, :2] += noise[1]
     learned = np.concatenate([np.full(CAR, 10.0), depth]) * np.exp(error * rng.normal(size=len(previous)))
-    return Matches(previous, current, learned, np.ones(len(learned))), T_current_previous
+    return matches_of(previous, current, learned), T_current_previous
 
 
 def angle_deg(R_a: np.ndarray, R_b: np.ndarray) -> float:
@@ -100,7 +106,7 @@ def test_a_known_motion_is_refined():
     direction = T_current_previous[:3, 3] / np.linalg.norm(T_current_previous[:3, 3])
     off = se3.from_rotation_vector(np.deg2rad([0.05, 0.1, -0.05]), np.zeros(3))[:3, :3]
     start = UnitRelativePose(off @ T_current_previous[:3, :3], direction)
-    refined = TwoViewEstimator(CONFIG, FOCAL_PX).refined(matches, start, DEPTH_RELATIVE_SIGMA)
+    refined = TwoViewEstimator(CONFIG, FOCAL_PX).refined(matches, start)
     assert refined is not None
     assert angle_deg(refined.unit_pose.R_current_previous, T_current_previous[:3, :3]) < 0.06
 
@@ -110,14 +116,11 @@ def test_the_estimator_has_no_state():
     estimator = TwoViewEstimator(CONFIG, FOCAL_PX)
     first, second = (corner_with_a_car(seed)[0] for seed in (0, 1))
     alone = estimator.estimate(second, NO_HISTORY)
-    refused = estimator.estimate(first, NO_HISTORY)
+    estimator.estimate(first, NO_HISTORY)
     again = estimator.estimate(second, NO_HISTORY)
-    assert alone is not None and again is not None and refused is not None
-    np.testing.assert_array_equal(alone[0].unit_pose.R_current_previous, again[0].unit_pose.R_current_previous)
-    assert alone[1].depth_relative_errors == again[1].depth_relative_errors and len(again[1].directions) == 1
-    assert NO_HISTORY.directions == () and len(refused[1].directions) == 1
-    after = estimator.estimate(second, refused[1])
-    assert after is not None and len(after[1].directions) == 2
+    assert alone is not None and again is not None
+    np.testing.assert_array_equal(alone.unit_pose.R_current_previous, again.unit_pose.R_current_previous)
+    np.testing.assert_array_equal(alone.inliers, again.inliers)
 
 
 def test_the_history_of_a_drive_chooses_between_motions():
@@ -125,7 +128,7 @@ def test_the_history_of_a_drive_chooses_between_motions():
     history = NO_HISTORY
     for _ in range(20):
         ahead = UnitRelativePose(np.eye(3), np.array([0.07, 0.0, -1.0]) / np.hypot(0.07, 1.0))
-        history = history.with_step(ahead, 0.15)
+        history = history.with_step(ahead, 0.9, 6.0)
     errors_deg = []
     for seed in range(20):
         matches, T_current_previous = corner_with_a_car(seed)
@@ -162,7 +165,7 @@ def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same():
 def test_without_common_points_there_is_no_motion():
     rng = np.random.default_rng(0)
     rays = [np.column_stack([rng.uniform(-0.8, 0.8, (12, 2)), np.ones(12)]) for _ in range(2)]
-    matches = Matches(*rays, np.full(12, np.nan), np.ones(12))
+    matches = matches_of(*rays, np.full(12, np.nan))
     assert TwoViewEstimator(CONFIG, FOCAL_PX).estimate(matches, NO_HISTORY) is None
 
 
@@ -180,3 +183,31 @@ def test_a_car_that_turns_off_in_rain_does_not_turn_the_camera(first):
         assert isinstance(motion, Motion)
         truth = se3.invert(previous.T_world_camera) @ current.T_world_camera
         assert angle_deg(motion.relative_pose.T_from_to[:3, :3], truth[:3, :3]) < 0.5
+
+
+def plain_road(seed: int, length: float = 0.9) -> tuple[Matches, np.ndarray, np.ndarray]:
+    """Two thirds of the corners far, with learned depth 35 % too near; also which are near, and the true motion."""
+    rng = np.random.default_rng(seed)
+    T_current_previous = se3.from_rotation_vector(np.deg2rad(rng.normal(0.0, 0.3, 3)), np.array([0.0, 0.0, -length]))
+    near = np.arange(600) < 200
+    x, y = rng.uniform(-0.8, 0.8, 600), np.where(near, rng.uniform(0.1, 0.25, 600), rng.uniform(-0.12, 0.02, 600))
+    depth = np.where(near, 1.65 / np.maximum(y, 0.1), rng.uniform(40.0, 90.0, 600))
+    previous = np.column_stack([x, y, np.ones(600)])
+    current = se3.apply(T_current_previous, previous * depth[:, None])
+    current /= current[:, 2:]
+    current[:, :2] += rng.normal(0.0, 0.15 / 720.0, (600, 2))
+    learned = depth * np.where(near, 1.0, 0.65) * np.exp(0.1 * rng.normal(size=600))
+    return matches_of(previous, current, learned), near, T_current_previous
+
+
+def test_learned_depth_that_sees_far_things_too_near_casts_out_no_near_corner():
+    errors_deg, kept = [], []
+    estimator = TwoViewEstimator(CONFIG, 720.0)
+    for seed in range(200):
+        matches, near, T_current_previous = plain_road(seed)
+        found = estimator.estimate(matches, NO_HISTORY)
+        assert found is not None
+        errors_deg.append(angle_deg(found.unit_pose.R_current_previous, T_current_previous[:3, :3]))
+        kept.append(found.inliers[near].mean())
+    assert max(errors_deg) < 0.1
+    assert min(kept) > 0.95  # as many as have less than four sigmas of noise across their epipolar lines

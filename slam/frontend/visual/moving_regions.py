@@ -1,0 +1,69 @@
+"""Regions of one image pair that move, by corners on their epipolar lines that contradict learned depth.
+
+A car that drives along with the camera keeps its corners on their epipolar lines, so geometry alone takes it for a part
+of the scene, farther or nearer than it is; learned depth knows better. But learned depth errs too, over half of the
+image at times, and must not cast out the scene itself. So it is believed only about a region as an object has it:
+connected, of one motion, and without the majority of the road; and about all such regions together only where they do
+not hold the majority of the image's parallax.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.se3 import FloatArray
+
+# side of the cells that connect corners, pixels: some two spacings of corners
+_CELL_PX = 24.0
+_LARGEST_SHARE = 0.5
+# largest deviation of the corners of a region from its own motion, over that motion
+_CONSISTENCY = 0.5
+
+
+def moving_corners(
+    pixels: FloatArray,
+    on_road: NDArray[np.bool_],
+    agreeing: NDArray[np.bool_],
+    contradicting: NDArray[np.bool_],
+    expected_px: FloatArray,
+    seen_px: FloatArray,
+) -> NDArray[np.bool_]:
+    """Which of the contradicting corners ``(M,)`` lie in a region that moves.
+
+    Args:
+        pixels: ``(M, 2)``, of any origin.
+        on_road: corners that learned depth puts on the road ``(M,)``.
+        agreeing: corners on their epipolar lines whose shift along them is as learned depth has it ``(M,)``.
+        contradicting: those on their lines whose shift is another ``(M,)``.
+        expected_px: the shift by learned depth ``(M,)``.
+        seen_px: the shift along the line ``(M,)``, negative away from it.
+    """
+    moving = np.zeros(len(pixels), dtype=bool)
+    if not contradicting.any():
+        return moving
+    cells = np.floor((pixels[contradicting] - pixels[contradicting].min(axis=0)) / _CELL_PX).astype(np.int64)
+    occupied = np.zeros(tuple(cells.max(axis=0) + 1), np.uint8)
+    occupied[tuple(cells.T)] = 1
+    count, labels = cv2.connectedComponents(occupied, connectivity=8)
+    region = labels[tuple(cells.T)]
+    motion = 1.0 - seen_px[contradicting] / np.maximum(expected_px[contradicting], 1e-3)
+    parallax = np.where(agreeing | contradicting, np.abs(seen_px), 0.0)
+    for n in range(1, count):
+        inside = np.zeros_like(moving)
+        inside[contradicting] = region == n
+        if not _has_majority(inside & on_road, parallax, on_road) and _agree(motion[region == n]):
+            moving |= inside
+    return np.zeros_like(moving) if _has_majority(moving, parallax, parallax > 0) else moving
+
+
+def _has_majority(part: NDArray[np.bool_], parallax: FloatArray, whole: NDArray[np.bool_]) -> bool:
+    """Whether a part of the corners ``(M,)`` holds more than half of the parallax ``(M,)`` of the whole."""
+    return bool(parallax[part].sum() > _LARGEST_SHARE * parallax[whole].sum())
+
+
+def _agree(motions: FloatArray) -> bool:
+    """Whether the corners of a region have one motion along their lines, as a share of the expected shift."""
+    middle = float(np.median(motions))
+    return float(np.median(np.abs(motions - middle))) < _CONSISTENCY * abs(middle)

@@ -1,0 +1,86 @@
+"""Which of several estimates of a step the road, the steps before and a car's acceleration agree with.
+
+Learned depth, the dynamic mask and the motion prior are learned from the steps before: one wrong step teaches them to
+find the next one wrong too. So a step that loses a third of its inliers, or has a length that no car reaches, is
+estimated again from corners alone, and the measurements that do not depend on them vote.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.frontend.visual.epipolar import triangulated_depth
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.motion_history import MotionHistory
+from slam.frontend.visual.triangulated_points import TriangulatedPoints
+from slam.frontend.visual.two_view import Matches, TwoViewEstimate
+
+# largest log of a length over the same by the road or by triangulated points
+_AGREEMENT = 0.25
+_LEAST_ROAD_CORNERS = 8
+
+
+@dataclass(frozen=True)
+class Step:
+    """A ``motion`` whose length learned depth gives, the two-view estimate behind it, and the points triangulated."""
+
+    motion: Motion
+    two_view: TwoViewEstimate
+    points: TriangulatedPoints
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Share of the corners that fit."""
+        return float(self.two_view.inliers.mean())
+
+    def speed(self, height_unscaled: float | None, seconds: float) -> float:
+        """Camera heights a second, NaN where the height is unknown."""
+        if height_unscaled is None or seconds <= 0:
+            return np.nan
+        return self.motion.length_unscaled / height_unscaled / seconds
+
+
+def most_credible(
+    steps: Sequence[Step | None],
+    matches: Matches,
+    height_unscaled: float | None,
+    seconds: float,
+    history: MotionHistory,
+) -> Step | None:
+    """The step with most votes, the first of equal ones; None where more votes are against each than for it."""
+    found = [step for step in steps if step is not None]
+    balance = [sum(_votes(step, matches, height_unscaled, seconds, history)) for step in found]
+    best = int(np.argmax(balance))
+    return found[best] if balance[best] >= 0 else None
+
+
+def _votes(
+    step: Step, matches: Matches, height_unscaled: float | None, seconds: float, history: MotionHistory
+) -> list[int]:
+    """1 for, -1 against, by each measurement that there is."""
+    speed = step.speed(height_unscaled, seconds)
+    votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, seconds, history)]
+    votes.append(_fits_road(step, matches, height_unscaled))
+    return [1 if vote else -1 for vote in votes if vote is not None]
+
+
+def _fits_ratio(step: Step, speed: float, seconds: float, history: MotionHistory) -> bool | None:
+    """Whether points of this step and the one before have the ratio of lengths that learned depth has."""
+    if step.motion.length_ratio is None or not history.speeds or not np.isfinite(speed / history.speeds[-1]):
+        return None
+    ratio, _ = step.motion.length_ratio
+    return bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT)
+
+
+def _fits_road(step: Step, matches: Matches, height_unscaled: float | None) -> bool | None:
+    """Whether the corners on the road are triangulated at the camera's height below it."""
+    road = matches.on_road & step.two_view.inliers
+    if height_unscaled is None or road.sum() < _LEAST_ROAD_CORNERS:
+        return None
+    rays = matches.rays_previous[road]
+    depth = triangulated_depth(rays, matches.rays_current[road], step.two_view.unit_pose)
+    height = float(np.median(depth * rays[:, 1]))
+    return bool(abs(np.log(max(height * step.motion.length_unscaled, 1e-9) / height_unscaled)) < _AGREEMENT)

@@ -17,10 +17,11 @@ from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
-from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
+from slam.pipeline.batch import Progress, SlamPipeline
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.journal import Journal, clear_journal
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places
@@ -44,7 +45,7 @@ class Stream:
 
     frames: Callable[[], Iterator[Frame]]
     watch: Callable[[Observer], None]
-    finish: Callable[[SlamResult, Path], None]
+    finish: Callable[[Estimate, Path], None]
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Job:
     progress: Progress | None = None
     stream: Stream | None = None
 
-    def checkpoint_of(self, state: ObserverState) -> SessionCheckpoint:
+    def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
         """What is kept of this run after some of its frames."""
         return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
 
@@ -110,7 +111,7 @@ def _run(job: Job, folder: RunFolder) -> None:
     output = job.settings.output
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
+        examples = [DepthExample(i, image, depth) for i, image, depth in result.drive.examples]
         write_report(folder, examples, views)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
@@ -124,11 +125,11 @@ def _journal(job: Job, folder: Path) -> Journal | None:
         return None
     journal = Journal(folder, job.checkpoint_of, with_keyframes=keep == "keyframes")
     if job.checkpoint is not None:
-        journal.begin_after(job.checkpoint.state.seen)
+        journal.begin_after(job.checkpoint.state.drive)
     return journal
 
 
-def _write_estimate(folder: RunFolder, result: SlamResult, job: Job) -> None:
+def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
     """Trajectories, graph, loops and places, and what ``run --continue`` needs."""
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
@@ -145,12 +146,12 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: Job) -> None:
     if keep != "nothing":
         folder.write(DRIVE, job.checkpoint_of(result.state).write)
     if keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
+        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.drive.keyframes))
 
 
-def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
+def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
     """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
-    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.observations.views)
+    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.drive.views)
     T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
     return Places(intrinsics, views, T_world_camera)
 

@@ -23,7 +23,8 @@ from slam.live.reader import EXPECTED
 from slam.live.sequence import StreamedSequence, calibration_of
 from slam.live.source import open_source
 from slam.live.view import Viewer
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
@@ -143,9 +144,9 @@ class _Session:
             late = None if arrival is None else round(1e3 * (time.monotonic() - arrival.at_s), 1)
             self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
             if self._viewer is not None:
-                self._viewer.show(index, observer.seen, tracked)
+                self._viewer.show(index, observer.drive, tracked)
 
-    def finish(self, result: SlamResult, folder: Path) -> None:
+    def finish(self, result: Estimate, folder: Path) -> None:
         """Say all poses again as the whole drive gives them, and why it ended."""
         reader = self._sequence.reader
         message = corrected_message(result.optimised, len(result.loops.accepted), result.scale.unit_name, str(folder))

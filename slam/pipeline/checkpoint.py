@@ -15,8 +15,9 @@ from typing import Self
 import numpy as np
 
 from slam.errors import RunError
-from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent
+from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent, View
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
 from slam.frontend.scale.road_homography import RoadStep
@@ -31,9 +32,8 @@ from slam.frontend.visual.tracking import Corners, TrackerState
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
-from slam.loops.descriptors import View
-from slam.pipeline.observations import Keyframe, Observations
-from slam.pipeline.observer import ObserverState, RecentFrame
+from slam.frontend.window.relative_poses import WindowPoses
+from slam.pipeline.observer import FrontEndState, RecentFrame
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
 from slam.storage.archive import opened_archive, read_array
@@ -57,12 +57,12 @@ class SessionCheckpoint:
     camera_height_m: float | None
     stamps: FloatArray
     reference: FloatArray | None
-    state: ObserverState
+    state: FrontEndState
 
     @classmethod
-    def of(cls, sequence: FrameSequence, state: ObserverState, weights_sha256: str) -> Self:
+    def of(cls, sequence: FrameSequence, state: FrontEndState, weights_sha256: str) -> Self:
         """From the state of an observer after the last frame, without images."""
-        without_images = replace(state, seen=replace(state.seen, keyframes=[], examples=[]))
+        without_images = replace(state, drive=replace(state.drive, keyframes=[], examples=[]))
         return cls(
             sequence.name,
             sequence.provenance(),
@@ -100,7 +100,7 @@ class SessionCheckpoint:
             )
         checkpoint = cls.read(folder / DRIVE)
         if (folder / KEYFRAMES).exists():
-            checkpoint.state.seen.keyframes.extend(read_keyframes(folder / KEYFRAMES))
+            checkpoint.state.drive.keyframes.extend(read_keyframes(folder / KEYFRAMES))
         return checkpoint
 
     def continued(self, following: FrameSequence) -> Continued:
@@ -114,10 +114,10 @@ class SessionCheckpoint:
 
 
 SERIALISER = Serialiser(
-    *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
+    *(SessionCheckpoint, FrontEndState, Drive, GateState, OdometryState, TrackerState, MotionHistory),
     *(Corners, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
-    *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
+    *(WindowPoses, WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
 )
 
 

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from slam.errors import RunError, SlamError
+from slam.frontend.drive import Drive
 from slam.pipeline.checkpoint import SERIALISER, SessionCheckpoint, read_keyframes, write_keyframes
-from slam.pipeline.observations import Observations
-from slam.pipeline.observer import ObserverState
+from slam.pipeline.observer import FrontEndState
 from slam.storage.files import JOURNAL_FILE, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class Journal:
     """Keeps the states of one pass; after a failure (a full disk) it warns, keeps no more, and the run goes on."""
 
     def __init__(
-        self, folder: Path, checkpoint_of: Callable[[ObserverState], SessionCheckpoint], with_keyframes: bool
+        self, folder: Path, checkpoint_of: Callable[[FrontEndState], SessionCheckpoint], with_keyframes: bool
     ) -> None:
         """Prepare for the first state.
 
@@ -45,18 +45,18 @@ class Journal:
         self._counts: dict[str, int] = {}
         self._is_writable = True
 
-    def begin_after(self, seen: Observations) -> None:
+    def begin_after(self, drive: Drive) -> None:
         """Take what was measured by an earlier process, whose journal is in the same folder, as kept."""
-        self._counts = {name: len(items) for name, items in _items(seen).items()}
+        self._counts = {name: len(items) for name, items in drive.collected().items()}
 
-    def keep(self, state: ObserverState) -> None:
+    def keep(self, state: FrontEndState) -> None:
         """Write what is new since the last state, then the state of the front end; maps, at distances that grow."""
-        frames, items, before = len(state.seen.roads), _items(state.seen), self._counts.get("roads", 0)
+        frames, items, before = len(state.drive), state.drive.collected(), self._counts.get("roads", 0)
         is_early = state.keyframes is not None and frames - before < _GROWTH * before
         if is_early or not self._is_writable:
             return
-        new = Observations(**{name: _after(each, self._counts.get(name, 0)) for name, each in items.items()})
-        whole = replace(self._checkpoint_of(state), reference=None, state=replace(state, seen=Observations()))
+        new = Drive(**{name: _after(each, self._counts.get(name, 0)) for name, each in items.items()})
+        whole = replace(self._checkpoint_of(state), reference=None, state=replace(state, drive=Drive()))
         measured = replace(new, keyframes=[], examples=[])
         try:
             self._write(f"pass-part-{frames:06d}.zip", lambda path: SERIALISER.write(path, measured))
@@ -67,7 +67,7 @@ class Journal:
         except (SlamError, OSError) as error:
             logger.warning("the state of the run is not kept any more, a killed run goes on from before: %s", error)
             self._is_writable = False
-        self.begin_after(state.seen)
+        self.begin_after(state.drive)
 
     def _write(self, name: str, fill: Callable[[Path], object]) -> None:
         write_atomically(self._folder / name, fill)
@@ -85,23 +85,23 @@ def read_journal(folder: Path) -> SessionCheckpoint | None:
     if not states:
         return None
     last = max(states)
-    checkpoint, seen = SessionCheckpoint.read(states[last]), Observations()
+    checkpoint, drive = SessionCheckpoint.read(states[last]), Drive()
     keyframes = _files(folder, "keyframes")
     for frames, path in sorted(_files(folder, "part").items()):
         if frames > last:
             break
         part = SERIALISER.read(path)
-        if not isinstance(part, Observations):
+        if not isinstance(part, Drive):
             raise RunError(f"{path} is damaged: run the sequence again")
-        _extend(seen, part)
+        _extend(drive, part)
         if frames in keyframes:
-            seen.keyframes.extend(read_keyframes(keyframes[frames]))
-    if len(seen.roads) != last:
+            drive.keyframes.extend(read_keyframes(keyframes[frames]))
+    if len(drive) != last:
         raise RunError(
-            f"{folder} lacks parts of what its run kept ({len(seen.roads)} of {last} frames are there): "
+            f"{folder} lacks parts of what its run kept ({len(drive)} of {last} frames are there): "
             "run the sequence again"
         )
-    return replace(checkpoint, state=replace(checkpoint.state, seen=seen))
+    return replace(checkpoint, state=replace(checkpoint.state, drive=drive))
 
 
 def clear_journal(folder: Path) -> None:
@@ -122,18 +122,13 @@ def _remove(folder: Path, kind: str, before: int | None = None) -> None:
             path.unlink(missing_ok=True)
 
 
-def _items(seen: Observations) -> dict[str, Any]:
-    """Lists and dictionaries by name; all of them only grow at their end."""
-    return {field.name: getattr(seen, field.name) for field in fields(Observations)}
-
-
 def _after(items: Any, count: int) -> Any:
     return dict(islice(items.items(), count, None)) if isinstance(items, dict) else items[count:]
 
 
-def _extend(seen: Observations, part: Observations) -> None:
-    new = _items(part)
-    for name, items in _items(seen).items():
+def _extend(drive: Drive, part: Drive) -> None:
+    new = part.collected()
+    for name, items in drive.collected().items():
         if isinstance(items, dict):
             items.update(new[name])
         else:

@@ -23,7 +23,7 @@ from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.keyframe_tracking import decided, has_keyframes
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
@@ -225,7 +225,7 @@ class Slam:
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        if has_keyframes(self._config.window, checkpoint.state.seen) != (checkpoint.state.keyframes is not None):
+        if has_keyframes(self._config.window, checkpoint.state.drive) != (checkpoint.state.keyframes is not None):
             raise SlamError(f"{path} was made with another window.use: make Slam with the same")
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
@@ -253,13 +253,14 @@ class Slam:
             SlamError: the graph has no solution.
         """
         self._observer.flush()
-        if not self._observer.seen.snippets:
+        if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        solved = self._pipeline.solve(self._mode, self._pipeline.close_maps(self._observer.closed()))
-        self._tracker.correct(solved.T_world_camera, solved.measured.scale)
-        return solved.loops
+        drive, closure = self._pipeline.close_maps(self._observer.completed())
+        estimate = self._pipeline.solve(self._mode, drive, self._observer.state(), closure)
+        self._tracker.correct(estimate.optimised.T_world_camera, estimate.scale)
+        return estimate.loops
 
-    def _observe(self, state: ObserverState | None) -> Observer:
+    def _observe(self, state: FrontEndState | None) -> Observer:
         return Observer(
             self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
         )

@@ -255,7 +255,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
         assert len(failed) == 1 and 8 < failed[0] <= 11
         trajectory = slam.trajectory()
         slam.save(tmp_path / "drive.zip")
-    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.seen.unusable
+    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.drive.unusable
     if question == "depth":
         assert unusable.pop(8) == "it could not be measured (out of memory at frame 8)"
     assert set(unusable) <= {9, 10}, "the black frame, or the one that was measured when the snippet failed"

@@ -9,13 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.config import SlamConfig, WindowConfig
-from slam.frames import RelativeSimilarity
+from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.odometry import WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
 from slam.loops import maps
-from slam.loops.descriptors import View
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking

@@ -126,10 +126,9 @@ class KeyframeTracking:
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
-        state = self.state()
-        if state is None or not self._is_carried or not state.segments:
+        if self._odometry is None or not self._is_carried or not self._odometry.segments:
             return None
-        segment = state.segments[-1]
+        segment = self._odometry.segments[-1]
         placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
         located = [(place, T_map) for place, T_map in placed if T_map is not None]
         if len(located) < 2 or located[-1][0] != index:
@@ -144,12 +143,12 @@ class KeyframeTracking:
         self.decide(drive)
         if self._odometry is None or not self._is_carried:
             return ()
-        return tuple(segment for segment in self._odometry.state().segments if segment.started)
+        return tuple(segment.copy() for segment in self._odometry.segments if segment.started)
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
         """What became of the maps so far."""
-        return () if self._odometry is None else self._odometry.state().events
+        return () if self._odometry is None else self._odometry.events
 
     def poses(self, maps: Sequence[Segment]) -> WindowPoses:
         """Relative poses of all frames of some maps."""

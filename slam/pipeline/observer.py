@@ -98,7 +98,7 @@ class Observer:
         self._config = config
         self._stopwatch = stopwatch
         self._examples = frozenset(examples)
-        self._drive = Drive() if state is None else state.drive
+        self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
@@ -166,10 +166,10 @@ class Observer:
             self._finish_tasks()
 
     def state(self) -> FrontEndState:
-        """The state from which another observer continues as without an interruption."""
+        """A snapshot from which another observer continues as without an interruption."""
         self.flush()
         parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        return FrontEndState(self._drive, *parts, self._window, self._recent, self._unread)
+        return FrontEndState(self._drive.copy(), *parts, self._window, self._recent, self._unread)
 
     @property
     def frames(self) -> int:

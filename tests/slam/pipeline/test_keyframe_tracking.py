@@ -1,4 +1,5 @@
 import importlib.util
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
+from slam.pipeline.checkpoint import SERIALISER
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
-from slam.pipeline.observer import Observer
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
 from slam.se3 import chain, from_rotation_vector
@@ -91,6 +93,34 @@ def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: 
     assert late == {22, 26, 30, 34, 38} | {keyframe.index for keyframe in keyframes if keyframe.index >= 20}
     assert [snippet.target for snippet in closed.trusted if snippet.target > 18] == [22, 26, 30, 34]
     assert len(closed.trusted[0].sources) == 4 and not closed.interpolated
+
+
+def written(state: FrontEndState, path: Path) -> list[bytes]:
+    SERIALISER.write(path, state)
+    with zipfile.ZipFile(path) as file:
+        return [file.read(name) for name in file.namelist()]
+
+
+def test_a_state_stays_as_it_was_given_out(tmp_path: Path) -> None:
+    """While frames follow, in the front end that gave it out and in another that resumed from it."""
+    truth = room.walk(40)
+    oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
+
+    def observer(state: FrontEndState | None = None) -> Observer:
+        return Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch(), state=state)
+
+    with observer() as first:
+        for k in range(26):
+            first.add(k, room.frame(k, truth[k]))
+        state = first.state()
+        before = written(state, tmp_path / "before")
+        with observer(state) as second:
+            for k in range(26, 40):
+                first.add(k, room.frame(k, truth[k]))
+                second.add(k, room.frame(k, truth[k]))
+            after = [written(each.state(), tmp_path / "after") for each in (first, second)]
+    assert state.keyframes is not None and state.keyframes.segments[-1].started
+    assert written(state, tmp_path / "again") == before and after[0] == after[1] != before
 
 
 def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:

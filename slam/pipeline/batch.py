@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.frames import Frame, Predictor, RelativePose
@@ -36,11 +34,11 @@ from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.map_closure import close_maps
 from slam.pipeline.measurements import Measurements
-from slam.pipeline.observations import ClosedObservations
+from slam.pipeline.observations import ClosedObservations, Examples
 from slam.pipeline.observer import Observer, ObserverState
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
-from slam.pipeline.requirements import require_possible
+from slam.pipeline.requirements import require_frames, require_possible
 from slam.pipeline.solution import Solution
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
@@ -54,7 +52,6 @@ from slam.trajectory import Trajectory
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
-EXAMPLES = 5
 
 
 @dataclass(frozen=True)
@@ -146,13 +143,11 @@ class SlamPipeline:
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """
-        if frames is None:
-            self.require_possible()
+        mode = self.require_possible() if frames is None else require_possible(self._sequence, self._config, False)
         if self._config.mapping.enabled:
             import_open3d_beside()
         observations, state = self._observe(journal, frames, watch)
         observations = self.close_maps(observations)
-        mode = self.require_possible()
         warn_of_doubts(len(self._sequence), observations, state)
         solved = self.solve(mode, observations)
         measured = solved.measured
@@ -243,9 +238,9 @@ class SlamPipeline:
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed; raises as `require_possible`."""
-        shortest = self._predictor.sources + 1
-        mode = require_possible(self._sequence, shortest, self._config, self._gps_track is not None)
+        """The scale mode of this run, after checks that it can succeed; raises as they do."""
+        require_frames(self._sequence, self._predictor.sources + 1)
+        mode = require_possible(self._sequence, self._config, self._gps_track is not None)
         self._positioning(mode)
         return mode
 
@@ -264,7 +259,7 @@ class SlamPipeline:
             logger.warning(
                 "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
             )
-        examples = np.linspace(first, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
+        examples = Examples(None if frames is not None else range(first, total))
         observer = Observer(
             self._predictor,
             self._sequence.intrinsics,

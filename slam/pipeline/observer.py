@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +26,7 @@ from slam.frontend.visual.odometry import OdometryState, VisualOdometry
 from slam.frontend.window.odometry import WindowState
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
+from slam.pipeline.observations import ClosedObservations, Examples, Keyframe, Observations
 from slam.pipeline.pending import PendingFrame, PendingTask
 from slam.pipeline.reading import predicted_depth
 from slam.runtime.memory import return_freed_memory
@@ -78,7 +78,7 @@ class Observer:
         intrinsics: Intrinsics,
         config: SlamConfig,
         stopwatch: Stopwatch,
-        examples: Collection[int] = (),
+        examples: Examples | None = None,
         get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
         state: ObserverState | None = None,
@@ -90,7 +90,7 @@ class Observer:
             intrinsics: of all images.
             config: of all parts.
             stopwatch: measures the time of stages.
-            examples: frames to keep whole for the report.
+            examples: frames to keep whole for the report; None keeps none.
             get_or_compute: a cache of image measurements.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
@@ -98,7 +98,7 @@ class Observer:
         self._predictor = predictor
         self._config = config
         self._stopwatch = stopwatch
-        self._examples = frozenset(examples)
+        self._examples = examples or Examples(range(0))
         self._seen = Observations() if state is None else state.seen
         self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
         self._odometry = VisualOdometry(
@@ -343,7 +343,7 @@ class Observer:
         """Keep thinned frames for the map, and a few whole ones for the report."""
         mapping = self._config.mapping
         if frame.index in self._examples:
-            self._seen.examples.append((frame.index, frame.image, depth))
+            self._examples.keep(frame, depth, self._seen.examples)
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
             self._tasks.append(PendingTask("map", keyframe, self._seen.keyframes.append))

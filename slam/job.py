@@ -34,18 +34,21 @@ from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.sequences.continued import Continued
+from slam.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
 class Stream:
     """Frames that come while they are taken, and who watches them.
 
-    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder.
+    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder;
+    ``tracked`` gives the poses so far.
     """
 
     frames: Callable[[], Iterator[Frame]]
     watch: Callable[[Observer], None]
     finish: Callable[[Estimate, Path], None]
+    tracked: Callable[[], Trajectory]
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
             _run(job, folder)
     except BaseException as error:
         ignore_signals()
-        _leave_failure(folder, log, job.settings.output.report, error)
+        _leave_failure(job, folder, log, error)
         if folder.replaces is not None and isinstance(error, SlamError):
             is_kept = (folder.replaces / ESTIMATE).is_file()  # else it failed while one was put in the other's place
             kept = f"{folder.replaces} {'keeps' if is_kept else 'lost'} its earlier run, this one is in {folder.path}"
@@ -156,12 +159,17 @@ def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
     return Places(intrinsics, views, T_world_camera)
 
 
-def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseException) -> None:
-    """Write the reason of the failure to the folder; errors of writing it are ignored, so the first one is raised."""
+def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseException) -> None:
+    """Write the reason of the failure, and of a live drive its poses, which nothing else could give again.
+
+    Errors of writing them are ignored, so the first one is raised.
+    """
     known = isinstance(error, SlamError | ErfsfmError | Terminated)
     reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     log.failed(reason)
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
-        if report:
+        if job.stream is not None and folder.trajectory("odometry") is None:
+            folder.write_trajectory("trajectory_odometry", job.stream.tracked())
+        if job.settings.output.report:
             write_report(folder, [], None)

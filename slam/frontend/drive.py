@@ -26,6 +26,8 @@ from slam.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
 
+_EXAMPLES, _MOST_EXAMPLES = 5, 8
+
 
 @dataclass(frozen=True)
 class Keyframe:
@@ -56,6 +58,32 @@ class Keyframe:
     def depth_unscaled(self) -> DepthMap:
         """``(h, w)``."""
         return self.spilled_depth.read()
+
+
+class Examples:
+    """Chooses frames to keep whole for the report, evenly spread over a drive.
+
+    Of a recording there are five, known before its first frame. Of a drive that grows, whose end nobody knows, every
+    frame of a stride is kept, and the stride doubles where more than eight would be.
+    """
+
+    def __init__(self, recording: range | None = None) -> None:
+        """Choose among the frames of a recording; None is a drive that grows."""
+        self._stride = 1
+        self._frames: frozenset[int] | None = None
+        if recording is not None:
+            spread = np.linspace(recording.start, recording.stop - 1, _EXAMPLES + 2).round().astype(int)
+            self._frames = frozenset(spread[1:-1].tolist())
+
+    def __contains__(self, index: int) -> bool:
+        return index % self._stride == 0 if self._frames is None else index in self._frames
+
+    def keep(self, frame: Frame, depth: DepthMap, kept: list[tuple[int, Image, DepthMap]]) -> None:
+        """Add a chosen frame with its depth ``(H, W)`` to those that are kept."""
+        kept.append((frame.index, frame.image, depth))
+        if self._frames is None and len(kept) > _MOST_EXAMPLES:
+            self._stride *= 2
+            kept[:] = [example for example in kept if example[0] in self]
 
 
 @dataclass

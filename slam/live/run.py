@@ -25,7 +25,9 @@ from slam.live.source import open_source
 from slam.live.view import Viewer
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.observer import Observer
+from slam.pipeline.requirements import require_possible
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
@@ -34,6 +36,7 @@ from slam.results.output import check_output
 from slam.results.run_log import run_log
 from slam.run import RunRequest, provenance_of
 from slam.runtime.imports import import_rerun
+from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +108,9 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     intrinsics = StreamedSequence.intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor, _ = make_predictor(networks, depth, settings.depth, intrinsics)
-    sequence = StreamedSequence(Path(request.source).stem or "live", source, camera, request.wait_s)
+    name = Path(request.source).stem or "live"
+    require_possible(GrowingSequence(intrinsics, camera.height_or(None), name=name), settings, has_gps=False)
+    sequence = StreamedSequence(name, source, camera, request.wait_s)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
     tracker = Tracker(predictor, intrinsics, sequence.camera_height_m, settings, networks.noise)
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
@@ -118,7 +123,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         command=request.command,
     )
     provenance = provenance_of(recorded, networks, sequence, depth)
-    stream = Stream(sequence.frames, session.watch, session.finish)
+    stream = Stream(sequence.frames, session.watch, session.finish, session.tracked)
     sha256 = mixed_sha256(networks.sha256, depth)
     return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
 
@@ -145,6 +150,11 @@ class _Session:
             self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
             if self._viewer is not None:
                 self._viewer.show(index, observer.drive, tracked)
+
+    def tracked(self) -> Trajectory:
+        """The poses that were said so far."""
+        T_world_camera = self._tracker.T_world_camera
+        return Trajectory(self._sequence.stamps[: len(T_world_camera)], T_world_camera)
 
     def finish(self, result: Estimate, folder: Path) -> None:
         """Say all poses again as the whole drive gives them, and why it ended."""

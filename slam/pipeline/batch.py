@@ -9,13 +9,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from erfsfm.pose_noise import PoseNoise
 from slam.config import ScaleMode, SlamConfig
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.drive import Drive
+from slam.frontend.drive import Drive, Examples
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
@@ -39,7 +37,7 @@ from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
-from slam.pipeline.requirements import require_possible
+from slam.pipeline.requirements import require_frames, require_possible
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -52,7 +50,6 @@ from slam.trajectory import Trajectory
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
-EXAMPLES = 5
 
 
 class SlamPipeline:
@@ -119,13 +116,11 @@ class SlamPipeline:
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """
-        if frames is None:
-            self.require_possible()
+        mode = self.require_possible() if frames is None else require_possible(self._sequence, self._config, False)
         if self._config.mapping.enabled:
             import_open3d_beside()
         drive, state = self._observe(journal, frames, watch)
         drive, closure = self.close_maps(drive)
-        mode = self.require_possible()
         warn_of_doubts(drive, state.gate)
         return self.solve(mode, drive, state, closure)
 
@@ -222,9 +217,9 @@ class SlamPipeline:
         return tsdf_map
 
     def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed; raises as `require_possible`."""
-        shortest = self._predictor.sources + 1
-        mode = require_possible(self._sequence, shortest, self._config, self._gps_track is not None)
+        """The scale mode of this run, after checks that it can succeed; raises as they do."""
+        require_frames(self._sequence, self._predictor.sources + 1)
+        mode = require_possible(self._sequence, self._config, self._gps_track is not None)
         self._positioning(mode)
         return mode
 
@@ -243,7 +238,7 @@ class SlamPipeline:
             logger.warning(
                 "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
             )
-        examples = np.linspace(first, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
+        examples = Examples(None if frames is not None else range(first, total))
         observer = Observer(
             self._predictor,
             self._sequence.intrinsics,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +14,7 @@ import numpy as np
 from slam.config import SlamConfig
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
-from slam.frontend.drive import Drive, Keyframe
+from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import completed
 from slam.frontend.image_gate import GateState, ImageGate, Verdict
@@ -77,7 +77,7 @@ class Observer:
         intrinsics: Intrinsics,
         config: SlamConfig,
         stopwatch: Stopwatch,
-        examples: Collection[int] = (),
+        examples: Examples | None = None,
         get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
         state: FrontEndState | None = None,
@@ -89,7 +89,7 @@ class Observer:
             intrinsics: of all images.
             config: of all parts.
             stopwatch: measures the time of stages.
-            examples: frames to keep whole for the report.
+            examples: frames to keep whole for the report; None keeps none.
             get_or_compute: a cache of image measurements.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
@@ -97,7 +97,7 @@ class Observer:
         self._predictor = predictor
         self._config = config
         self._stopwatch = stopwatch
-        self._examples = frozenset(examples)
+        self._examples = examples or Examples(range(0))
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
         self._odometry = VisualOdometry(
@@ -339,7 +339,7 @@ class Observer:
         """Keep thinned frames for the map, and a few whole ones for the report."""
         mapping = self._config.mapping
         if frame.index in self._examples:
-            self._drive.examples.append((frame.index, frame.image, depth))
+            self._examples.keep(frame, depth, self._drive.examples)
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
             self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))

@@ -9,23 +9,26 @@ from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
 
 
-def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_gps: bool) -> ScaleMode:
-    """The scale mode of a run, after checks that it can succeed.
-
-    Args:
-        sequence: to run on.
-        shortest: number of frames of one snippet.
-        config: of the run.
-        has_gps: whether a GPS track was given.
-
-    Raises:
-        SlamError: too few frames, or the sequence lacks what the configuration needs.
-    """
+def require_frames(sequence: Sequence, shortest: int) -> None:
+    """Refuse a sequence with fewer frames than one snippet of the networks, ``shortest``, by a `SlamError`."""
     if len(sequence) < shortest:
         raise SlamError(
             f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
             "choose a longer range"
         )
+
+
+def require_possible(sequence: Sequence, config: SlamConfig, has_gps: bool) -> ScaleMode:
+    """The scale mode of a run, after checks that the sequence has what the configuration needs.
+
+    Args:
+        sequence: to run on; of one that grows no frame is needed yet.
+        config: of the run.
+        has_gps: whether a GPS track was given.
+
+    Raises:
+        SlamError: the sequence lacks what the configuration needs.
+    """
     mode = resolve_mode(config.scale, sequence.camera_height_m, has_gps)
     wants_lidar = {"scale.mode=lidar": mode == "lidar", "lidar.factors=true": config.lidar.factors}
     for setting in (name for name, is_wanted in wants_lidar.items() if is_wanted and not has_scans(sequence)):

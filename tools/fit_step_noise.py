@@ -132,7 +132,7 @@ def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[Relativ
     """The triangulated steps with a length, as they enter the graph."""
     known = Drive(motions=[motion for ends, motion in steps.triangulated.items() if ends in scale.lengths])
     geometry = GeometryConfig(**dict(zip(RATIOS, ratios.tolist(), strict=True)))
-    return make_factors(known, scale, [], None, FrontendConfig(use="gaps"), geometry)
+    return make_factors(known, scale, None, FrontendConfig(use="gaps"), geometry)
 
 
 def main(words: Sequence[str] | None = None) -> None:

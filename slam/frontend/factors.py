@@ -11,6 +11,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
     STUDENT_T_DOF,
@@ -30,7 +31,6 @@ from slam.se3 import FloatArray, invert, nearest_rotation
 def make_factors(
     drive: Drive,
     scale: Scale,
-    lidar_steps: Sequence[RelativePose],
     noise: PoseNoise | None,
     frontend: FrontendConfig,
     geometry: GeometryConfig,
@@ -40,7 +40,6 @@ def make_factors(
     Args:
         drive: completed.
         scale: of each frame, and the lengths of steps.
-        lidar_steps: already in the unit of the scale.
         noise: of the pose network; None measures it against image geometry on this drive.
         frontend: which factors of the pose network are used.
         geometry: noise of image geometry.
@@ -61,7 +60,14 @@ def make_factors(
     by_network, interpolated, by_image = (scaled(poses) for poses in others)
     by_window = scaled_poses(window.poses, window, scale)
     interpolated = led_through(interpolated, [*by_network, *by_image], by_window, window.segments)
-    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_window]
+    return [*by_network, *interpolated, *by_image, *by_window]
+
+
+def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
+    """The factors with LiDAR steps, all in metres, before those of image geometry, by which odometry is chained."""
+    less_certain = (NETWORK_SOURCE, INTERPOLATED_SOURCE)
+    before = [factor for factor in factors if factor.source in less_certain]
+    return [*before, *lidar_steps, *(factor for factor in factors if factor.source not in less_certain)]
 
 
 def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:

@@ -15,7 +15,7 @@ from threading import Thread
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.lock import FolderLock
 from erfsfm.signals import raising_on_termination
-from slam.config import SlamConfig, load_config
+from slam.config import load_config
 from slam.errors import SlamError
 from slam.job import Job, Stream, complete
 from slam.live.messages import Emit, corrected_message, pose_message
@@ -100,7 +100,6 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     if request.view:
         import_rerun("--view")
     settings = load_config(request.config, request.overrides)
-    _refuse_what_needs_the_whole(settings)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     source = open_source(request.source, request.wait_s)
     camera = calibration_of(request.source, request.calibration, source)
@@ -109,7 +108,8 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     depth = open_depth(settings.depth, intrinsics, None)
     predictor, _ = make_predictor(networks, depth, settings.depth, intrinsics)
     name = Path(request.source).stem or "live"
-    require_possible(GrowingSequence(intrinsics, camera.height_or(None), name=name), settings, has_gps=False)
+    growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
+    require_possible(growing, settings, predictor.sources + 1)
     sequence = StreamedSequence(name, source, camera, request.wait_s)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
     tracker = Tracker(predictor, intrinsics, sequence.camera_height_m, settings, networks.noise)
@@ -165,11 +165,6 @@ class _Session:
             self._viewer.correct(result.optimised)
         (logger.warning if reader.dropped else logger.info)("%d images were dropped", reader.dropped)
         (logger.info if reader.ended in EXPECTED else logger.warning)("the stream ended: %s", reader.ended)
-
-
-def _refuse_what_needs_the_whole(settings: SlamConfig) -> None:
-    if settings.scale.mode in ("reference", "lidar", "known", "gps") or settings.lidar.factors:
-        raise SlamError("a live drive has no truth, scans, track or known frames: choose camera-height, none or auto")
 
 
 @contextmanager

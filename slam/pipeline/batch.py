@@ -6,21 +6,22 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import ScaleMode, SlamConfig
+from slam.config import SlamConfig
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import Drive, Examples
-from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
+    resolve_mode,
     scale_from_distance,
     scale_from_reference,
 )
@@ -37,7 +38,7 @@ from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
-from slam.pipeline.requirements import require_frames, require_possible
+from slam.pipeline.requirements import require_possible
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -91,6 +92,7 @@ class SlamPipeline:
         self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
         self._seed = seed
         self._gps_track = gps_track
+        self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
         self._watch = Stopwatch()
 
     def run(self) -> Estimate:
@@ -116,15 +118,15 @@ class SlamPipeline:
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """
-        mode = self.require_possible() if frames is None else require_possible(self._sequence, self._config, False)
+        self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
         drive, state = self._observe(journal, frames, watch)
         drive, closure = self.close_maps(drive)
         warn_of_doubts(drive, state.gate)
-        return self.solve(mode, drive, state, closure)
+        return self.solve(drive, state, closure)
 
-    def solve(self, mode: ScaleMode, drive: Drive, state: FrontEndState, closure: MapClosure | None = None) -> Estimate:
+    def solve(self, drive: Drive, state: FrontEndState, closure: MapClosure | None = None) -> Estimate:
         """Lengths, factors and loops of a drive after `close_maps`, and the trajectory that fits them.
 
         Raises:
@@ -133,7 +135,7 @@ class SlamPipeline:
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
-        scale, factors, T_odometry = self.measure(mode, drive, T_network, lidar)
+        scale, factors, T_odometry = self.measure(drive, T_network, lidar)
         loops = self._close_loops(drive, scale, T_odometry) if closure is None else closure.closures(scale)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
         reference = self._sequence.reference
@@ -155,17 +157,20 @@ class SlamPipeline:
         )
 
     def measure(
-        self,
-        mode: ScaleMode,
-        drive: Drive,
-        T_network: FloatArray,
-        lidar: LidarPath | MeasurementFailure | None = None,
+        self, drive: Drive, T_network: FloatArray, lidar: LidarPath | MeasurementFailure | None = None
     ) -> tuple[Scale, list[RelativePose], FloatArray]:
         """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
-        by_lidar = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        config, by_lidar = self._config, lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
         with self._watch.stage("scale"):
-            scale = self._find_scale(mode, drive, by_lidar, T_network)
-        factors = self._factors(drive, scale, by_lidar if self._config.lidar.factors and scale.is_metric else [])
+            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
+        factors = make_factors(drive, scale, self._noise, config.frontend, config.geometry)
+        if self.mode in ("reference", "known", "gps"):
+            unit = self._unit(chain_odometry(factors, T_network, scale))
+            scale = scale.in_metres(unit)
+            if isinstance(unit, ScaleEstimate):
+                factors = [factor.scaled(unit.value) for factor in factors]
+        if config.lidar.factors and scale.is_metric:
+            factors = with_lidar(factors, by_lidar)
         return scale, factors, chain_odometry(factors, T_network, scale)
 
     def close_maps(self, drive: Drive) -> tuple[Drive, MapClosure | None]:
@@ -216,17 +221,17 @@ class SlamPipeline:
                 self._progress("map", done, len(moved))
         return tsdf_map
 
-    def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed; raises as they do."""
-        require_frames(self._sequence, self._predictor.sources + 1)
-        mode = require_possible(self._sequence, self._config, self._gps_track is not None)
-        self._positioning(mode)
-        return mode
+    def require_possible(self) -> None:
+        """Check that this run can succeed; raises as `requirements.require_possible` and `Positioning`."""
+        shortest = self._predictor.sources + 1
+        require_possible(self._sequence, self._config, shortest, self._gps_track is not None)
+        _ = self._positioning
 
-    def _positioning(self, mode: ScaleMode) -> Positioning | None:
+    @cached_property
+    def _positioning(self) -> Positioning | None:
         """The GPS track matched to the drive, None without one."""
         track = self._gps_track
-        return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, mode)
+        return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, self.mode)
 
     def _observe(
         self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
@@ -265,31 +270,14 @@ class SlamPipeline:
             warn_of_another_place(drive, first)
         return drive, state
 
-    def _find_scale(
-        self, mode: ScaleMode, drive: Drive, by_lidar: Sequence[RelativePose], T_network: FloatArray
-    ) -> Scale:
-        """The unit of length by the mode, and the lengths of all steps."""
-        scale = find_scale(mode, self._sequence.camera_height_m, drive, by_lidar, self._config.lengths)
-        if mode not in ("reference", "known", "gps"):
-            return scale
-        T_odometry = chain_odometry(self._factors(drive, scale, []), T_network, scale)
-        return scale.in_metres(self._unit(mode, T_odometry))
-
-    def _unit(self, mode: ScaleMode, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
-        sequence, config = self._sequence, self._config.scale
-        unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
-        positioning = self._positioning(mode)
-        if mode == "reference" and sequence.reference is not None:
-            unit = scale_from_reference(T_odometry, sequence.reference)
-        elif mode == "known":
-            unit = scale_from_distance(T_odometry, sequence.stamps, config)
-        elif positioning is not None:
-            unit = positioning.scale(T_odometry)
-        return unit
-
-    def _factors(self, drive: Drive, scale: Scale, by_lidar: Sequence[RelativePose]) -> list[RelativePose]:
-        return make_factors(drive, scale, by_lidar, self._noise, self._config.frontend, self._config.geometry)
+        sequence = self._sequence
+        if self.mode == "reference" and sequence.reference is not None:
+            return scale_from_reference(T_odometry, sequence.reference)
+        if self.mode == "gps" and self._positioning is not None:
+            return self._positioning.scale(T_odometry)
+        return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
     def _optimise(
         self, scale: Scale, factors: Sequence[RelativePose], T_odometry: FloatArray, loops: LoopClosures
@@ -297,7 +285,7 @@ class SlamPipeline:
         """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
         graph, unit = PoseGraph(self._config.pose_graph), scale.estimate
         graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
-        positioning = self._positioning(scale.mode)
+        positioning = self._positioning
         location = None if positioning is None else positioning.locate(T_odometry, unit)
         if positioning is not None and isinstance(location, Location):
             positioning.add_factors(graph, location, T_odometry)

@@ -17,7 +17,6 @@ from erfsfm.readers.pinhole import impossible
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
@@ -91,19 +90,13 @@ class Slam:
                 f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
                 f"{sweep_frames} and {seed}"
             )
-        self._mode = resolve_mode(config.scale, camera_height_m)
-        if self._mode in ("reference", "lidar", "known", "gps"):
-            raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
-        if config.lidar.factors:
-            raise SlamError("lidar.factors=true needs a whole sequence with LiDAR scans: leave the setting out")
-        if self._mode == "camera-height" and camera_height_m is None:
-            raise SlamError("scale mode camera-height needs camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = decided(config.model_copy(update={"mapping": without_map}), camera_height_m)
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
+        self._pipeline.require_possible()
         self._observer = self._observe(None)
         self._is_closed = False
         self._tracker = Tracker(predictor, intrinsics, camera_height_m, config, noise, update=update_frames)
@@ -256,7 +249,7 @@ class Slam:
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
         drive, closure = self._pipeline.close_maps(self._observer.completed())
-        estimate = self._pipeline.solve(self._mode, drive, self._observer.state(), closure)
+        estimate = self._pipeline.solve(drive, self._observer.state(), closure)
         self._tracker.correct(estimate.optimised.T_world_camera, estimate.scale)
         return estimate.loops
 

@@ -8,12 +8,11 @@ from typing import Literal
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import ScaleMode, SlamConfig
+from slam.config import SlamConfig
 from slam.frames import Intrinsics, Predictor
 from slam.frontend.gap_interpolation import completed
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.observer import Observer
@@ -55,7 +54,6 @@ class Tracker:
         self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
         self._window, self._update = window, update
         self.unit_name: str | None = None  # of all lengths, None while unknown
-        self._mode: ScaleMode = resolve_mode(config.scale, camera_height_m)
         self._T_world_camera: list[FloatArray] = []
         self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
@@ -122,7 +120,7 @@ class Tracker:
         self._recent.stamps = np.arange(count - first, dtype=np.float64)
         window = completed(window, self._sources)
         T_network = chain_raw(window.snippets, len(window))
-        scale, _, T_odometry = self._pipeline.measure(self._mode, window, T_network)
+        scale, _, T_odometry = self._pipeline.measure(window, T_network)
         self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])

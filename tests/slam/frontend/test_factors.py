@@ -11,7 +11,7 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
-from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
@@ -65,7 +65,8 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 def factors(
     measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
 ) -> list[RelativePose]:
-    return make_factors(measured, scale, lidar, noise, FrontendConfig(use=use), GeometryConfig())
+    found = make_factors(measured, scale, noise, FrontendConfig(use=use), GeometryConfig())
+    return with_lidar(found, lidar)
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]

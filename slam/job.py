@@ -18,9 +18,8 @@ from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
+from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.journal import Journal, clear_journal
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
@@ -96,11 +95,14 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
 def _run(job: Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
     folder.write_text("config.yaml", dump_yaml(job.settings))
-    stream, journal = job.stream, _journal(job, folder.path)
+    stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
-    estimate = job.pipeline.estimate(journal, frames, watch)
+    # a run does not go on without the images of a live drive, nor in a folder without those before its own
+    goes_on = stream is None and not isinstance(job.recording, Continued)
+    estimate = job.pipeline.estimate(checkpoints if goes_on else None, frames, watch)
     _write_estimate(folder, estimate, job)
-    clear_journal(folder.path)
+    if checkpoints is not None:
+        checkpoints.finish(estimate.state)
     metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
@@ -120,20 +122,18 @@ def _run(job: Job, folder: RunFolder) -> None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
 
 
-def _journal(job: Job, folder: Path) -> Journal | None:
-    """Where the state of the pass is kept; not of a live drive, whose images are gone,
-    and not of one whose first frames are in another folder."""
-    keep = job.settings.output.keep
-    if keep == "nothing" or job.stream is not None or isinstance(job.recording, Continued):
+def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
+    """What keeps the drive for runs that go on; None where the configuration says so."""
+    keep, before = job.settings.output.keep, job.checkpoint
+    if keep == "nothing":
         return None
-    journal = Journal(folder, job.checkpoint_of, with_keyframes=keep == "keyframes")
-    if job.checkpoint is not None:
-        journal.begin_after(job.checkpoint.state.drive)
-    return journal
+    is_here = before is not None and not isinstance(job.recording, Continued)
+    kept = before.state.drive if before is not None and is_here else None
+    return CheckpointWriter(folder, job.checkpoint_of, keep == "keyframes", kept)
 
 
 def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
-    """Trajectories, graph, loops and places, and what ``run --continue`` needs."""
+    """Trajectories, graph, loops and places."""
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
@@ -145,11 +145,6 @@ def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
     result.graph.write_g2o(folder.path / "graph.g2o")
     folder.write_text("loops.json", as_json(result.loops.details()))
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
-    keep = job.settings.output.keep
-    if keep != "nothing":
-        folder.write(DRIVE, job.checkpoint_of(result.state).write)
-    if keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.drive.keyframes))
 
 
 def _places(result: Estimate, intrinsics: Intrinsics) -> Places:

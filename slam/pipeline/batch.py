@@ -28,10 +28,9 @@ from slam.frontend.scale.scale_estimate import (
 from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.map import TsdfMap
-from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
 from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.journal import EVERY_FRAMES, Journal
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.map_closure import MapClosure, close_maps
@@ -107,21 +106,21 @@ class SlamPipeline:
 
     def estimate(
         self,
-        journal: Journal | None = None,
+        checkpoints: CheckpointWriter | None = None,
         frames: Iterator[Frame] | None = None,
         watch: Callable[[Observer], None] | None = None,
     ) -> Estimate:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
         Args:
-            journal: keeps the state of the pass, given to it every 100 frames.
+            checkpoints: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """
         self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        drive, state = self._observe(journal, frames, watch)
+        drive, state = self._observe(checkpoints, frames, watch)
         drive, closure = self.close_maps(drive)
         warn_of_doubts(drive, state.gate)
         return self.solve(drive, state, closure)
@@ -234,7 +233,10 @@ class SlamPipeline:
         return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, self.mode)
 
     def _observe(
-        self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
+        self,
+        checkpoints: CheckpointWriter | None,
+        frames: Iterator[Frame] | None,
+        watch: Callable[[Observer], None] | None,
     ) -> tuple[Drive, FrontEndState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
@@ -262,9 +264,9 @@ class SlamPipeline:
                     watch(observer)
                 self._progress("frames", index + 1, total)
                 done = index + 1 - first
-                if journal is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
+                if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
                     with self._watch.stage("journal"):
-                        journal.keep(observer.state())
+                        checkpoints.keep(observer.state())
             drive, state = observer.completed(), observer.state()
         if isinstance(self._sequence, Continued):
             warn_of_another_place(drive, first)

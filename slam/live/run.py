@@ -112,7 +112,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     require_possible(growing, settings, predictor.sources + 1)
     sequence = StreamedSequence(name, source, camera, request.wait_s)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
-    tracker = Tracker(predictor, intrinsics, sequence.camera_height_m, settings, networks.noise)
+    tracker = Tracker(predictor.sources, sequence.camera_height_m, settings, networks.noise)
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=request.source,

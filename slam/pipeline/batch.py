@@ -134,7 +134,7 @@ class SlamPipeline:
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
-        scale, factors, T_odometry = self.measure(drive, T_network, lidar)
+        scale, factors, T_odometry = self._measure(drive, T_network, lidar)
         loops = self._close_loops(drive, scale, T_odometry) if closure is None else closure.closures(scale)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
         reference = self._sequence.reference
@@ -155,8 +155,8 @@ class SlamPipeline:
             stopwatch=self._watch,
         )
 
-    def measure(
-        self, drive: Drive, T_network: FloatArray, lidar: LidarPath | MeasurementFailure | None = None
+    def _measure(
+        self, drive: Drive, T_network: FloatArray, lidar: LidarPath | MeasurementFailure | None
     ) -> tuple[Scale, list[RelativePose], FloatArray]:
         """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
         config, by_lidar = self._config, lidar_steps(lidar) if isinstance(lidar, LidarPath) else []

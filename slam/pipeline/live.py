@@ -99,7 +99,7 @@ class Slam:
         self._pipeline.require_possible()
         self._observer = self._observe(None)
         self._is_closed = False
-        self._tracker = Tracker(predictor, intrinsics, camera_height_m, config, noise, update=update_frames)
+        self._tracker = Tracker(predictor.sources, camera_height_m, config, noise, update=update_frames)
         self._sweep_frames = sweep_frames
 
     @classmethod

@@ -9,12 +9,11 @@ import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import SlamConfig
-from slam.frames import Intrinsics, Predictor
+from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import completed
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.scale.metric_scale import Scale
-from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.growing import GrowingSequence
+from slam.frontend.scale.metric_scale import Scale, find_scale
+from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.pipeline.observer import Observer
 from slam.se3 import FloatArray, invert
 
@@ -40,18 +39,25 @@ class Tracker:
 
     def __init__(
         self,
-        predictor: Predictor,
-        intrinsics: Intrinsics,
+        sources: int,
         camera_height_m: float | None,
         config: SlamConfig,
         noise: PoseNoise | None,
         window: int = 100,
         update: int = 10,
     ) -> None:
-        """Prepare for the first frame."""
-        self._sources = predictor.sources
-        self._recent = GrowingSequence(intrinsics, camera_height_m)
-        self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
+        """Prepare for the first frame.
+
+        Args:
+            sources: of a snippet.
+            camera_height_m: above the road; None where unknown.
+            config: of all parts.
+            noise: of the snippet poses; None measures it against image geometry alone.
+            window: frames whose poses are solved again.
+            update: frames between two solutions.
+        """
+        self._sources, self._camera_height_m, self._config, self._noise = sources, camera_height_m, config, noise
+        self._mode = resolve_mode(config.scale, camera_height_m)
         self._window, self._update = window, update
         self.unit_name: str | None = None  # of all lengths, None while unknown
         self._T_world_camera: list[FloatArray] = []
@@ -117,10 +123,10 @@ class Tracker:
         window = observer.drive.since(first)
         if not window.snippets:
             return
-        self._recent.stamps = np.arange(count - first, dtype=np.float64)
-        window = completed(window, self._sources)
-        T_network = chain_raw(window.snippets, len(window))
-        scale, _, T_odometry = self._pipeline.measure(window, T_network)
+        config, window = self._config, completed(window, self._sources)
+        scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
+        factors = make_factors(window, scale, self._noise, config.frontend, config.geometry)
+        T_odometry = chain_odometry(factors, chain_raw(window.snippets, len(window)), scale)
         self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None
         unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])

@@ -14,7 +14,6 @@ from slam.config import SlamConfig, load_config
 from slam.errors import ConfigError, RunError
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
-from slam.pipeline.journal import read_journal
 from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.results.output import UNFINISHED
@@ -131,10 +130,9 @@ def state_to_resume(folder: Path, recording: FrameSequence) -> SessionCheckpoint
     Raises:
         RunError: a damaged file, or the recording is not the same any more.
     """
-    whole = (folder / DRIVE).is_file()
-    checkpoint = SessionCheckpoint.open(folder) if whole else read_journal(folder)
-    if checkpoint is None:
+    if not (folder / DRIVE).is_file():
         return None
+    checkpoint = SessionCheckpoint.open(folder)
     same = (
         checkpoint.sources == recording.provenance()
         and checkpoint.intrinsics == recording.intrinsics
@@ -155,11 +153,11 @@ def state_to_continue(folder: Path, following: FrameSequence) -> SessionCheckpoi
     Raises:
         RunError: the run has not ended, kept nothing, or has some of these frames.
     """
-    if not (folder / DRIVE).is_file() and read_journal(folder) is not None:
+    checkpoint = SessionCheckpoint.open(folder)
+    if not checkpoint.is_whole:
         raise RunError(
             f"{folder} was ended before its last frame: let it go on first, with 'erfsfm-slam run --continue {folder}'"
         )
-    checkpoint = SessionCheckpoint.open(folder)
     ranges = [name for name in following.provenance() if name.endswith("]")]  # a simulated world has none
     twice = overlapping(ranges, checkpoint.sources)
     if twice:

@@ -24,6 +24,7 @@ T = TypeVar("T")
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
+Descriptors = NDArray[np.uint8]
 Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
 Ends = tuple[int, int]  # the two frames of a step or a factor
 LOOP_SOURCE = "loop"  # the ``source`` of relative poses that close a loop: the graph may drop these
@@ -168,6 +169,27 @@ class Predictor(Protocol):
     def executor(self) -> Executor:
         """A new executor of one thread for this predictor, with its number of cores; the user shuts it down."""
         ...
+
+
+@dataclass(frozen=True)
+class View:
+    """The features of one frame, about 60 bytes each.
+
+    ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
+    NaN where the learned depth is not trusted, in the unit of the depth.
+    """
+
+    index: int
+    pixels: NDArray[np.float32]
+    descriptors: Descriptors
+    points: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def scaled(self, factor: float) -> View:
+        """The same view with its points in another unit."""
+        return replace(self, points=self.points * np.float32(factor))
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import PLACES, Places
-from slam.pipeline.batch import Progress, SlamPipeline, SlamResult
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint, write_keyframes
-from slam.pipeline.journal import Journal, clear_journal
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.batch import Progress, SlamPipeline
+from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places
@@ -33,18 +33,21 @@ from slam.results.rerun import write_rerun
 from slam.results.run_log import LOG, RunLog
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.sequences.continued import Continued
+from slam.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
 class Stream:
     """Frames that come while they are taken, and who watches them.
 
-    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder.
+    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder;
+    ``tracked`` gives the poses so far.
     """
 
     frames: Callable[[], Iterator[Frame]]
     watch: Callable[[Observer], None]
-    finish: Callable[[SlamResult, Path], None]
+    finish: Callable[[Estimate, Path], None]
+    tracked: Callable[[], Trajectory]
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Job:
     progress: Progress | None = None
     stream: Stream | None = None
 
-    def checkpoint_of(self, state: ObserverState) -> SessionCheckpoint:
+    def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
         """What is kept of this run after some of its frames."""
         return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
 
@@ -80,7 +83,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
             _run(job, folder)
     except BaseException as error:
         ignore_signals()
-        _leave_failure(folder, log, job.settings.output.report, error)
+        _leave_failure(job, folder, log, error)
         if folder.replaces is not None and isinstance(error, SlamError):
             is_kept = (folder.replaces / ESTIMATE).is_file()  # else it failed while one was put in the other's place
             kept = f"{folder.replaces} {'keeps' if is_kept else 'lost'} its earlier run, this one is in {folder.path}"
@@ -92,11 +95,14 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
 def _run(job: Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
     folder.write_text("config.yaml", dump_yaml(job.settings))
-    stream, journal = job.stream, _journal(job, folder.path)
+    stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
-    estimate = job.pipeline.estimate(journal, frames, watch)
+    # a run does not go on without the images of a live drive, nor in a folder without those before its own
+    goes_on = stream is None and not isinstance(job.recording, Continued)
+    estimate = job.pipeline.estimate(checkpoints if goes_on else None, frames, watch)
     _write_estimate(folder, estimate, job)
-    clear_journal(folder.path)
+    if checkpoints is not None:
+        checkpoints.finish(estimate.state)
     metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
     folder.write_metrics(metrics)
     folder.publish()
@@ -110,26 +116,24 @@ def _run(job: Job, folder: RunFolder) -> None:
     output = job.settings.output
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
-        examples = [DepthExample(i, image, depth) for i, image, depth in result.observations.examples]
+        examples = [DepthExample(i, image, depth) for i, image, depth in result.drive.examples]
         write_report(folder, examples, views)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
 
 
-def _journal(job: Job, folder: Path) -> Journal | None:
-    """Where the state of the pass is kept; not of a live drive, whose images are gone,
-    and not of one whose first frames are in another folder."""
-    keep = job.settings.output.keep
-    if keep == "nothing" or job.stream is not None or isinstance(job.recording, Continued):
+def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
+    """What keeps the drive for runs that go on; None where the configuration says so."""
+    keep, before = job.settings.output.keep, job.checkpoint
+    if keep == "nothing":
         return None
-    journal = Journal(folder, job.checkpoint_of, with_keyframes=keep == "keyframes")
-    if job.checkpoint is not None:
-        journal.begin_after(job.checkpoint.state.seen)
-    return journal
+    is_here = before is not None and not isinstance(job.recording, Continued)
+    kept = before.state.drive if before is not None and is_here else None
+    return CheckpointWriter(folder, job.checkpoint_of, keep == "keyframes", kept)
 
 
-def _write_estimate(folder: RunFolder, result: SlamResult, job: Job) -> None:
-    """Trajectories, graph, loops and places, and what ``run --continue`` needs."""
+def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
+    """Trajectories, graph, loops and places."""
     for name in ("network", "odometry", "optimised"):
         folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
     if result.reference is not None:
@@ -141,26 +145,26 @@ def _write_estimate(folder: RunFolder, result: SlamResult, job: Job) -> None:
     result.graph.write_g2o(folder.path / "graph.g2o")
     folder.write_text("loops.json", as_json(result.loops.details()))
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
-    keep = job.settings.output.keep
-    if keep != "nothing":
-        folder.write(DRIVE, job.checkpoint_of(result.state).write)
-    if keep == "keyframes":
-        folder.write(KEYFRAMES, lambda path: write_keyframes(path, result.state.seen.keyframes))
 
 
-def _places(result: SlamResult, intrinsics: Intrinsics) -> Places:
+def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
     """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
-    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.observations.views)
+    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.drive.views)
     T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
     return Places(intrinsics, views, T_world_camera)
 
 
-def _leave_failure(folder: RunFolder, log: RunLog, report: bool, error: BaseException) -> None:
-    """Write the reason of the failure to the folder; errors of writing it are ignored, so the first one is raised."""
+def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseException) -> None:
+    """Write the reason of the failure, and of a live drive its poses, which nothing else could give again.
+
+    Errors of writing them are ignored, so the first one is raised.
+    """
     known = isinstance(error, SlamError | ErfsfmError | Terminated)
     reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     log.failed(reason)
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
-        if report:
+        if job.stream is not None and folder.trajectory("odometry") is None:
+            folder.write_trajectory("trajectory_odometry", job.stream.tracked())
+        if job.settings.output.report:
             write_report(folder, [], None)

@@ -26,9 +26,9 @@ from slam.config import FrontendConfig, GeometryConfig, load_config
 from slam.errors import SlamError
 from slam.evaluation.coverage import LEVELS, squared_bound
 from slam.frames import RelativePose
-from slam.frontend.factors import Unscaled, make_factors
+from slam.frontend.drive import Drive
+from slam.frontend.factors import make_factors
 from slam.frontend.network_factors import STUDENT_T_DOF
-from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable
 from slam.pipeline.batch import SlamPipeline
@@ -123,17 +123,16 @@ def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> Driv
     predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
     config = load_config(None, QUIET)
     found = SlamPipeline(recording, predictor, config, noise=networks.noise, get_or_compute=answers).estimate()
-    steps = smooth_rotations(found.observations.steps, found.observations.relative_rotations)
     T_true = np.array(recording.reference)
     T_true[:, :3, 3] *= umeyama(found.optimised.positions, T_true[:, :3, 3], with_scale=True).scale
-    return DriveSteps.of(Path(root).name + (sequence and f" {sequence}"), steps, found.scale, T_true)
+    return DriveSteps.of(Path(root).name + (sequence and f" {sequence}"), found.drive.steps, found.scale, T_true)
 
 
 def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[RelativePose]:
     """The triangulated steps with a length, as they enter the graph."""
-    known = StepTable({ends: motion for ends, motion in steps.triangulated.items() if ends in scale.lengths})
+    known = Drive(motions=[motion for ends, motion in steps.triangulated.items() if ends in scale.lengths])
     geometry = GeometryConfig(**dict(zip(RATIOS, ratios.tolist(), strict=True)))
-    return make_factors(Unscaled(known, [], []), scale, [], None, FrontendConfig(use="gaps"), geometry)
+    return make_factors(known, scale, None, FrontendConfig(use="gaps"), geometry)
 
 
 def main(words: Sequence[str] | None = None) -> None:

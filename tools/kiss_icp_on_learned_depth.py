@@ -25,8 +25,8 @@ from slam.config import load_config
 from slam.errors import SlamError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import DepthMap, Intrinsics
+from slam.frontend.drive import Keyframe
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.observations import Keyframe
 from slam.prediction.networks import NetworkPredictor
 from slam.results.tables import metrics_table
 from slam.se3 import FloatArray, invert
@@ -52,9 +52,9 @@ def main(words: Sequence[str] | None = None) -> None:
         result = SlamPipeline(recording, predictor, load_config(None, options.set)).estimate()
     except (SlamError, ErfsfmError) as error:
         raise SystemExit(str(error)) from error
-    if result.reference is None or not result.observations.keyframes:
+    if result.reference is None or not result.drive.keyframes:
         raise SystemExit(f"{recording.name} has no true poses to compare with, or mapping.enabled=false kept no depth")
-    keyframes = result.observations.keyframes
+    keyframes = result.drive.keyframes
     rows = np.array([keyframe.index for keyframe in keyframes])
     truth = result.reference.select(rows).rebased()
     one_unit = np.full(len(recording), np.median(result.scale.per_frame))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
 from slam.config import FrontendConfig, GeometryConfig
-from slam.frames import Ends, RelativePose, SnippetPoses
+from slam.frames import Ends, RelativePose
+from slam.frontend.drive import Drive
+from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
     STUDENT_T_DOF,
@@ -26,20 +28,9 @@ from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.se3 import FloatArray, invert, nearest_rotation
 
 
-@dataclass(frozen=True)
-class Unscaled:
-    """Measurements in the networks' unit: steps of image geometry, snippets, gaps, and poses by keyframes."""
-
-    steps: StepTable
-    snippets: Sequence[SnippetPoses]
-    interpolated: Sequence[RelativePose]
-    window: WindowPoses = field(default_factory=WindowPoses)
-
-
 def make_factors(
-    measured: Unscaled,
+    drive: Drive,
     scale: Scale,
-    lidar_steps: Sequence[RelativePose],
     noise: PoseNoise | None,
     frontend: FrontendConfig,
     geometry: GeometryConfig,
@@ -47,32 +38,36 @@ def make_factors(
     """All relative poses with their noise, in the unit of the scale.
 
     Args:
-        measured: in the networks' unit.
+        drive: completed.
         scale: of each frame, and the lengths of steps.
-        lidar_steps: already in the unit of the scale.
         noise: of the pose network; None measures it against image geometry on this drive.
         frontend: which factors of the pose network are used.
         geometry: noise of image geometry.
     """
-    geometric = _geometric(measured.steps, scale, geometry)
+    geometric = _geometric(drive.steps, scale, geometry)
     if noise is None:
-        networks = network_factors(measured.snippets, measured_noise(measured.snippets, geometric))
+        networks = network_factors(drive.trusted, measured_noise(drive.trusted, geometric))
     else:
-        networks = calibrated_factors(measured.snippets, geometric, noise)
+        networks = calibrated_factors(drive.trusted, geometric, noise)
     if frontend.use == "gaps" or (frontend.use == "calibrated" and noise is None):
         networks = without_measured(networks, geometric)
 
     def scaled(poses: Sequence[RelativePose]) -> list[RelativePose]:
         return [pose.scaled(scale.unit_at(pose)) for pose in poses]
 
-    window = measured.window
-    others = [
-        [pose for pose in poses if not window.within(pose)] for poses in (networks, measured.interpolated, geometric)
-    ]
+    window = drive.map_poses
+    others = [[pose for pose in poses if not window.within(pose)] for poses in (networks, drive.gap_steps, geometric)]
     by_network, interpolated, by_image = (scaled(poses) for poses in others)
     by_window = scaled_poses(window.poses, window, scale)
     interpolated = led_through(interpolated, [*by_network, *by_image], by_window, window.segments)
-    return [*by_network, *interpolated, *lidar_steps, *by_image, *by_window]
+    return [*by_network, *interpolated, *by_image, *by_window]
+
+
+def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
+    """The factors with LiDAR steps, all in metres, before those of image geometry, by which odometry is chained."""
+    less_certain = (NETWORK_SOURCE, INTERPOLATED_SOURCE)
+    before = [factor for factor in factors if factor.source in less_certain]
+    return [*before, *lidar_steps, *(factor for factor in factors if factor.source not in less_certain)]
 
 
 def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:

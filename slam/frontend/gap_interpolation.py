@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slam.errors import SlamError
-from slam.frames import RelativePose, SnippetPoses, runs
+from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
+from slam.frontend.drive import Drive
+from slam.frontend.rotation_smoothing import smooth_rotations
+from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
+from slam.frontend.window.odometry import Segment as MapSegment
+from slam.frontend.window.relative_poses import WindowPoses
 from slam.se3 import FloatArray, from_rotation_vector, invert
 
 INTERPOLATED_SOURCE = "interpolated"
@@ -25,51 +30,57 @@ _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 
 
-@dataclass(frozen=True)
-class InterpolatedGaps:
-    """A run's measurements with gaps interpolated, unscaled.
-
-    ``snippets`` has one entry a target, gaps filled by the constant-velocity model; ``trusted`` are those that the
-    network measured on usable frames. ``steps`` are without frozen frames; ``interpolated`` are the factors of steps
-    without a measurement; ``frames`` are the interpolated frames and why.
-    """
-
-    snippets: list[SnippetPoses]
-    trusted: list[SnippetPoses]
-    steps: StepTable
-    interpolated: list[RelativePose]
-    frames: dict[int, str]
-
-
-def interpolate_gaps(
-    count: int,
+def completed(
+    drive: Drive,
     sources: int,
-    snippets: Sequence[SnippetPoses],
-    steps: StepTable,
-    unusable: Mapping[int, str],
-    repeated: Collection[int],
-    cuts: Collection[int] = (),
-) -> InterpolatedGaps:
-    """Interpolate the gaps of a run.
+    maps: Sequence[MapSegment] = (),
+    map_poses: WindowPoses | None = None,
+    events: Sequence[TrackingEvent] = (),
+) -> Drive:
+    """The drive with its gaps interpolated, its rotations smoothed, and its segments; more frames may follow.
 
     Args:
-        count: frames of the sequence.
+        drive: as collected; it stays as it is.
         sources: sources of a snippet.
-        snippets: measured, none of them on an unusable frame.
-        steps: measured between usable frames; over a gap, between its two ends.
-        unusable: frames without a measurement, and why.
-        repeated: frames whose image repeats that of the frame before.
+        maps: of keyframes.
+        map_poses: by these maps.
+        events: what became of the maps.
+
+    Raises:
+        SlamError: no snippet was measured, so there is no motion to extrapolate.
+    """
+    map_poses = map_poses or WindowPoses()
+    measured = {*drive.steps.motions, *map_poses.steps}
+    cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
+    filled = interpolate_gaps(drive, sources, cuts)
+    return replace(
+        filled,
+        motions=list(smooth_rotations(filled.steps, drive.relative_rotations)),
+        segments=find_segments(len(drive), cuts, filled.interpolated),
+        maps=list(maps),
+        map_poses=map_poses,
+        events=sorted(events, key=lambda event: event.frame),
+    )
+
+
+def interpolate_gaps(drive: Drive, sources: int, cuts: Collection[int] = ()) -> Drive:
+    """The drive with steps and snippets in its gaps, and without what was measured on interpolated frames.
+
+    Args:
+        drive: its snippets are on usable frames; its steps over a gap are between the two ends.
+        sources: sources of a snippet.
         cuts: frames that show another place than the one before: no snippet measures across them.
 
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
+    count, snippets, unusable, repeated = len(drive), drive.snippets, drive.unusable, drive.repeated
     if not snippets:
         why = next(iter(unusable.values()), "the sequence is too short")
         raise SlamError(f"no {sources + 1} usable frames in a row among {count}: {why}")
     new = set(range(count)).difference(unusable, repeated)
     by_network = network_steps(snippets)
-    frozen, steps = _without_frozen(by_network, steps, repeated, new)
+    frozen, steps = _without_frozen(by_network, drive.steps, repeated, new)
     frames = dict(unusable) | dict.fromkeys(frozen, "the image stands still while the camera moves")
     spans = ((s, {s.target, *s.sources}) for s in snippets)
     trusted = [s for s, span in spans if not frozen & span and not any(min(span) < cut <= max(span) for cut in cuts)]
@@ -82,8 +93,16 @@ def interpolate_gaps(
     motion = _completed(known, loose)
     motion |= _equal_steps(steps.relative_poses, set(loose))
     typical = float(np.median([np.linalg.norm(T[:3, 3]) for T in known.values()]))
-    interpolated = [_interpolated_step(step, motion[step], typical) for step in loose]
-    return InterpolatedGaps(filled, trusted, steps, interpolated, dict(sorted(frames.items())))
+    return replace(
+        drive,
+        snippets=filled,
+        trusted=trusted,
+        motions=list(steps),
+        interpolated=dict(sorted(frames.items())),
+        gap_steps=[_interpolated_step(step, motion[step], typical) for step in loose],
+        views=[view for view in drive.views if view.index not in frames],
+        keyframes=[keyframe for keyframe in drive.keyframes if keyframe.index not in frames],
+    )
 
 
 def network_steps(snippets: Sequence[SnippetPoses]) -> dict[int, FloatArray]:

@@ -15,7 +15,7 @@ from threading import Thread
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.lock import FolderLock
 from erfsfm.signals import raising_on_termination
-from slam.config import SlamConfig, load_config
+from slam.config import load_config
 from slam.errors import SlamError
 from slam.job import Job, Stream, complete
 from slam.live.messages import Emit, corrected_message, pose_message
@@ -23,8 +23,11 @@ from slam.live.reader import EXPECTED
 from slam.live.sequence import StreamedSequence, calibration_of
 from slam.live.source import open_source
 from slam.live.view import Viewer
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.observer import Observer
+from slam.pipeline.requirements import require_possible
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
@@ -33,6 +36,7 @@ from slam.results.output import check_output
 from slam.results.run_log import run_log
 from slam.run import RunRequest, provenance_of
 from slam.runtime.imports import import_rerun
+from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -96,7 +100,6 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     if request.view:
         import_rerun("--view")
     settings = load_config(request.config, request.overrides)
-    _refuse_what_needs_the_whole(settings)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     source = open_source(request.source, request.wait_s)
     camera = calibration_of(request.source, request.calibration, source)
@@ -104,9 +107,12 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     intrinsics = StreamedSequence.intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor, _ = make_predictor(networks, depth, settings.depth, intrinsics)
-    sequence = StreamedSequence(Path(request.source).stem or "live", source, camera, request.wait_s)
+    name = Path(request.source).stem or "live"
+    growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
+    require_possible(growing, settings, predictor.sources + 1)
+    sequence = StreamedSequence(name, source, camera, request.wait_s)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
-    tracker = Tracker(predictor, intrinsics, sequence.camera_height_m, settings, networks.noise)
+    tracker = Tracker(predictor.sources, sequence.camera_height_m, settings, networks.noise)
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=request.source,
@@ -117,7 +123,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         command=request.command,
     )
     provenance = provenance_of(recorded, networks, sequence, depth)
-    stream = Stream(sequence.frames, session.watch, session.finish)
+    stream = Stream(sequence.frames, session.watch, session.finish, session.tracked)
     sha256 = mixed_sha256(networks.sha256, depth)
     return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
 
@@ -143,9 +149,14 @@ class _Session:
             late = None if arrival is None else round(1e3 * (time.monotonic() - arrival.at_s), 1)
             self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
             if self._viewer is not None:
-                self._viewer.show(index, observer.seen, tracked)
+                self._viewer.show(index, observer.drive, tracked)
 
-    def finish(self, result: SlamResult, folder: Path) -> None:
+    def tracked(self) -> Trajectory:
+        """The poses that were said so far."""
+        T_world_camera = self._tracker.T_world_camera
+        return Trajectory(self._sequence.stamps[: len(T_world_camera)], T_world_camera)
+
+    def finish(self, result: Estimate, folder: Path) -> None:
         """Say all poses again as the whole drive gives them, and why it ended."""
         reader = self._sequence.reader
         message = corrected_message(result.optimised, len(result.loops.accepted), result.scale.unit_name, str(folder))
@@ -154,11 +165,6 @@ class _Session:
             self._viewer.correct(result.optimised)
         (logger.warning if reader.dropped else logger.info)("%d images were dropped", reader.dropped)
         (logger.info if reader.ended in EXPECTED else logger.warning)("the stream ended: %s", reader.ended)
-
-
-def _refuse_what_needs_the_whole(settings: SlamConfig) -> None:
-    if settings.scale.mode in ("reference", "lidar", "known", "gps") or settings.lidar.factors:
-        raise SlamError("a live drive has no truth, scans, track or known frames: choose camera-height, none or auto")
 
 
 @contextmanager

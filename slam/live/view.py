@@ -6,7 +6,7 @@ import numpy as np
 
 from slam import se3
 from slam.frames import Intrinsics
-from slam.pipeline.observations import Observations
+from slam.frontend.drive import Drive
 from slam.pipeline.tracker import Tracked
 from slam.runtime.imports import import_rerun
 from slam.se3 import FloatArray
@@ -28,14 +28,14 @@ class Viewer:
         self._stream.spawn()
         self._stream.log("world", self._rr.ViewCoordinates.RDF, static=True)
 
-    def show(self, index: int, seen: Observations, tracked: Tracked) -> None:
+    def show(self, index: int, drive: Drive, tracked: Tracked) -> None:
         """A frame at its pose; its image and depth where it is a keyframe."""
         rr, stream, T = self._rr, self._stream, tracked.T_world_camera
         stream.set_time("frame", sequence=index)
         self._positions.append(T[:3, 3])
         stream.log("world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH]))
         stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        keyframe = seen.keyframes[-1] if seen.keyframes else None
+        keyframe = drive.keyframes[-1] if drive.keyframes else None
         if keyframe is None or index - keyframe.index > 1 or tracked.unit is None:
             return
         image, depth = keyframe.image, tracked.unit * keyframe.depth_unscaled

@@ -18,8 +18,8 @@ from erfsfm.readers.numbering import in_order
 from erfsfm.threads import take_working_memory
 from slam.config import LoopsConfig, load_stored
 from slam.errors import RunError, SequenceError
-from slam.frames import Frame, Image, Intrinsics
-from slam.loops.descriptors import FeatureExtractor, View
+from slam.frames import Frame, Image, Intrinsics, View
+from slam.loops.descriptors import FeatureExtractor
 from slam.loops.places import PLACES, Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.thresholds import LoopThresholds

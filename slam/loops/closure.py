@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from slam.config import LoopsConfig
-from slam.frames import Intrinsics, RelativePose
+from slam.frames import Intrinsics, RelativePose, View
 from slam.loops.consistency import agreeing
-from slam.loops.descriptors import View
 from slam.loops.retrieval import find_candidates
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop

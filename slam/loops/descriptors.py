@@ -3,43 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Frame, Grey, Intrinsics
+from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View
 from slam.storage.cache import Answer, GetOrCompute, without_cache
 
-Descriptors = NDArray[np.uint8]
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
 _EDGE_PX = 16
 _CORNER_CONTRAST = 10  # least contrast of a corner, grey levels
 _MAX_DEPTH_HEIGHTS = 30.0  # largest depth used, in camera heights
 _MAX_FEATURES = 500  # largest number of corners kept of a frame
-
-
-@dataclass(frozen=True)
-class View:
-    """The features of one frame, about 60 bytes each.
-
-    ``pixels`` ``(M, 2)`` float32, ``descriptors`` ``(M, 32)`` uint8, ``points`` ``(M, 3)`` float32 in the camera,
-    NaN where the learned depth is not trusted, in the unit of the depth.
-    """
-
-    index: int
-    pixels: NDArray[np.float32]
-    descriptors: Descriptors
-    points: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def scaled(self, factor: float) -> View:
-        """The same view with its points in another unit."""
-        return replace(self, points=self.points * np.float32(factor))
 
 
 class FeatureExtractor:

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, RelativeSimilarity
+from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, RelativeSimilarity, View
 from slam.loops.consistency import agreeing
-from slam.loops.descriptors import View
 from slam.loops.retrieval import similar_views
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop, Sighting, matches

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from erfsfm.readers.pinhole import Pinhole, impossible
 from slam.errors import RunError
-from slam.frames import Intrinsics
-from slam.loops.descriptors import View
+from slam.frames import Intrinsics, View
 from slam.se3 import FloatArray, is_se3
 from slam.storage.archive import opened_archive, read_array
 

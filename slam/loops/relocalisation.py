@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Intrinsics
-from slam.loops.descriptors import View
+from slam.frames import Intrinsics, View
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import LoopVerifier, Sighting, matches

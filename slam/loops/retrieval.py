@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from slam.loops.descriptors import Descriptors, View, hamming
+from slam.frames import Descriptors, View
+from slam.loops.descriptors import hamming
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
 from slam.storage.cache import Answer, GetOrCompute, without_cache

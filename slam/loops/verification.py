@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose
-from slam.loops.descriptors import View, hamming
+from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
+from slam.loops.descriptors import hamming
 from slam.loops.thresholds import LoopThresholds
 from slam.resection import Resection, consensus, refine
 from slam.se3 import FloatArray, invert, make, rotation_angle

@@ -5,43 +5,39 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 
-import numpy as np
-
 from erfsfm.pose_noise import PoseNoise
-from slam.config import ScaleMode, SlamConfig
+from slam.config import SlamConfig
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
-from slam.frontend.factors import Unscaled, chain_odometry, make_factors
+from slam.frontend.drive import Drive, Examples
+from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath, lidar_path, lidar_steps
 from slam.frontend.network_factors import chain_raw
-from slam.frontend.rotation_smoothing import smooth_rotations
-from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
+from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import (
     ScaleEstimate,
+    resolve_mode,
     scale_from_distance,
     scale_from_reference,
 )
 from slam.geodesy import GpsTrack
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.map import TsdfMap
-from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
 from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
-from slam.pipeline.journal import EVERY_FRAMES, Journal
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
-from slam.pipeline.map_closure import close_maps
-from slam.pipeline.measurements import Measurements
-from slam.pipeline.observations import ClosedObservations
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.map_closure import MapClosure, close_maps
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
-from slam.pipeline.solution import Solution
 from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.threads import read_ahead
@@ -54,32 +50,6 @@ from slam.trajectory import Trajectory
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
-EXAMPLES = 5
-
-
-@dataclass(frozen=True)
-class SlamResult:
-    """Trajectories with one row a frame, the graph, the map and the measurements.
-
-    ``state`` is that of the observer, for a run that continues this one; frames before ``first`` are of earlier runs.
-    ``location`` is None without a GPS track, and the reason where the track cannot be used.
-    """
-
-    network: Trajectory
-    odometry: Trajectory
-    optimised: Trajectory
-    lidar: LidarPath | MeasurementFailure | None
-    reference: Trajectory | None
-    state: ObserverState
-    observations: ClosedObservations
-    scale: Scale
-    factors: list[RelativePose]
-    loops: LoopClosures
-    graph: PoseGraph
-    map: TsdfMap | None
-    stopwatch: Stopwatch
-    first: int
-    location: Location | MeasurementFailure | None = None
 
 
 class SlamPipeline:
@@ -118,12 +88,13 @@ class SlamPipeline:
         self._progress = progress or (lambda stage, done, total: None)
         self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
-        self.first = 0 if checkpoint is None else len(checkpoint.state.seen.roads)  # frames before are measured
+        self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
         self._seed = seed
         self._gps_track = gps_track
+        self.mode = resolve_mode(config.scale, sequence.camera_height_m, gps_track is not None)
         self._watch = Stopwatch()
 
-    def run(self) -> SlamResult:
+    def run(self) -> Estimate:
         """Run the whole system.
 
         Raises:
@@ -135,83 +106,90 @@ class SlamPipeline:
 
     def estimate(
         self,
-        journal: Journal | None = None,
+        checkpoints: CheckpointWriter | None = None,
         frames: Iterator[Frame] | None = None,
         watch: Callable[[Observer], None] | None = None,
-    ) -> SlamResult:
+    ) -> Estimate:
         """Everything but the map, so that trajectories can be kept before fusion begins; raises as ``run``.
 
         Args:
-            journal: keeps the state of the pass, given to it every 100 frames.
+            checkpoints: keeps the state of the pass, given to it every 100 frames.
             frames: of a sequence that grows as they come; None reads them from the sequence.
             watch: called after every frame.
         """
-        if frames is None:
-            self.require_possible()
+        self.require_possible()
         if self._config.mapping.enabled:
             import_open3d_beside()
-        observations, state = self._observe(journal, frames, watch)
-        observations = self.close_maps(observations)
-        mode = self.require_possible()
-        warn_of_doubts(len(self._sequence), observations, state)
-        solved = self.solve(mode, observations)
-        measured = solved.measured
-        return SlamResult(
-            network=self._trajectory(measured.T_network),
-            odometry=self._trajectory(measured.T_odometry),
-            optimised=self._trajectory(solved.T_world_camera),
-            lidar=measured.lidar,
-            reference=None if self._sequence.reference is None else self._trajectory(self._sequence.reference),
-            state=state,
-            observations=observations,
-            scale=measured.scale,
-            factors=measured.factors,
-            loops=solved.loops,
-            graph=solved.graph,
-            map=None,
-            stopwatch=self._watch,
-            first=self.first,
-            location=solved.location,
-        )
+        drive, state = self._observe(checkpoints, frames, watch)
+        drive, closure = self.close_maps(drive)
+        warn_of_doubts(drive, state.gate)
+        return self.solve(drive, state, closure)
 
-    def solve(self, mode: ScaleMode, observations: ClosedObservations) -> Solution:
-        """Relative poses, loops and the trajectory that fits both; ``SlamError`` where there is none."""
-        measured = self.measure(mode, observations)
-        loops = self.close_loops(observations, measured)
-        graph, T_optimised, location = self._optimise(measured, loops)
-        return Solution(measured, loops.without(graph.dropped), graph, T_optimised, location)
+    def solve(self, drive: Drive, state: FrontEndState, closure: MapClosure | None = None) -> Estimate:
+        """Lengths, factors and loops of a drive after `close_maps`, and the trajectory that fits them.
 
-    def measure(self, mode: ScaleMode, seen: ClosedObservations) -> Measurements:
-        """The front end: rotations, scale and lengths, then all factors and the odometry chained from them."""
-        T_network = chain_raw(seen.snippets, len(self._sequence))
-        steps = smooth_rotations(seen.steps, seen.relative_rotations)
+        Raises:
+            SlamError: the graph has no solution.
+        """
+        T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
-        by_lidar = lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
-        unscaled = Unscaled(steps, seen.gaps.trusted, seen.gaps.interpolated, seen.window)
-        scale = self._find_scale(mode, seen, unscaled, by_lidar, T_network)
-        factors = self._factors(unscaled, scale, by_lidar if self._config.lidar.factors and scale.is_metric else [])
-        return Measurements(T_network, lidar, scale, factors, chain_odometry(factors, T_network, scale))
+        scale, factors, T_odometry = self._measure(drive, T_network, lidar)
+        loops = self._close_loops(drive, scale, T_odometry) if closure is None else closure.closures(scale)
+        graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
+        reference = self._sequence.reference
+        return Estimate(
+            network=self._trajectory(T_network),
+            odometry=self._trajectory(T_odometry),
+            optimised=self._trajectory(T_world_camera),
+            lidar=lidar,
+            reference=None if reference is None else self._trajectory(reference),
+            drive=drive,
+            state=state,
+            scale=scale,
+            factors=factors,
+            loops=loops.without(graph.dropped),
+            graph=graph,
+            location=location,
+            first=self.first,
+            stopwatch=self._watch,
+        )
 
-    def close_maps(self, seen: ClosedObservations) -> ClosedObservations:
-        """The same after loops among the keyframes of all maps."""
-        if not seen.maps or not self._config.loops.enabled:
-            return seen
-        with self._watch.stage("loops"):
-            return seen.with_closure(close_maps(seen.maps, self._sequence.intrinsics, self._config, self._seed))
+    def _measure(
+        self, drive: Drive, T_network: FloatArray, lidar: LidarPath | MeasurementFailure | None
+    ) -> tuple[Scale, list[RelativePose], FloatArray]:
+        """Scale and factors of a completed drive, and the odometry ``(N, 4, 4)`` chained from the factors."""
+        config, by_lidar = self._config, lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
+        with self._watch.stage("scale"):
+            scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
+        factors = make_factors(drive, scale, self._noise, config.frontend, config.geometry)
+        if self.mode in ("reference", "known", "gps"):
+            unit = self._unit(chain_odometry(factors, T_network, scale))
+            scale = scale.in_metres(unit)
+            if isinstance(unit, ScaleEstimate):
+                factors = [factor.scaled(unit.value) for factor in factors]
+        if config.lidar.factors and scale.is_metric:
+            factors = with_lidar(factors, by_lidar)
+        return scale, factors, chain_odometry(factors, T_network, scale)
 
-    def close_loops(self, seen: ClosedObservations, measured: Measurements) -> LoopClosures:
-        """Loops after the last frame: those of the closed maps, or else among all views."""
-        if seen.closure is not None:
-            return seen.closure.closures(measured.scale)
+    def close_maps(self, drive: Drive) -> tuple[Drive, MapClosure | None]:
+        """A completed drive with its maps joined by loops among all keyframes; None without maps."""
+        if not drive.maps or not self._config.loops.enabled:
+            return drive, None
         with self._watch.stage("loops"):
-            scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in seen.views]
+            closure = close_maps(drive.maps, self._sequence.intrinsics, self._config, self._seed)
+        return drive.with_maps(closure.poses, closure.joins), closure
+
+    def _close_loops(self, drive: Drive, scale: Scale, T_odometry: FloatArray) -> LoopClosures:
+        """Loops among all views, after the last frame."""
+        with self._watch.stage("loops"):
+            scaled = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
             intrinsics, config = self._sequence.intrinsics, self._config.loops
-            return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
+            return close_loops(scaled, T_odometry, intrinsics, config, self._get_or_compute, self._seed)
 
     def fuse(
         self,
-        estimate: SlamResult,
+        estimate: Estimate,
         compare: Callable[[KeyframeDepth], None] | None = None,
         folder: Path | None = None,
     ) -> TsdfMap | None:
@@ -220,7 +198,7 @@ class SlamPipeline:
         ``compare`` is called with the depth of each keyframe that is far enough from the one before; ``folder`` is
         where finished submaps go, a temporary folder where it is None.
         """
-        keyframes = estimate.observations.keyframes
+        keyframes = estimate.drive.keyframes
         if not self._config.mapping.enabled or not keyframes:
             return None
         height, width = keyframes[0].depth_unscaled.shape
@@ -228,7 +206,7 @@ class SlamPipeline:
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
         scales = estimate.scale.per_frame
-        depths = KeyframeDepths(estimate.observations, scales, T_world_camera, intrinsics, config.depth)
+        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, intrinsics, config.depth)
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
@@ -242,29 +220,32 @@ class SlamPipeline:
                 self._progress("map", done, len(moved))
         return tsdf_map
 
-    def require_possible(self) -> ScaleMode:
-        """The scale mode of this run, after checks that it can succeed; raises as `require_possible`."""
+    def require_possible(self) -> None:
+        """Check that this run can succeed; raises as `requirements.require_possible` and `Positioning`."""
         shortest = self._predictor.sources + 1
-        mode = require_possible(self._sequence, shortest, self._config, self._gps_track is not None)
-        self._positioning(mode)
-        return mode
+        require_possible(self._sequence, self._config, shortest, self._gps_track is not None)
+        _ = self._positioning
 
-    def _positioning(self, mode: ScaleMode) -> Positioning | None:
+    @cached_property
+    def _positioning(self) -> Positioning | None:
         """The GPS track matched to the drive, None without one."""
         track = self._gps_track
-        return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, mode)
+        return None if track is None else Positioning(track, self._sequence.stamps, self._config.gps, self.mode)
 
     def _observe(
-        self, journal: Journal | None, frames: Iterator[Frame] | None, watch: Callable[[Observer], None] | None
-    ) -> tuple[ClosedObservations, ObserverState]:
+        self,
+        checkpoints: CheckpointWriter | None,
+        frames: Iterator[Frame] | None,
+        watch: Callable[[Observer], None] | None,
+    ) -> tuple[Drive, FrontEndState]:
         """One pass over the frames, or over those that follow a checkpoint."""
         checkpoint, first, total = self._checkpoint, self.first, len(self._sequence)
         state = None if checkpoint is None else checkpoint.state
-        if state is not None and self._config.mapping.enabled and not state.seen.keyframes:
+        if state is not None and self._config.mapping.enabled and not state.drive.keyframes:
             logger.warning(
                 "the map begins at frame %d: no earlier keyframes were kept (see output.keep=keyframes)", first
             )
-        examples = np.linspace(first, total - 1, EXAMPLES + 2).round().astype(int)[1:-1].tolist()
+        examples = Examples(None if frames is not None else range(first, total))
         observer = Observer(
             self._predictor,
             self._sequence.intrinsics,
@@ -283,55 +264,30 @@ class SlamPipeline:
                     watch(observer)
                 self._progress("frames", index + 1, total)
                 done = index + 1 - first
-                if journal is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
+                if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
                     with self._watch.stage("journal"):
-                        journal.keep(observer.state())
-            closed = observer.closed()
-            if isinstance(self._sequence, Continued):
-                warn_of_another_place(closed, first)
-            return closed, observer.state()
+                        checkpoints.keep(observer.state())
+            drive, state = observer.completed(), observer.state()
+        if isinstance(self._sequence, Continued):
+            warn_of_another_place(drive, first)
+        return drive, state
 
-    def _find_scale(
-        self,
-        mode: ScaleMode,
-        seen: ClosedObservations,
-        unscaled: Unscaled,
-        by_lidar: Sequence[RelativePose],
-        T_network: FloatArray,
-    ) -> Scale:
-        """The unit of length by the mode, and the lengths of all steps."""
-        config, sequence = self._config, self._sequence
-        measured = LengthMeasurements(seen.roads, unscaled.steps.triangulated, seen.road_steps, by_lidar)
-        with self._watch.stage("scale"):
-            scale = find_scale(mode, sequence.camera_height_m, measured, config.lengths)
-            if mode not in ("reference", "known", "gps"):
-                return scale
-            T_odometry = chain_odometry(self._factors(unscaled, scale, []), T_network, scale)
-            return scale.in_metres(self._unit(mode, T_odometry))
-
-    def _unit(self, mode: ScaleMode, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
+    def _unit(self, T_odometry: FloatArray) -> ScaleEstimate | MeasurementFailure:
         """Metres per unit of an odometry, by what the mode knows of the drive."""
-        sequence, config = self._sequence, self._config.scale
-        unit: ScaleEstimate | MeasurementFailure = MeasurementFailure(f"nothing is known for scale mode {mode}")
-        positioning = self._positioning(mode)
-        if mode == "reference" and sequence.reference is not None:
-            unit = scale_from_reference(T_odometry, sequence.reference)
-        elif mode == "known":
-            unit = scale_from_distance(T_odometry, sequence.stamps, config)
-        elif positioning is not None:
-            unit = positioning.scale(T_odometry)
-        return unit
-
-    def _factors(self, unscaled: Unscaled, scale: Scale, by_lidar: Sequence[RelativePose]) -> list[RelativePose]:
-        return make_factors(unscaled, scale, by_lidar, self._noise, self._config.frontend, self._config.geometry)
+        sequence = self._sequence
+        if self.mode == "reference" and sequence.reference is not None:
+            return scale_from_reference(T_odometry, sequence.reference)
+        if self.mode == "gps" and self._positioning is not None:
+            return self._positioning.scale(T_odometry)
+        return scale_from_distance(T_odometry, sequence.stamps, self._config.scale)
 
     def _optimise(
-        self, measured: Measurements, loops: LoopClosures
+        self, scale: Scale, factors: Sequence[RelativePose], T_odometry: FloatArray, loops: LoopClosures
     ) -> tuple[PoseGraph, FloatArray, Location | MeasurementFailure | None]:
         """The optimised trajectory without the loops that contradict it, and where it lies on the earth."""
-        graph, T_odometry, unit = PoseGraph(self._config.pose_graph), measured.T_odometry, measured.scale.estimate
-        graph.add_relative(*measured.factors, *(loop.measured for loop in loops.accepted))
-        positioning = self._positioning(measured.scale.mode)
+        graph, unit = PoseGraph(self._config.pose_graph), scale.estimate
+        graph.add_relative(*factors, *(loop.measured for loop in loops.accepted))
+        positioning = self._positioning
         location = None if positioning is None else positioning.locate(T_odometry, unit)
         if positioning is not None and isinstance(location, Location):
             positioning.add_factors(graph, location, T_odometry)

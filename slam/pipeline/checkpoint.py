@@ -1,22 +1,25 @@
 """A checkpoint of a session on disk: all measurements of a drive so far, without its images.
 
-The frames that follow are measured as without an interruption. Lengths, noise, loops and graph are then computed again
-for the whole drive (``docs/design/storage-and-sessions.md``).
+A drive that is continued, a run that was killed and a session that was saved go on from the same file. The frames that
+follow are measured as without an interruption. Lengths, noise, loops and graph are then computed again for the whole
+drive (``docs/design/storage-and-sessions.md``).
 """
 
 from __future__ import annotations
 
+import logging
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from slam.errors import RunError
-from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent
+from slam.errors import RunError, SlamError
+from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent, View
 from slam.frames import Sequence as FrameSequence
+from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
 from slam.frontend.scale.road_homography import RoadStep
@@ -32,16 +35,20 @@ from slam.frontend.visual.tracking import Corners, TrackerState
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
-from slam.loops.descriptors import View
-from slam.pipeline.observations import Keyframe, Observations
-from slam.pipeline.observer import ObserverState, RecentFrame
+from slam.frontend.window.relative_poses import WindowPoses
+from slam.pipeline.observer import FrontEndState, RecentFrame
 from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
 from slam.storage.archive import opened_archive, read_array
+from slam.storage.files import KEYFRAMES_PART, remove, write_atomically
 from slam.storage.serialisation import Serialiser
 from slam.storage.spill import SpillFile
 
 DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
+EVERY_FRAMES = 100
+_GROWTH = 0.1  # of a drive, before its state is written again: all writes together are eleven times the last one
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,12 +65,12 @@ class SessionCheckpoint:
     camera_height_m: float | None
     stamps: FloatArray
     reference: FloatArray | None
-    state: ObserverState
+    state: FrontEndState
 
     @classmethod
-    def of(cls, sequence: FrameSequence, state: ObserverState, weights_sha256: str) -> Self:
+    def of(cls, sequence: FrameSequence, state: FrontEndState, weights_sha256: str) -> Self:
         """From the state of an observer after the last frame, without images."""
-        without_images = replace(state, seen=replace(state.seen, keyframes=[], examples=[]))
+        without_images = replace(state, drive=replace(state.drive, keyframes=[], examples=[]))
         return cls(
             sequence.name,
             sequence.provenance(),
@@ -100,9 +107,15 @@ class SessionCheckpoint:
                 "finished, and not with output.keep=nothing"
             )
         checkpoint = cls.read(folder / DRIVE)
-        if (folder / KEYFRAMES).exists():
-            checkpoint.state.seen.keyframes.extend(read_keyframes(folder / KEYFRAMES))
+        drive = checkpoint.state.drive
+        keyframes = {keyframe.index: keyframe for path in _keyframe_files(folder) for keyframe in read_keyframes(path)}
+        drive.keyframes.extend(keyframes[index] for index in sorted(keyframes) if index < len(drive))
         return checkpoint
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it has all frames of its sequence, as that of a killed run has not."""
+        return len(self.state.drive) == len(self.stamps)
 
     def continued(self, following: FrameSequence) -> Continued:
         """The drive extended by the frames that follow.
@@ -115,11 +128,72 @@ class SessionCheckpoint:
 
 
 SERIALISER = Serialiser(
-    *(SessionCheckpoint, ObserverState, Observations, GateState, OdometryState, TrackerState, MotionHistory),
+    *(SessionCheckpoint, FrontEndState, Drive, GateState, OdometryState, TrackerState, MotionHistory),
     *(Corners, DepthError, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
-    *(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
+    *(WindowPoses, WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
 )
+
+
+class CheckpointWriter:
+    """Keeps a drive in the folder of its run while its frames are measured, and once they are all there."""
+
+    def __init__(
+        self,
+        folder: Path,
+        checkpoint_of: Callable[[FrontEndState], SessionCheckpoint],
+        with_keyframes: bool,
+        kept: Drive | None = None,
+    ) -> None:
+        """Prepare for the first state.
+
+        Args:
+            folder: of the run.
+            checkpoint_of: the checkpoint of a state.
+            with_keyframes: also keep the frames of the map.
+            kept: what a checkpoint in this folder has already.
+        """
+        self._folder, self._checkpoint_of, self._with_keyframes = folder, checkpoint_of, with_keyframes
+        self._frames, self._keyframes = (0, 0) if kept is None else (len(kept), len(kept.keyframes))
+        self._is_writable = True
+
+    def keep(self, state: FrontEndState) -> None:
+        """Write the state of a pass that goes on, at distances that grow with the drive.
+
+        After a failure (a full disk) it warns, keeps no more, and the run goes on.
+        """
+        drive = state.drive
+        if not self._is_writable or len(drive) - self._frames < _GROWTH * self._frames:
+            return
+        new = drive.keyframes[self._keyframes :]
+        try:
+            if self._with_keyframes and new:
+                part = self._folder / f"keyframes-{len(drive):06d}.npz"
+                write_atomically(part, lambda path: write_keyframes(path, new))
+            write_atomically(self._folder / DRIVE, self._checkpoint_of(state).write)
+        except (SlamError, OSError) as error:
+            logger.warning("the state of the run is not kept any more, a killed run goes on from before: %s", error)
+            self._is_writable = False
+        self._frames, self._keyframes = len(drive), len(drive.keyframes)
+
+    def finish(self, state: FrontEndState) -> None:
+        """Write the state after the last frame; all keyframes are then in one file.
+
+        Raises:
+            RunError: a file cannot be written.
+        """
+        if self._with_keyframes:
+            keyframes = state.drive.keyframes
+            write_atomically(self._folder / KEYFRAMES, lambda path: write_keyframes(path, keyframes), RunError)
+        write_atomically(self._folder / DRIVE, self._checkpoint_of(state).write, RunError)
+        for path in _keyframe_files(self._folder):
+            if path.name != KEYFRAMES:
+                remove(path, RunError)
+
+
+def _keyframe_files(folder: Path) -> list[Path]:
+    """The files of keyframes in a folder: one, or while a pass goes on one for each time that its state was kept."""
+    return sorted(path for path in folder.iterdir() if path.name == KEYFRAMES or KEYFRAMES_PART.fullmatch(path.name))
 
 
 def write_keyframes(path: Path, keyframes: Sequence[Keyframe]) -> None:

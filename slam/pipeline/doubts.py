@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 
 from slam.frames import runs
+from slam.frontend.drive import Drive
+from slam.frontend.image_gate import GateState
 from slam.frontend.moving_cover import crossings
-from slam.pipeline.observations import ClosedObservations
-from slam.pipeline.observer import ObserverState
 
 logger = logging.getLogger(__name__)
 
@@ -18,20 +18,19 @@ _ROLLING_EXPOSURE = 0.6
 _LEAST_COMPARED = 30
 
 
-def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) -> None:
+def warn_of_doubts(drive: Drive, gate: GateState) -> None:
     """Warn of gaps, of segments, whose places are guesses, and of a frozen end: did the camera stand there?"""
-    gaps = runs(seen.interpolated)
+    gaps = runs(drive.interpolated)
     for first, last in gaps[:_MOST_NAMED]:
-        logger.warning("frames %d to %d are interpolated: %s", first, last, seen.interpolated[first])
+        logger.warning("frames %d to %d are interpolated: %s", first, last, drive.interpolated[first])
     if len(gaps) > _MOST_NAMED:
         more, frames_of_them = gaps[_MOST_NAMED:], sum(last - first + 1 for first, last in gaps[_MOST_NAMED:])
         logger.warning("%d more stretches are interpolated, of %d frames: see metrics.json", len(more), frames_of_them)
-    _warn_of_segments(seen)
-    doubled = doubled_frames(frames, seen, state)
+    _warn_of_segments(drive)
+    doubled = doubled_frames(drive)
     if doubled:
         named = ", ".join(map(str, doubled[:_MOST_NAMED])) + (", ..." if len(doubled) > _MOST_NAMED else "")
         logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named)
-    gate = state.gate
     if gate.compared >= _LEAST_COMPARED and gate.exposed > _ROLLING_EXPOSURE * gate.compared:
         logger.warning(
             "the exposure rolls: %d of %d images are more than a tenth brighter or darker than the one before; fix the "
@@ -46,9 +45,9 @@ def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) 
             first,
             last,
         )
-    end = frames - 1
-    for first, last in runs(state.seen.repeated):
-        if last == end and end not in seen.interpolated:
+    end = len(drive) - 1
+    for first, last in runs(drive.repeated):
+        if last == end and end not in drive.interpolated:
             logger.warning(
                 "frames %d to %d, the last ones, repeat frame %d: the camera is taken to stand; if the video "
                 "froze, leave them out with --frames",
@@ -58,19 +57,19 @@ def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) 
             )
 
 
-def doubled_frames(frames: int, seen: ClosedObservations, state: ObserverState) -> list[int]:
+def doubled_frames(drive: Drive) -> list[int]:
     """Frames that repeat the one before while the camera moves, not interpolated, at most two in a row.
 
     More in a row are a camera that stands. At the end of a drive nobody knows.
     """
-    moving = set(state.seen.moving).difference(seen.interpolated)
-    few = [(first, last) for first, last in runs(state.seen.repeated) if last - first < 2 and last < frames - 1]
+    moving = set(drive.moving).difference(drive.interpolated)
+    few = [(first, last) for first, last in runs(drive.repeated) if last - first < 2 and last < len(drive) - 1]
     return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
 
-def _warn_of_segments(seen: ClosedObservations) -> None:
+def _warn_of_segments(drive: Drive) -> None:
     """Where a segment begins, its place relative to the ones before is a guess."""
-    later = seen.segments[1:]
+    later = drive.segments[1:]
     for segment in later[:_MOST_NAMED]:
         logger.warning(
             "a new segment of the drive begins at frame %d (%s): its place relative to the frames before is a guess",
@@ -81,10 +80,10 @@ def _warn_of_segments(seen: ClosedObservations) -> None:
         logger.warning("%d more segments begin: see metrics.json", len(later) - _MOST_NAMED)
 
 
-def warn_of_another_place(seen: ClosedObservations, first: int) -> None:
+def warn_of_another_place(drive: Drive, first: int) -> None:
     """Copies of other recordings under the same name, and folders, are known by their first image alone."""
-    for start, end, reason in seen.failures:
-        if (start, end) == (first - 1, first) and first not in seen.interpolated:
+    for start, end, reason in drive.failures:
+        if (start, end) == (first - 1, first) and first not in drive.interpolated:
             logger.warning(
                 "frame %d, the first that follows, does not match frame %d (%s): make sure that it was taken "
                 "right after it on the same drive",

@@ -11,8 +11,8 @@ from erfsfm.refinement.refine import RefinedDepth, Road
 from slam.config import DepthConfig, MappingConfig
 from slam.depth_refinement import DepthRefiner
 from slam.frames import DepthMap, Image, Intrinsics
+from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.pipeline.observations import ClosedObservations, Keyframe
 from slam.se3 import FloatArray
 
 _SOME = 20
@@ -47,7 +47,7 @@ class KeyframeDepths:
 
     def __init__(
         self,
-        observations: ClosedObservations,
+        drive: Drive,
         scale_per_frame: FloatArray,
         T_world_camera: FloatArray,
         intrinsics: Intrinsics,
@@ -56,14 +56,14 @@ class KeyframeDepths:
         """Prepare.
 
         Args:
-            observations: with at least one keyframe.
+            drive: with at least one keyframe.
             scale_per_frame: factor ``(N,)`` on unscaled depth.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
             intrinsics: of the keyframes.
             config: whether to refine.
         """
-        self._keyframes: Sequence[Keyframe] = observations.keyframes
-        self._roads = observations.roads
+        self._keyframes: Sequence[Keyframe] = drive.keyframes
+        self._roads = drive.roads
         self._scale = scale_per_frame
         self._refiner: DepthRefiner | None = None
         if config.refine == "multiview":

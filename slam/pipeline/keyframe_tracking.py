@@ -8,15 +8,14 @@ from itertools import islice
 import numpy as np
 
 from slam.config import LoopsConfig, SlamConfig, WindowConfig
-from slam.frames import DepthMap, Frame, Intrinsics
+from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
+from slam.frontend.drive import Drive
 from slam.frontend.window.descriptors import describe
 from slam.frontend.window.local_map import LocalMap, corners_of
 from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
-from slam.loops.descriptors import View
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
-from slam.pipeline.observations import Observations
 from slam.se3 import FloatArray, invert
 
 # a lost camera is looked for at every third frame
@@ -97,28 +96,28 @@ class KeyframeTracking:
         odometry.relocalise(frame, depth, found.T_camera_map, tracks, corners[found.corners[first]], place)
         self._places = None  # the new keyframe changes the map
 
-    def decide(self, seen: Observations) -> None:
+    def decide(self, drive: Drive) -> None:
         """End the tracking where the first steps are those of a vehicle."""
         if self._odometry is None or self._is_carried:
             return
-        vehicle = False if self._config.use == "always" else is_vehicle(seen)
+        vehicle = False if self._config.use == "always" else is_vehicle(drive)
         self._is_carried = vehicle is False
         if vehicle:
             self._odometry = None
 
-    def measures(self, seen: Observations, index: int) -> bool:
+    def measures(self, drive: Drive, index: int) -> bool:
         """Whether keyframes alone measure the motion to the last frame: not before the decision, nor beside a gap or a
         repeated image."""
-        doubtful = {*seen.repeated[-1:], *list(seen.unusable)[-1:]}
+        doubtful = {*drive.repeated[-1:], *list(drive.unusable)[-1:]}
         if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
             return False
         return self._odometry.locates(index - 1, index)
 
-    def measure_alone(self, seen: Observations, index: int) -> bool:
+    def measure_alone(self, drive: Drive, index: int) -> bool:
         """Whether keyframes locate one of the last frames and no step was measured to it."""
         if self._odometry is None or not self._is_carried:
             return False
-        has_step = any(motion.ends[1] == index for motion in seen.motions[-_FRAMES:])
+        has_step = any(motion.ends[1] == index for motion in drive.motions[-_FRAMES:])
         return not has_step and self._odometry.has_located(index)
 
     def is_keyframe(self, index: int) -> bool:
@@ -127,10 +126,9 @@ class KeyframeTracking:
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
-        state = self.state()
-        if state is None or not self._is_carried or not state.segments:
+        if self._odometry is None or not self._is_carried or not self._odometry.segments:
             return None
-        segment = state.segments[-1]
+        segment = self._odometry.segments[-1]
         placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
         located = [(place, T_map) for place, T_map in placed if T_map is not None]
         if len(located) < 2 or located[-1][0] != index:
@@ -140,26 +138,31 @@ class KeyframeTracking:
         T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
         return before, T_before_frame
 
-    def maps(self, seen: Observations) -> tuple[Segment, ...]:
+    def maps(self, drive: Drive) -> tuple[Segment, ...]:
         """All maps so far; none of a vehicle, nor before that is decided."""
-        self.decide(seen)
+        self.decide(drive)
         if self._odometry is None or not self._is_carried:
             return ()
-        return tuple(segment for segment in self._odometry.state().segments if segment.started)
+        return tuple(segment.copy() for segment in self._odometry.segments if segment.started)
+
+    @property
+    def events(self) -> Sequence[TrackingEvent]:
+        """What became of the maps so far."""
+        return () if self._odometry is None else self._odometry.events
 
     def poses(self, maps: Sequence[Segment]) -> WindowPoses:
         """Relative poses of all frames of some maps."""
         return window_poses(maps, self._intrinsics, self._seed)
 
 
-def has_keyframes(config: WindowConfig, seen: Observations) -> bool:
+def has_keyframes(config: WindowConfig, drive: Drive) -> bool:
     """Whether a drive of which this was measured is tracked by keyframes, so that its state has them."""
-    return config.use == "always" or (config.use == "auto" and is_vehicle(seen) is not True)
+    return config.use == "always" or (config.use == "auto" and is_vehicle(drive) is not True)
 
 
-def is_vehicle(seen: Observations) -> bool | None:
+def is_vehicle(drive: Drive) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
-    triangulated = (motion for motion in seen.motions if motion.is_triangulated)
+    triangulated = (motion for motion in drive.motions if motion.is_triangulated)
     first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]
     if len(first) < _DECISION_STEPS:
         return None

@@ -17,13 +17,12 @@ from erfsfm.readers.pinhole import impossible
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
-from slam.frontend.scale.scale_estimate import resolve_mode
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.keyframe_tracking import decided, has_keyframes
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
@@ -91,22 +90,16 @@ class Slam:
                 f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
                 f"{sweep_frames} and {seed}"
             )
-        self._mode = resolve_mode(config.scale, camera_height_m)
-        if self._mode in ("reference", "lidar", "known", "gps"):
-            raise SlamError(f"scale mode {self._mode} needs a whole sequence: choose camera-height or none")
-        if config.lidar.factors:
-            raise SlamError("lidar.factors=true needs a whole sequence with LiDAR scans: leave the setting out")
-        if self._mode == "camera-height" and camera_height_m is None:
-            raise SlamError("scale mode camera-height needs camera_height_m: give it or choose scale.mode=none")
         without_map = config.mapping.model_copy(update={"enabled": False})
         config = decided(config.model_copy(update={"mapping": without_map}), camera_height_m)
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
         self._pipeline = SlamPipeline(self._sequence, predictor, config, noise=noise, seed=seed)
+        self._pipeline.require_possible()
         self._observer = self._observe(None)
         self._is_closed = False
-        self._tracker = Tracker(predictor, intrinsics, camera_height_m, config, noise, update=update_frames)
+        self._tracker = Tracker(predictor.sources, camera_height_m, config, noise, update=update_frames)
         self._sweep_frames = sweep_frames
 
     @classmethod
@@ -225,7 +218,7 @@ class Slam:
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        if has_keyframes(self._config.window, checkpoint.state.seen) != (checkpoint.state.keyframes is not None):
+        if has_keyframes(self._config.window, checkpoint.state.drive) != (checkpoint.state.keyframes is not None):
             raise SlamError(f"{path} was made with another window.use: make Slam with the same")
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
@@ -253,13 +246,14 @@ class Slam:
             SlamError: the graph has no solution.
         """
         self._observer.flush()
-        if not self._observer.seen.snippets:
+        if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        solved = self._pipeline.solve(self._mode, self._pipeline.close_maps(self._observer.closed()))
-        self._tracker.correct(solved.T_world_camera, solved.measured.scale)
-        return solved.loops
+        drive, closure = self._pipeline.close_maps(self._observer.completed())
+        estimate = self._pipeline.solve(drive, self._observer.state(), closure)
+        self._tracker.correct(estimate.optimised.T_world_camera, estimate.scale)
+        return estimate.loops
 
-    def _observe(self, state: ObserverState | None) -> Observer:
+    def _observe(self, state: FrontEndState | None) -> Observer:
         return Observer(
             self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
         )

@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.config import SlamConfig
-from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent
+from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import map_units, scaled_poses
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.joining import SharedCorners, join
@@ -20,7 +20,6 @@ from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.loops.closure import LoopClosures
-from slam.loops.descriptors import View
 from slam.loops.maps import MapLoop, find_map_loops
 from slam.loops.verification import Loop, RejectedLoop
 from slam.se3 import FloatArray, apply, invert, make

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,19 +14,18 @@ import numpy as np
 from slam.config import SlamConfig
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
+from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import interpolate_gaps
+from slam.frontend.gap_interpolation import completed
 from slam.frontend.image_gate import GateState, ImageGate, Verdict
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
-from slam.frontend.segments import find_cuts
-from slam.frontend.step_table import StepTable, path_between, shortest_by_start
+from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
 from slam.frontend.window.odometry import WindowState
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.observations import ClosedObservations, Keyframe, Observations
 from slam.pipeline.pending import PendingFrame, PendingTask
 from slam.pipeline.reading import predicted_depth
 from slam.runtime.memory import return_freed_memory
@@ -48,10 +47,10 @@ class RecentFrame:
 
 
 @dataclass(frozen=True)
-class ObserverState:
-    """State of an observer after a frame; ``keyframes`` is None where the drive is measured by steps alone."""
+class FrontEndState:
+    """A snapshot after a frame; ``keyframes`` is None where the drive is measured by steps alone."""
 
-    seen: Observations
+    drive: Drive
     gate: GateState
     odometry: OdometryState
     keyframes: WindowState | None
@@ -78,10 +77,10 @@ class Observer:
         intrinsics: Intrinsics,
         config: SlamConfig,
         stopwatch: Stopwatch,
-        examples: Collection[int] = (),
+        examples: Examples | None = None,
         get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
-        state: ObserverState | None = None,
+        state: FrontEndState | None = None,
     ) -> None:
         """Prepare for the first frame, or resume from a state.
 
@@ -90,7 +89,7 @@ class Observer:
             intrinsics: of all images.
             config: of all parts.
             stopwatch: measures the time of stages.
-            examples: frames to keep whole for the report.
+            examples: frames to keep whole for the report; None keeps none.
             get_or_compute: a cache of image measurements.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
@@ -98,15 +97,15 @@ class Observer:
         self._predictor = predictor
         self._config = config
         self._stopwatch = stopwatch
-        self._examples = frozenset(examples)
-        self._seen = Observations() if state is None else state.seen
+        self._examples = examples or Examples(range(0))
+        self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
         keyframes = WindowState() if state is None else state.keyframes
         self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
-        self._keyframes.decide(self._seen)
+        self._keyframes.decide(self._drive)
         self._road = RoadHomography(
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
@@ -158,7 +157,7 @@ class Observer:
         finally:
             self._pending = pending
             if verdict == "repeated":  # what is measured of the frame before does not know it
-                self._seen.repeat(index, self._gate.was_moving)
+                self._drive.repeat(index, self._gate.was_moving)
 
     def flush(self) -> None:
         """Finish every frame so far."""
@@ -166,39 +165,36 @@ class Observer:
         while self._tasks:
             self._finish_tasks()
 
-    def state(self) -> ObserverState:
-        """The state from which another observer continues as without an interruption."""
+    def state(self) -> FrontEndState:
+        """A snapshot from which another observer continues as without an interruption."""
         self.flush()
         parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        return ObserverState(self._seen, *parts, self._window, self._recent, self._unread)
+        return FrontEndState(self._drive.copy(), *parts, self._window, self._recent, self._unread)
 
     @property
     def frames(self) -> int:
         """Number of frames so far."""
-        return len(self._seen.roads) + (self._pending is not None)
+        return len(self._drive) + (self._pending is not None)
 
     @property
-    def seen(self) -> Observations:
-        """What was measured so far."""
-        return self._seen
+    def drive(self) -> Drive:
+        """What was measured so far, which grows with the frames."""
+        return self._drive
 
     def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
 
-    def closed(self) -> ClosedObservations:
+    def completed(self) -> Drive:
         """Everything measured so far with its gaps interpolated; more frames may follow.
 
         Raises:
             SlamError: no snippet of usable frames.
         """
         self.flush()
-        seen, sources = self._seen, self._predictor.sources
-        steps, count, maps = StepTable.of(seen.motions), len(seen.roads), self._keyframes.maps(seen)
-        window = self._keyframes.poses(maps)
-        cuts = find_cuts(seen.failures, {*steps.motions, *window.steps}, {*seen.unusable, *seen.repeated})
-        gaps = interpolate_gaps(count, sources, seen.snippets, steps, seen.unusable, seen.repeated, cuts)
-        return ClosedObservations.of(seen, gaps, cuts, window, maps)
+        maps = self._keyframes.maps(self._drive)
+        poses = self._keyframes.poses(maps)
+        return completed(self._drive, self._predictor.sources, maps, poses, self._keyframes.events)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -212,14 +208,14 @@ class Observer:
         try:
             self._process_pending()
         finally:  # the error is of the frame before
-            self._seen.unusable[index] = reason
-            self._seen.roads.append(MeasurementFailure(reason))
+            self._drive.unusable[index] = reason
+            self._drive.roads.append(MeasurementFailure(reason))
             self._window = ()
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
         sources, index = self._predictor.sources, frame.index
         self._window = (*self._window, frame)[-sources - 1 :]
-        is_sparse = self._keyframes.measure_alone(self._seen, index - 2)  # finished, whatever else is
+        is_sparse = self._keyframes.measure_alone(self._drive, index - 2)  # finished, whatever else is
         depth = snippet = None
         if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
@@ -238,9 +234,9 @@ class Observer:
             # callers may continue after this: the frame becomes a gap, with one entry in ``roads`` as all frames
             self._tasks.clear()
             self._recent = ()
-            self._seen.unusable[pending.frame.index] = f"it could not be measured ({error})"
-            if len(self._seen.roads) == pending.frame.index:
-                self._seen.roads.append(MeasurementFailure(str(error)))
+            self._drive.unusable[pending.frame.index] = f"it could not be measured ({error})"
+            if len(self._drive) == pending.frame.index:
+                self._drive.roads.append(MeasurementFailure(str(error)))
             raise
 
     def _process(self, pending: PendingFrame) -> None:
@@ -248,18 +244,18 @@ class Observer:
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            measure = self._config.geometry.enabled and not self._keyframes.measures(self._seen, frame.index)
+            measure = self._config.geometry.enabled and not self._keyframes.measures(self._drive, frame.index)
             step = self._measure_step(self._recent[-1], frame) if measure and self._recent else None
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
-        self._keyframes.decide(self._seen)
+        self._keyframes.decide(self._drive)
         if pending.snippet is not None:
-            self._tasks.append(PendingTask("pose network", pending.snippet, self._seen.snippets.append))
+            self._tasks.append(PendingTask("pose network", pending.snippet, self._drive.snippets.append))
         if rotation is not None:
             self._tasks.append(PendingTask("geometry", self._beside.submit(rotation), self._keep_rotation))
         if self._config.road.enabled and step is not None:
             self._tasks.append(self._road_task(self._recent[-1].frame, frame, step))
-        self._seen.roads.append(MeasurementFailure("its depth was not predicted"))
+        self._drive.roads.append(MeasurementFailure("its depth was not predicted"))
         self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._config.geometry.rotation_baseline_steps :]
         if pending.depth is not None:
             with self._stopwatch.stage("depth network"):
@@ -273,12 +269,12 @@ class Observer:
     def _learn(self, frame: Frame, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         with self._stopwatch.stage("road"):
-            self._seen.roads[frame.index] = road = self._plane.fit(depth)
+            self._drive.roads[frame.index] = road = self._plane.fit(depth)
         self._keyframes.learn(frame, depth)
         height = self._remember(frame, depth, road)
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
             with self._stopwatch.stage("loops"):
-                self._seen.views.append(self._features.view(frame, depth, height))
+                self._drive.views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
@@ -299,10 +295,10 @@ class Observer:
         depth, height = self._known(previous)
         measured = self._odometry.measure(previous.frame, current, depth, height)
         if isinstance(measured, MeasurementFailure):
-            self._seen.failures.append((previous.frame.index, current.index, measured.reason))
+            self._drive.failures.append((previous.frame.index, current.index, measured.reason))
             logger.info("geometry %d -> %d failed: %s", previous.frame.index, current.index, measured.reason)
             return None
-        self._seen.motions.append(measured)
+        self._drive.motions.append(measured)
         return measured if measured.is_triangulated else None
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
@@ -311,7 +307,7 @@ class Observer:
         if baseline < 2 or len(self._recent) < baseline:
             return None
         first = self._recent[-baseline]
-        motions = {m.ends: m for m in self._seen.motions[-2 * baseline :] if m.is_triangulated}
+        motions = {m.ends: m for m in self._drive.motions[-2 * baseline :] if m.is_triangulated}
         path = path_between(shortest_by_start(motions), first.frame.index, current.index)
         if path is None or len(path) != baseline:
             return None
@@ -320,12 +316,12 @@ class Observer:
 
     def _keep_rotation(self, rotation: Any) -> None:
         if rotation is not None:
-            self._seen.relative_rotations.append(rotation)
+            self._drive.relative_rotations.append(rotation)
 
     def _road_task(self, previous: Frame, current: Frame, motion: Motion) -> PendingTask:
         def keep(step: RoadStep | MeasurementFailure) -> None:
             if isinstance(step, RoadStep):
-                self._seen.road_steps[motion.ends] = step
+                self._drive.road_steps[motion.ends] = step
             else:
                 logger.info("road %d -> %d failed: %s", *motion.ends, step.reason)
 
@@ -343,7 +339,7 @@ class Observer:
         """Keep thinned frames for the map, and a few whole ones for the report."""
         mapping = self._config.mapping
         if frame.index in self._examples:
-            self._seen.examples.append((frame.index, frame.image, depth))
+            self._examples.keep(frame, depth, self._drive.examples)
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
-            self._tasks.append(PendingTask("map", keyframe, self._seen.keyframes.append))
+            self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))

@@ -1,27 +1,29 @@
-"""What a configuration needs of a sequence, checked before the pass over its frames."""
+"""What a configuration needs of a sequence, checked at every door before the first frame."""
 
 from __future__ import annotations
 
-from slam.config import ScaleMode, SlamConfig
+from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Sequence
 from slam.frontend.lidar_odometry import has_scans
 from slam.frontend.scale.scale_estimate import known_frames, resolve_mode
+from slam.pipeline.growing import GrowingSequence
 
 
-def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_gps: bool) -> ScaleMode:
-    """The scale mode of a run, after checks that it can succeed.
+def require_possible(sequence: Sequence, config: SlamConfig, shortest: int, has_gps: bool = False) -> None:
+    """Check that a sequence has what the configuration of a run needs.
 
     Args:
-        sequence: to run on.
-        shortest: number of frames of one snippet.
+        sequence: to run on; one that grows needs no frame yet.
         config: of the run.
+        shortest: number of frames of one snippet of the networks.
         has_gps: whether a GPS track was given.
 
     Raises:
         SlamError: too few frames, or the sequence lacks what the configuration needs.
     """
-    if len(sequence) < shortest:
+    grows = isinstance(sequence, GrowingSequence)
+    if len(sequence) < shortest and not grows:
         raise SlamError(
             f"{sequence.name} has {len(sequence)} frames, and one snippet of these networks has {shortest}: "
             "choose a longer range"
@@ -49,6 +51,10 @@ def require_possible(sequence: Sequence, shortest: int, config: SlamConfig, has_
         )
     if mode == "gps" and not has_gps:
         raise SlamError("scale mode gps needs a GPS track: give --gps FILE or choose another scale.mode")
+    if mode == "known" and grows:
+        raise SlamError(
+            f"scale mode known needs frames of a whole sequence, and {sequence.name} grows: "
+            "choose camera-height or none"
+        )
     if mode == "known":
         known_frames(config.scale, sequence.stamps)
-    return mode

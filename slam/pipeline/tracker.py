@@ -8,14 +8,13 @@ from typing import Literal
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import ScaleMode, SlamConfig
-from slam.frames import Intrinsics, Predictor
-from slam.frontend.scale.metric_scale import Scale
+from slam.config import SlamConfig
+from slam.frontend.factors import chain_odometry, make_factors
+from slam.frontend.gap_interpolation import completed
+from slam.frontend.network_factors import chain_raw
+from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
-from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.growing import GrowingSequence
 from slam.pipeline.observer import Observer
-from slam.pipeline.recent import closed, recent
 from slam.se3 import FloatArray, invert
 
 State = Literal["starting", "tracking", "bridged", "relocalised"]
@@ -40,21 +39,27 @@ class Tracker:
 
     def __init__(
         self,
-        predictor: Predictor,
-        intrinsics: Intrinsics,
+        sources: int,
         camera_height_m: float | None,
         config: SlamConfig,
         noise: PoseNoise | None,
         window: int = 100,
         update: int = 10,
     ) -> None:
-        """Prepare for the first frame."""
-        self._sources = predictor.sources
-        self._recent = GrowingSequence(intrinsics, camera_height_m)
-        self._pipeline = SlamPipeline(self._recent, predictor, config, noise=noise)
+        """Prepare for the first frame.
+
+        Args:
+            sources: of a snippet.
+            camera_height_m: above the road; None where unknown.
+            config: of all parts.
+            noise: of the snippet poses; None measures it against image geometry alone.
+            window: frames whose poses are solved again.
+            update: frames between two solutions.
+        """
+        self._sources, self._camera_height_m, self._config, self._noise = sources, camera_height_m, config, noise
+        self._mode = resolve_mode(config.scale, camera_height_m)
         self._window, self._update = window, update
         self.unit_name: str | None = None  # of all lengths, None while unknown
-        self._mode: ScaleMode = resolve_mode(config.scale, camera_height_m)
         self._T_world_camera: list[FloatArray] = []
         self._T_previous_newest = np.eye(4)
         self._unit: float | None = None  # of the mode per unscaled length, at the newest frame
@@ -71,14 +76,14 @@ class Tracker:
 
     def add(self, observer: Observer) -> list[Tracked]:
         """The frames that the observer has finished since the last call."""
-        seen = observer.seen
-        first, count = len(self._T_world_camera), len(seen.roads)
+        drive = observer.drive
+        first, count = len(self._T_world_camera), len(drive)
         for index in range(first, count):
             self._step(observer, index)
-        if seen.snippets and (self._unit is None or count // self._update > first // self._update):
+        if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        return [Tracked(self._T_world_camera[k], self._state(k in seen.unusable), unit) for k in range(first, count)]
+        return [Tracked(self._T_world_camera[k], self._state(k in drive.unusable), unit) for k in range(first, count)]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""
@@ -100,7 +105,7 @@ class Tracker:
             self._T_world_camera.append(np.eye(4))
             return
         before, by_keyframes = index - 1, observer.keyframe_step(index)
-        motion = next((m for m in reversed(observer.seen.motions[-4:]) if m.ends == (before, index)), None)
+        motion = next((m for m in reversed(observer.drive.motions[-4:]) if m.ends == (before, index)), None)
         T_before_frame = self._T_previous_newest
         if by_keyframes is not None:
             before, T_before_frame = by_keyframes
@@ -115,14 +120,16 @@ class Tracker:
     def _solve(self, observer: Observer, count: int) -> None:
         """Poses of the window by its own measurements, from its first one on, or from the last settled one on."""
         first = max(count - self._window, 0)
-        window = recent(observer.seen, first)
+        window = observer.drive.since(first)
         if not window.snippets:
             return
-        self._recent.stamps = np.arange(count - first, dtype=np.float64)
-        measured = self._pipeline.measure(self._mode, closed(window, self._sources))
-        self.unit_name = measured.scale.unit_name
+        config, window = self._config, completed(window, self._sources)
+        scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
+        factors = make_factors(window, scale, self._noise, config.frontend, config.geometry)
+        T_odometry = chain_odometry(factors, chain_raw(window.snippets, len(window)), scale)
+        self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None
-        unit = float(np.median(measured.scale.per_frame) if by_keyframes else measured.scale.per_frame[-1])
+        unit = float(np.median(scale.per_frame) if by_keyframes else scale.per_frame[-1])
         if self._unit is None:
             for T in (*self._T_world_camera, self._T_previous_newest):
                 T[:3, 3] *= unit
@@ -130,7 +137,7 @@ class Tracker:
         if by_keyframes:
             return
         kept = max(first, self._settled)
-        T_window_camera = measured.T_odometry[kept - first :]
+        T_window_camera = T_odometry[kept - first :]
         T_world_window = self._T_world_camera[kept] @ invert(T_window_camera[0])
         self._T_world_camera[kept + 1 :] = list(T_world_window @ T_window_camera[1:])
         self._T_previous_newest = invert(self._T_world_camera[-2]) @ self._T_world_camera[-1]

@@ -9,7 +9,7 @@ import numpy as np
 from slam.formats.geographic import write_geojson, write_kml
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
-from slam.pipeline.batch import SlamResult
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
 from slam.results.summary import null
@@ -20,7 +20,7 @@ GEOJSON = "trajectory_optimised.geojson"
 KML = "trajectory_optimised.kml"
 
 
-def gps_metrics(result: SlamResult, in_graph: bool) -> dict[str, Any]:
+def gps_metrics(result: Estimate, in_graph: bool) -> dict[str, Any]:
     """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
     location = result.location
     if not isinstance(location, Location):
@@ -48,7 +48,7 @@ def gps_metrics(result: SlamResult, in_graph: bool) -> dict[str, Any]:
     }
 
 
-def write_places(folder: RunFolder, result: SlamResult, name: str) -> None:
+def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
     """Write the optimised trajectory as paths on the earth, where a GPS track located it."""
     if not isinstance(result.location, Location):
         return

@@ -13,7 +13,8 @@ from slam.mapping.map import TsdfMap
 from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import MapSurface, positions
-from slam.pipeline.batch import Progress, SlamResult
+from slam.pipeline.batch import Progress
+from slam.pipeline.estimate import Estimate
 from slam.results.double_walls import AT_LOOPS, double_walls_at_loops
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
@@ -23,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 def write_map(
-    folder: RunFolder, result: SlamResult, sequence: Sequence, progress: Progress | None = None
+    folder: RunFolder, result: Estimate, sequence: Sequence, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Merge the submaps, write mesh and cloud, and give the numbers of the map; an empty map gives a reason.
 
@@ -48,7 +49,7 @@ def write_map(
     return asdict(result.map.statistics()) | walls | errors
 
 
-def _double_walls(surface: MapSurface, tsdf_map: TsdfMap, result: SlamResult) -> dict[str, Any]:
+def _double_walls(surface: MapSurface, tsdf_map: TsdfMap, result: Estimate) -> dict[str, Any]:
     """Their distances are metres; without these a reason."""
     if not result.scale.is_metric:
         reason = "lengths are not in metres"

@@ -14,7 +14,7 @@ from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
 from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.lidar_odometry import readable_scan
-from slam.pipeline.batch import SlamResult
+from slam.pipeline.estimate import Estimate
 from slam.results.summary import null
 from slam.se3 import FloatArray, Similarity, apply, invert
 from slam.sequences.continued import recording_of, unused_scans
@@ -168,7 +168,7 @@ def no_map_errors(reason: str) -> dict[str, Any]:
     return {key: value for name in names for key, value in null(name, reason).items()}
 
 
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: SlamResult, sequence: Sequence) -> dict[str, Any]:
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> dict[str, Any]:
     """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that

@@ -19,8 +19,8 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
-from slam.pipeline.batch import SlamResult
 from slam.pipeline.doubts import DOUBLED, doubled_frames
+from slam.pipeline.estimate import Estimate
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.summary import (
@@ -38,14 +38,14 @@ from slam.sequences.continued import unused_scans
 from slam.trajectory import Trajectory, associate
 
 
-def lidar_trajectory(result: SlamResult) -> Trajectory | None:
+def lidar_trajectory(result: Estimate) -> Trajectory | None:
     """LiDAR odometry with the stamps of its frames."""
     if not isinstance(result.lidar, LidarPath):
         return None
     return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
 
 
-def _lidar_metrics(result: SlamResult, sequence: Sequence) -> dict[str, Any]:
+def _lidar_metrics(result: Estimate, sequence: Sequence) -> dict[str, Any]:
     """Errors of LiDAR odometry at its frames."""
     path, lidar = result.lidar, lidar_trajectory(result)
     if isinstance(path, MeasurementFailure):
@@ -57,7 +57,7 @@ def _lidar_metrics(result: SlamResult, sequence: Sequence) -> dict[str, Any]:
 
 
 def estimate_metrics(
-    result: SlamResult, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
+    result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
 ) -> dict[str, Any]:
     """All metrics before the map is fused; a missing number is null with its reason."""
     reference = result.reference
@@ -67,7 +67,7 @@ def estimate_metrics(
         "optimised": trajectory_metrics(result.optimised, reference),
         **_lidar_metrics(result, sequence),
     }
-    doubled = dict.fromkeys(doubled_frames(len(sequence), result.observations, result.state), DOUBLED)
+    doubled = dict.fromkeys(doubled_frames(result.drive), DOUBLED)
     metrics: dict[str, Any] = finite(
         {
             "schema": SCHEMA,
@@ -75,11 +75,11 @@ def estimate_metrics(
             "reason": "the run has not ended, or was killed while it made the map",
             "provenance": provenance.described(),
             "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
-            | describe_gaps(result.observations.interpolated)
+            | describe_gaps(result.drive.interpolated)
             | {"doubled": describe_frames(doubled)}
             | {"unreadable_scans": describe_frames(_unreadable_scans(result))}
             | {"continued_at": result.first}
-            | {"segments": [asdict(segment) for segment in result.observations.segments]},
+            | {"segments": [asdict(segment) for segment in result.drive.segments]},
             "timing": describe_timing(result.stopwatch, len(sequence) - result.first),
             "scale": _scale(result),
             "trajectories": trajectories,
@@ -94,29 +94,27 @@ def estimate_metrics(
     return metrics
 
 
-def _unreadable_scans(result: SlamResult) -> Mapping[int, str]:
+def _unreadable_scans(result: Estimate) -> Mapping[int, str]:
     """Frames whose LiDAR scan was left out of the odometry, with the reason."""
     return result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
 
 
-def _tracking(result: SlamResult) -> dict[str, Any]:
+def _tracking(result: Estimate) -> dict[str, Any]:
     """Keyframes, their maps, and what became of them."""
-    state = result.state.keyframes
-    if state is None or not result.observations.maps:
+    drive = result.drive
+    if not drive.maps:
         return null("tracking", "this drive has no map of keyframes: it is measured from step to step")
-    closure = result.observations.closure
-    events = sorted([*state.events, *(() if closure is None else closure.joins)], key=lambda event: event.frame)
     return {
         "tracking": {
-            "keyframes": sum(len(segment.map.keyframes) for segment in result.observations.maps),
-            "maps": len(set(result.observations.window.segments.values())),
-            "events": [asdict(event) for event in events],
+            "keyframes": sum(len(segment.map.keyframes) for segment in drive.maps),
+            "maps": len(set(drive.map_poses.segments.values())),
+            "events": [asdict(event) for event in drive.events],
         }
     }
 
 
 def whole_metrics(
-    metrics: dict[str, Any], result: SlamResult, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
+    metrics: dict[str, Any], result: Estimate, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
 ) -> dict[str, Any]:
     """The metrics of a complete run: those of the estimate, with depth, the map and the final timing."""
     timing = describe_timing(result.stopwatch, len(sequence) - result.first)
@@ -140,16 +138,16 @@ def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
     return numbers
 
 
-def _network_snippets(result: SlamResult) -> SnippetErrors | None:
+def _network_snippets(result: Estimate) -> SnippetErrors | None:
     """The paper's protocol on the network's snippet poses; None without truth or with other snippets."""
-    snippets = result.observations.snippets
+    snippets = result.drive.snippets
     if result.reference is None or len(snippets[0].sources) != 4:
         return None
     predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
     return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
 
 
-def _scale(result: SlamResult) -> dict[str, Any]:
+def _scale(result: Estimate) -> dict[str, Any]:
     scale, estimate = result.scale, result.scale.estimate
     named = {"mode": scale.mode, "unit": scale.unit}
     if isinstance(estimate, MeasurementFailure):
@@ -157,7 +155,7 @@ def _scale(result: SlamResult) -> dict[str, Any]:
     return named | {"value": estimate.value, "spread": estimate.spread, "frames_used": estimate.frames_used}
 
 
-def _graph(result: SlamResult) -> dict[str, Any]:
+def _graph(result: Estimate) -> dict[str, Any]:
     """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
     summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
     if result.reference is None:

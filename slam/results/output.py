@@ -18,7 +18,7 @@ from slam.errors import RunError
 from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
 from slam.results.schema import MetricsFile
-from slam.storage.files import JOURNAL_FILE
+from slam.storage.files import KEYFRAMES_PART
 from slam.storage.json_file import read_json
 
 logger = logging.getLogger(__name__)
@@ -174,7 +174,7 @@ def refuse_file_of_run(path: Path) -> None:
 
 def is_own(name: str) -> bool:
     """Whether a run writes a file of this name."""
-    return name in _OWN or JOURNAL_FILE.fullmatch(name) is not None
+    return name in _OWN or KEYFRAMES_PART.fullmatch(name) is not None
 
 
 def _clear(folder: Path) -> None:

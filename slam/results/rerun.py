@@ -9,8 +9,8 @@ import numpy as np
 
 from slam.errors import EmptyMapError
 from slam.frames import Intrinsics
-from slam.pipeline.batch import SlamResult
-from slam.pipeline.observations import Keyframe
+from slam.frontend.drive import Keyframe
+from slam.pipeline.estimate import Estimate
 from slam.runtime.imports import import_rerun
 from slam.se3 import FloatArray
 from slam.storage.files import write_atomically
@@ -21,7 +21,7 @@ _JPEG_QUALITY = 85
 _POINT_VOXELS = 0.25  # radius of a map point in voxels
 
 
-def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics) -> None:
+def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
     """Write ``.rrd``: on the timeline ``frame`` the camera with image and depth, over all time trajectories and map.
 
     The world is that of the optimised trajectory, y down. Images and depth are those of keyframes,
@@ -46,7 +46,7 @@ def write_rerun(path: Path, result: SlamResult, intrinsics: Intrinsics) -> None:
             if trajectory is not None:
                 strip = rr.LineStrips3D([trajectory.positions], colors=[_COLOURS[name]])
                 stream.log(f"world/{name}", strip, static=True)
-        keyframes = {keyframe.index: keyframe for keyframe in result.observations.keyframes}
+        keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}
         for index, T_world_camera in enumerate(result.optimised.T_world_camera):
             stream.set_time("frame", sequence=index)
             stream.set_time("time", duration=float(result.optimised.stamps[index]))
@@ -74,7 +74,7 @@ def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics
     )
 
 
-def _log_map(rr: Any, stream: Any, result: SlamResult) -> None:
+def _log_map(rr: Any, stream: Any, result: Estimate) -> None:
     if result.map is None:
         return
     try:

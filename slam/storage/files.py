@@ -9,8 +9,8 @@ from pathlib import Path
 from erfsfm import files
 from slam.errors import SlamError
 
-# the state of a pass that has not ended, after so many frames (`slam.pipeline.journal`)
-JOURNAL_FILE = re.compile(r"pass-(?P<kind>part|state|keyframes)-(?P<frames>\d{6,})\.(?:zip|npz)")
+# some keyframes of a pass that has not ended (`slam.pipeline.checkpoint`)
+KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")
 
 
 def write_atomically(

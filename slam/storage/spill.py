@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,14 @@ from slam.errors import SlamError
 
 
 class SpillFile:
-    """An unnamed temporary file; the operating system removes it when the process ends."""
+    """An unnamed temporary file, shared by threads; the operating system removes it when the process ends."""
 
     def __init__(self, what: str = "keyframes") -> None:
         """An empty file; ``what`` names its content in errors."""
         self._what = what
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as this object
         self._end = 0
+        self._lock = Lock()  # the file has one position, which every write and read moves
 
     def put(self, array: NDArray[Any]) -> SpilledArray:
         """Write an array.
@@ -29,17 +31,18 @@ class SpillFile:
         """
         content = np.ascontiguousarray(array)
         try:
-            self._file.seek(self._end)
-            self._file.write(content.data)
-            self._file.flush()
+            with self._lock:
+                start = self._end
+                self._file.seek(start)
+                self._file.write(content.data)
+                self._file.flush()
+                self._end += content.nbytes
         except OSError as error:
             raise SlamError(
                 f"{self._what} cannot be kept in {tempfile.gettempdir()} ({error.strerror or error}): "
                 "make room, set TMPDIR or switch fusion off (mapping.enabled=false)"
             ) from error
-        spilled = SpilledArray(self, self._end, content.shape, content.dtype)
-        self._end += content.nbytes
-        return spilled
+        return SpilledArray(self, start, content.shape, content.dtype)
 
     def read(self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         """An array that was put at ``start``.
@@ -49,8 +52,9 @@ class SpillFile:
         """
         array = np.empty(shape, dtype)
         try:
-            self._file.seek(start)
-            found = self._file.readinto(array.data)  # type: ignore[attr-defined]
+            with self._lock:
+                self._file.seek(start)
+                found = self._file.readinto(array.data)  # type: ignore[attr-defined]
         except OSError as error:
             reason = error.strerror or error
             raise SlamError(f"{self._what} in {tempfile.gettempdir()} cannot be read ({reason})") from error

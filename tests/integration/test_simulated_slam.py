@@ -19,7 +19,8 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
@@ -53,7 +54,7 @@ def street() -> Rendered:
     return Rendered(SimulationOptions("loop", frames=250, seed=1000, width=416, height=128))
 
 
-def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> SlamResult:
+def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> Estimate:
     base, start = (sequence.base, sequence.start) if isinstance(sequence, Excerpt) else (sequence, 0)
     assert isinstance(base, Rendered) and sequence.reference is not None
     oracle = OraclePredictor(
@@ -62,26 +63,26 @@ def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> SlamResul
     return SlamPipeline(sequence, oracle, load_config(None, overrides)).run()
 
 
-def ate(estimate: Trajectory, result: SlamResult) -> float:
+def ate(estimate: Trajectory, result: Estimate) -> float:
     return float(trajectory_metrics(estimate, result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
 @pytest.fixture(scope="module")
-def round_trip(street: Rendered) -> SlamResult:
+def round_trip(street: Rendered) -> Estimate:
     """Once around the block with everything on."""
     return drive(street, 0)
 
 
-def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: SlamResult) -> None:
+def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate) -> None:
     assert len(round_trip.optimised) == 250
-    sources = [motion.relative_pose.source for motion in round_trip.observations.steps]
+    sources = [motion.relative_pose.source for motion in round_trip.drive.steps]
     assert sources.count(ESSENTIAL_SOURCE) > 200
     assert ate(round_trip.network, round_trip) == pytest.approx(1.2, rel=0.2)
     assert ate(round_trip.odometry, round_trip) < 2 * 0.64
     assert ate(round_trip.optimised, round_trip) < 2 * 0.109
 
 
-def test_the_camera_height_gives_metres(street: Rendered, round_trip: SlamResult) -> None:
+def test_the_camera_height_gives_metres(street: Rendered, round_trip: Estimate) -> None:
     estimate = round_trip.scale.estimate
     assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, MeasurementFailure)
     assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
@@ -89,7 +90,7 @@ def test_the_camera_height_gives_metres(street: Rendered, round_trip: SlamResult
     assert round_trip.optimised.length_m == pytest.approx(round_trip.reference.length_m, rel=0.03)
 
 
-def test_the_map_lies_on_the_street(street: Rendered, round_trip: SlamResult) -> None:
+def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> None:
     assert round_trip.map is not None and round_trip.reference is not None
     points = round_trip.map.cloud().points_world[::7]
     assert len(points) > 10_000

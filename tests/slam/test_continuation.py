@@ -19,9 +19,10 @@ from slam import run_slam
 from slam.errors import ConfigError, RunError, SequenceError, SlamError
 from slam.frames import Frame
 from slam.pipeline import batch
+from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
 from slam.pipeline.observer import Observer
 from slam.results.folder import RunFolder
-from slam.storage.files import JOURNAL_FILE
+from slam.storage.files import KEYFRAMES_PART
 
 KILLED = """
 import os, signal, sys
@@ -75,16 +76,15 @@ def whole(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPat
     return run_slam(kitti_root, "sim", frames="0:13", **options).path
 
 
-def journal(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if JOURNAL_FILE.fullmatch(path.name))
+def kept(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name == DRIVE or KEYFRAMES_PART.fullmatch(path.name))
 
 
 def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
     killed_at_ten: Callable[[Path], Path], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     output = killed_at_ten(tmp_path / "run")
-    parts = ["pass-keyframes-000004.npz", "pass-keyframes-000008.npz", "pass-part-000004.zip", "pass-part-000008.zip"]
-    assert journal(output) == [*parts, "pass-state-000008.zip"]
+    assert kept(output) == [DRIVE, "keyframes-000004.npz", "keyframes-000008.npz"]
     monkeypatch.setattr(batch, "EVERY_FRAMES", 2)
     metrics = run_slam(continues=output).metrics()
     assert (metrics["status"], metrics["sequence"]["frames"], metrics["sequence"]["continued_at"]) == ("ok", 13, 8)
@@ -95,17 +95,18 @@ def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
     assert {path.name for path in output.iterdir()} == {path.name for path in whole.iterdir()}
 
 
-def test_states_of_a_carried_camera_are_kept_at_distances_that_grow(
+def test_states_are_kept_at_distances_that_grow(
     kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     overrides = [*OVERRIDES, "window.use=always", "mapping.enabled=false"]
     options: dict[str, Any] = {"weights": tiny_weights, "overrides": overrides, "frames": "0:13"}
     uninterrupted = run_slam(kitti_root, "sim", output=tmp_path / "whole", **options).path
     output, add = tmp_path / "run", Observer.add
-    kept: list[str] = []
+    states: list[int] = []
 
     def add_or_end(self: Observer, index: int, frame: Frame | SequenceError) -> None:
-        kept.extend(name for name in journal(output) if "state" in name)
+        if DRIVE in kept(output):
+            states.append(len(SessionCheckpoint.read(output / DRIVE).state.drive))
         if index == 12:
             raise RunError("ended")
         add(self, index, frame)
@@ -114,7 +115,7 @@ def test_states_of_a_carried_camera_are_kept_at_distances_that_grow(
     with monkeypatch.context() as patched, pytest.raises(RunError, match="ended"):
         patched.setattr(Observer, "add", add_or_end)
         run_slam(kitti_root, "sim", output=output, **options)
-    assert kept == [f"pass-state-{frames:06d}.zip" for frames in (*range(1, 12), 11)]
+    assert states == [*range(1, 12), 11]
     metrics = run_slam(continues=output).metrics()
     assert metrics["sequence"]["continued_at"] == 11
     for name in SAME:
@@ -152,7 +153,7 @@ def test_it_can_be_killed_again_or_have_kept_nothing_yet(
     kill: Callable[..., Path], whole: Path, tmp_path: Path, kitti_root: Path, tiny_weights: Path
 ) -> None:
     output = kill(tmp_path / "run", 2)
-    assert journal(output) == []
+    assert kept(output) == []
     (output / ".1.2.partial.graph.g2o").write_text("half")
     named: dict[str, Any] = {"weights": tiny_weights, "frames": "0:13", "output": output, "continues": output}
     assert run_slam(kitti_root, "sim", **named).metrics()["sequence"]["continued_at"] == 0
@@ -190,11 +191,8 @@ def test_what_does_not_fit_is_refused(
         run_slam(weights="sim", continues=output)
     with pytest.raises(ConfigError, match="geometry cannot be changed"):
         run_slam(overrides=["geometry.enabled=false"], continues=output)
-    (output / "pass-part-000004.zip").unlink()
-    with pytest.raises(RunError, match="4 of 8 frames are there"):
-        run_slam(continues=output)
-    (output / "pass-state-000008.zip").write_bytes(b"PK")
-    with pytest.raises(RunError, match=r"pass-state-000008\.zip is damaged"):
+    (output / DRIVE).write_bytes(b"PK")
+    with pytest.raises(RunError, match=r"drive\.zip is damaged"):
         run_slam(continues=output)
     metrics = json.loads((output / "metrics.json").read_text())
     metrics["provenance"]["recording"]["dataset"] = str(tmp_path / "nowhere")

@@ -14,8 +14,8 @@ import numpy as np
 
 from slam.config import LengthConfig, ScaleMode
 from slam.frames import Ends, RelativePose
+from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_from_road, scale_track
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
@@ -77,43 +77,34 @@ class Scale:
         return float(self.per_frame[min(measured.ends)])
 
 
-@dataclass(frozen=True)
-class LengthMeasurements:
-    """Measurements of one pass: ground planes by frame, triangulated motions and road steps by step."""
-
-    planes: Sequence[GroundPlane | MeasurementFailure]
-    motions: Mapping[Ends, Motion]
-    road_steps: Mapping[Ends, RoadStep]
-    lidar_steps: Sequence[RelativePose] = ()
-
-
 def find_scale(
     mode: ScaleMode,
     camera_height_m: float | None,
-    measured: LengthMeasurements,
+    drive: Drive,
+    lidar_steps: Sequence[RelativePose],
     lengths: LengthConfig,
 ) -> Scale:
     """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps)."""
-    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in measured.lidar_steps}
+    motions, frames = drive.steps.triangulated, len(drive)
+    metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
     height = camera_height_m if mode == "camera-height" else None
     if mode == "lidar":
-        height = _height_by_lidar(metres, measured) or camera_height_m
+        height = _height_by_lidar(metres, drive) or camera_height_m
     unit = 1.0 if height is None else height
-    absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in measured.road_steps.items()}
+    absolute = {ends: (unit * road.length_heights, road.relative_sigma) for ends, road in drive.road_steps.items()}
     if mode == "lidar":
-        sigmas = {pose.ends: float(pose.sigmas[3]) for pose in measured.lidar_steps}
+        sigmas = {pose.ends: float(pose.sigmas[3]) for pose in lidar_steps}
         absolute |= {ends: (length, sigmas[ends] / length) for ends, length in metres.items() if length > 0}
-    by_planes = scale_from_road(measured.planes, height)
-    frames = len(measured.planes)
+    by_planes = scale_from_road(drive.roads, height)
     if isinstance(by_planes, MeasurementFailure):
-        prior_unit = np.full(frames, _unit_by_steps(measured.motions, absolute))
+        prior_unit = np.full(frames, _unit_by_steps(motions, absolute))
     elif absolute:
         # steps of known length measure the drift of the unit; rain or a car ahead biases the learned ground plane
         prior_unit = np.full(frames, by_planes.value)
     else:
-        prior_unit = scale_track(measured.planes, height, by_planes)
-    steps = links(measured.motions, frames)
-    evidence = gather_evidence(steps, measured.motions, absolute, prior_unit)
+        prior_unit = scale_track(drive.roads, height, by_planes)
+    steps = links(motions, frames)
+    evidence = gather_evidence(steps, motions, absolute, prior_unit)
     if not isinstance(by_planes, MeasurementFailure):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
@@ -147,15 +138,15 @@ def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: Flo
     }
 
 
-def _height_by_lidar(metres: Mapping[Ends, float], measured: LengthMeasurements) -> float | None:
+def _height_by_lidar(metres: Mapping[Ends, float], drive: Drive) -> float | None:
     """The camera's height from steps measured by LiDAR and the road, or else by learned planes; None without both."""
-    roads = measured.road_steps
+    roads = drive.road_steps
     heights = [metres[ends] / roads[ends].length_heights for ends in roads if ends in metres]
     if not heights:
         heights = [
             metres[ends] / motion.length_unscaled * plane.height_unscaled
-            for ends, motion in measured.motions.items()
-            if ends in metres and isinstance(plane := measured.planes[ends[0]], GroundPlane)
+            for ends, motion in drive.steps.triangulated.items()
+            if ends in metres and isinstance(plane := drive.roads[ends[0]], GroundPlane)
         ]
     return float(np.median(heights)) if heights else None
 

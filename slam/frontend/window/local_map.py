@@ -91,6 +91,10 @@ class LocalMap:
     keyframes: list[WindowKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
+    def copy(self) -> LocalMap:
+        """A snapshot, which stays while this map grows."""
+        return LocalMap(self.keyframes.copy(), self.points.copy())
+
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
         return np.asarray(np.isfinite(self.points[track_ids, 0]))

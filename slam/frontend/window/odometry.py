@@ -8,7 +8,8 @@ not drift, so each corner is compared with its image in the keyframe, not with t
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,10 @@ class Segment:
     frames: list[TrackedFrame] = field(default_factory=list)
     started: bool = False
 
+    def copy(self) -> Segment:
+        """A snapshot, which stays while this map grows."""
+        return replace(self, map=self.map.copy(), frames=self.frames.copy())
+
 
 @dataclass
 class WindowState:
@@ -74,6 +79,12 @@ class WindowState:
     lost: int = 0
     events: list[TrackingEvent] = field(default_factory=list)
 
+    def copy(self) -> WindowState:
+        """A snapshot, which stays while frames follow."""
+        segments = [segment.copy() for segment in self.segments]
+        places, slipped, events = self.places.copy(), self.slipped.copy(), self.events.copy()
+        return replace(self, segments=segments, places=places, slipped=slipped, events=events)
+
 
 class WindowOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map."""
@@ -85,11 +96,21 @@ class WindowOdometry:
         self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
-        self._state = state or WindowState()
+        self._state = WindowState() if state is None else state.copy()
 
     def state(self) -> WindowState:
-        """The state to resume from."""
-        return self._state
+        """A snapshot to resume from."""
+        return self._state.copy()
+
+    @property
+    def segments(self) -> Sequence[Segment]:
+        """The maps so far, which grow with the frames."""
+        return self._state.segments
+
+    @property
+    def events(self) -> Sequence[TrackingEvent]:
+        """What became of the maps so far."""
+        return self._state.events
 
     def lost_map(self) -> Segment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""

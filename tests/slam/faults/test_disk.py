@@ -190,14 +190,15 @@ def test_a_state_that_cannot_be_kept_is_one_warning(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(batch, "EVERY_FRAMES", 2)
-    note = FailingDisk.note
+    note, failed = FailingDisk.note, []
 
-    def full_for_the_journal(self: FailingDisk, operation: str, path: object) -> None:
-        if operation == "write" and "pass-" in str(path):
+    def full_for_the_state(self: FailingDisk, operation: str, path: object) -> None:
+        if operation == "write" and "drive.zip" in str(path) and not failed:
+            failed.append(path)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         note(self, operation, path)
 
-    monkeypatch.setattr(FailingDisk, "note", full_for_the_journal)
+    monkeypatch.setattr(FailingDisk, "note", full_for_the_state)
     main, words = verbs["run"]
     with FailingDisk("write", 0, tmp_path / "out").mounted():
         assert call(main, words) == 0

@@ -10,11 +10,11 @@ import pytest
 from erfsfm.pose_noise import PoseNoise
 from slam.config import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
-from slam.frontend.factors import Unscaled, chain_odometry, make_factors
+from slam.frontend.drive import Drive
+from slam.frontend.factors import chain_odometry, make_factors, with_lidar
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
-from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.se3 import FloatArray, chain, from_rotation_vector, invert
 
@@ -45,8 +45,8 @@ def pose(first: int, last: int, source: str = "essential", T: FloatArray = TRUE)
     return RelativePose(first, last, invert(T[first]) @ T[last], np.full(6, 0.01), source)
 
 
-def table(steps: list[Ends], T: FloatArray) -> StepTable:
-    return StepTable.of([Motion(pose(*ends, T=T), np.full(3, 0.002)) for ends in steps])
+def motions(steps: list[Ends], T: FloatArray) -> list[Motion]:
+    return [Motion(pose(*ends, T=T), np.full(3, 0.002)) for ends in steps]
 
 
 def snippets(T: FloatArray) -> list[SnippetPoses]:
@@ -63,9 +63,10 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 
 
 def factors(
-    measured: Unscaled, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
+    measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
 ) -> list[RelativePose]:
-    return make_factors(measured, scale, lidar, noise, FrontendConfig(use=use), GeometryConfig())
+    found = make_factors(measured, scale, noise, FrontendConfig(use=use), GeometryConfig())
+    return with_lidar(found, lidar)
 
 
 STEPS = [(0, 1), (1, 2), (2, 5), (5, 6), (6, 7), (8, 9)]
@@ -75,7 +76,9 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
     small = drive(1.0 / METRES)
     interpolated = [pose(7, 8, "interpolated", small)]
     lidar = (pose(3, 4, "lidar"),)  # in metres already
-    found = factors(Unscaled(table(STEPS, small), snippets(small), interpolated), scale(), lidar)
+    found = factors(
+        Drive(motions=motions(STEPS, small), trusted=snippets(small), gap_steps=interpolated), scale(), lidar
+    )
     assert {factor.source for factor in found} == {"essential", "interpolated", "lidar", NETWORK_SOURCE}
     for factor in found:
         np.testing.assert_allclose(factor.T_from_to, invert(TRUE[factor.from_index]) @ TRUE[factor.to_index], atol=1e-9)
@@ -90,7 +93,7 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     wrong = drive(3.0 / METRES)
     lengths = {(0, 1): np.linalg.norm(pose(0, 1).T_from_to[:3, 3]), (2, 5): np.linalg.norm(pose(2, 5).T_from_to[:3, 3])}
     unscaled = {ends: float(length) / METRES for ends, length in lengths.items()}
-    found = {f.ends: f for f in factors(Unscaled(table(STEPS, wrong), [], []), scale(unscaled))}
+    found = {f.ends: f for f in factors(Drive(motions=motions(STEPS, wrong)), scale(unscaled))}
     for ends in lengths:
         np.testing.assert_allclose(found[ends].T_from_to, pose(*ends).T_from_to, atol=1e-9)
         assert found[ends].student_t_dof == STUDENT_T_DOF
@@ -103,7 +106,7 @@ def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
 
 @pytest.mark.parametrize(("use", "noise"), [("gaps", NOISE), ("calibrated", None), ("calibrated", NOISE)])
 def test_network_factors_are_used_where_no_path_of_steps_exists(use: str, noise: PoseNoise | None) -> None:
-    found = factors(Unscaled(table(STEPS, TRUE), snippets(TRUE), []), scale(), use=use, noise=noise)
+    found = factors(Drive(motions=motions(STEPS, TRUE), trusted=snippets(TRUE)), scale(), use=use, noise=noise)
     pairs = {tuple(sorted(f.ends)) for f in found if f.source == NETWORK_SOURCE}
     assert {(2, 3), (3, 4), (4, 5), (2, 4), (3, 5), (7, 8), (7, 9), (6, 8)} <= pairs
     assert not pairs & {(0, 1), (1, 2), (0, 2), (5, 6), (6, 7), (5, 7), (8, 9)}

@@ -141,6 +141,60 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
     assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("scale.mode=camera-height",), "scale mode camera-height needs a known height; images has none"),
+        (
+            ("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]"),
+            "known needs frames of a whole sequence",
+        ),
+        (("lidar.factors=true",), r"lidar\.factors=true needs LiDAR scans of neighbouring frames"),
+    ],
+)
+def test_what_the_settings_need_is_asked_before_the_first_frame(
+    street: Path, tiny_weights: Path, tmp_path: Path, settings: tuple[str, ...], words: str
+) -> None:
+    """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
+    settings = (*SETTINGS, *settings)
+    images, messages = str(street / "images"), []
+    request = LiveRequest(images, Path("fov=70"), str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    with pytest.raises(SlamError, match=words):
+        run_live(request, messages.append)
+    assert messages == [] and not (tmp_path / "live").exists()
+
+
+@pytest.mark.parametrize("frames", [2, 9])
+def test_a_drive_that_fails_leaves_the_poses_that_it_had(
+    street: Path, tiny_weights: Path, tmp_path: Path, frames: int
+) -> None:
+    """After the last of two frames, which are too few, and at the ninth, which nobody listens to."""
+    taken, target, messages = tmp_path / "taken", tmp_path / "images", []
+    taken.mkdir()
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    for path in sorted((street / "images").iterdir())[:frames]:
+        shutil.copy(path, taken)
+    fill(taken, target, messages)
+
+    def listen(message: dict[str, Any]) -> None:
+        messages.append(message)
+        if len(messages) == 9:
+            raise SlamError("nobody listens")
+
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    with pytest.raises(SlamError, match="nobody listens" if frames == 9 else "usable frames"):
+        run_live(request, listen)
+    metrics = json.loads((tmp_path / "live" / "metrics.json").read_text())
+    assert metrics["status"] == "failed" and metrics["reason"]
+    left = np.loadtxt(tmp_path / "live" / "trajectory_odometry.kitti.txt")  # said poses were corrected since
+    np.testing.assert_allclose(left[0], messages[0]["T_world_camera"])
+    assert (np.linalg.norm(np.diff(left[:, 3::4], axis=0), axis=1) > 0).all() == (frames == 9)
+    stamps = np.loadtxt(tmp_path / "live" / "trajectory_odometry.tum.txt")[:, 0]
+    np.testing.assert_allclose(stamps, [message["stamp"] for message in messages])
+    assert not (tmp_path / "live" / "trajectory_optimised.tum.txt").exists()
+
+
 class Scripted:
     """A source of small images that does what its script says: waits, or dies."""
 
@@ -294,10 +348,6 @@ def test_sources_that_are_not_there(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SequenceError, match=r"pipe: it is a pipe that nothing was written to for 0\.1 s"):
         open_source(str(tmp_path / "pipe"), 0.1)
-    with pytest.raises(SlamError, match="choose camera-height"):
-        run_live(
-            LiveRequest("0", overrides=("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]")), print
-        )
 
 
 def test_messages_are_published(tmp_path: Path) -> None:

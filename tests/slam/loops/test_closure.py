@@ -14,7 +14,8 @@ from slam.frames import Frame
 from slam.loops.closure import MOST_REJECTED, close_loops
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.verification import Loop
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray, invert, rotation_angle
 from slam.sequences.simulation.sequence import SimulatedSequence
@@ -32,7 +33,7 @@ def drive(route: str, frames: int, seed: int) -> SimulatedSequence:
     return sequence
 
 
-def run(sequence: SimulatedSequence, *overrides: str) -> SlamResult:
+def run(sequence: SimulatedSequence, *overrides: str) -> Estimate:
     def depth_of(index: int) -> FloatArray:
         depth = sequence.street.render(index).depth.astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
@@ -49,7 +50,7 @@ def is_false(loop: Loop, T_true: FloatArray) -> bool:
     return bool(np.linalg.norm(error[:3, 3]) > 2.0 or rotation_angle(error[:3, :3]) > np.deg2rad(5.0))
 
 
-def ate(result: SlamResult, name: str) -> float:
+def ate(result: Estimate, name: str) -> float:
     return float(trajectory_metrics(getattr(result, name), result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
@@ -77,7 +78,7 @@ def test_switched_off_the_summary_has_the_reason() -> None:
     result = run(drive("straight", 20, 620), "loops.enabled=false")
     summary = result.loops.summary()
     assert summary["candidates"] is None and "loops.enabled" in summary["candidates_reason"]
-    assert result.observations.views == []
+    assert result.drive.views == []
 
 
 def test_features_are_spread_and_bounded() -> None:

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.loops.descriptors import View, hamming
+from slam.frames import View
+from slam.loops.descriptors import hamming
 from slam.loops.retrieval import find_candidates, nearest_words, train_vocabulary
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from slam.config import LoopsConfig
-from slam.frames import LOOP_SOURCE, Intrinsics
+from slam.frames import LOOP_SOURCE, Intrinsics, View
 from slam.loops import verification
-from slam.loops.descriptors import View
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.se3 import FloatArray, apply, from_rotation_vector, invert, rotation_angle

@@ -6,8 +6,8 @@ from slam.config import MappingConfig
 from slam.errors import SlamError
 from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
+from slam.frontend.drive import Keyframe
 from slam.mapping.map import TsdfMap
-from slam.pipeline.observations import Keyframe
 from slam.runtime.imports import import_open3d
 from slam.storage.spill import SpillFile
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -21,7 +21,9 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.growing import GrowingSequence
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
@@ -83,7 +85,7 @@ def road(index: int) -> FloatArray:
     return np.repeat(depth[:, None], 104, axis=1)
 
 
-def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> SlamResult:
+def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_of=road) -> Estimate:
     assert drive.reference is not None
     oracle = OraclePredictor(drive.reference, depth_of, noise, FACTOR)
     return SlamPipeline(drive, oracle, load_config(None, [*NO_IMAGES, *overrides])).run()
@@ -105,8 +107,8 @@ def test_exact_predictions_give_the_true_trajectory() -> None:
     np.testing.assert_allclose(result.network.positions, FACTOR * turning(60)[:, :3, 3], atol=1e-9)
     for each in (result.odometry, result.optimised):
         np.testing.assert_allclose(each.T_world_camera, turning(60), atol=1e-3)
-    assert result.map is None and len(result.observations.steps) == 0
-    assert len(result.observations.snippets) == 56 and len(result.factors) == 4 * 56
+    assert result.map is None and len(result.drive.steps) == 0
+    assert len(result.drive.snippets) == 56 and len(result.factors) == 4 * 56
 
 
 def test_the_graph_reduces_the_noise_of_the_pose_network() -> None:
@@ -184,7 +186,9 @@ def test_what_can_work_is_not_refused() -> None:
     drive = LevelRoad(turning(30))
     for setting, mode in (("auto", "camera-height"), ("reference", "reference"), ("none", "none")):
         config = load_config(None, [*NO_IMAGES, f"scale.mode={setting}"])
-        assert SlamPipeline(drive, OraclePredictor(turning(30), road), config).require_possible() == mode
+        pipeline = SlamPipeline(drive, OraclePredictor(turning(30), road), config)
+        pipeline.require_possible()
+        assert pipeline.mode == mode
     assert drive.frames_read == 0
 
 
@@ -255,7 +259,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     noise = OracleNoise(np.deg2rad(0.3))
     options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
     result = run(still, *options, noise=noise)
-    assert {factor.source for factor in result.observations.steps.relative_poses} == {STILL_SOURCE}
+    assert {factor.source for factor in result.drive.steps.relative_poses} == {STILL_SOURCE}
     rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
     assert rotation[1] < 0.3 * rotation[0]
     np.testing.assert_array_equal(result.odometry.T_world_camera, still.reference)
@@ -263,8 +267,8 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
 
 def test_images_without_corners_leave_only_network_factors() -> None:
     result = run(LevelRoad(turning(20)), "geometry.enabled=true")
-    assert len(result.observations.steps) == 0
-    pairs = [(first, second) for first, second, _ in result.observations.failures]
+    assert len(result.drive.steps) == 0
+    pairs = [(first, second) for first, second, _ in result.drive.failures]
     assert pairs == [(k, k + 1) for k in range(19)]
     np.testing.assert_allclose(result.optimised.T_world_camera, turning(20), atol=1e-3)
 
@@ -281,7 +285,7 @@ def drive_street(
     use: str = "calibrated",
     mode: str = "auto",
     sky: float = 200.0,
-) -> SlamResult:
+) -> Estimate:
     oracle = OraclePredictor(
         street.reference,
         lambda k: np.where((depth := street.base.street.render(street.start + k).depth) > 0, depth, sky),
@@ -314,7 +318,7 @@ def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     calls: list[tuple[str, int, int]] = []
     result = drive_street(street, lambda *words: calls.append(words))
     assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
-    seen = result.observations
+    seen = result.drive
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     measured = {first for first, _ in seen.steps.motions}
     by_network = [f for f in result.factors if f.source == "network"]
@@ -324,6 +328,20 @@ def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     assert all(np.array_equal(image, street.frame(index).image) for index, image, _ in seen.examples)
     assert result.map is not None and result.map.statistics().triangles > 5000
     assert {"read", "depth network", "pose network", "geometry", "graph", "map"} <= set(result.stopwatch.stages)
+
+
+def test_examples_are_spread_over_a_drive_that_grows(street: Excerpt) -> None:
+    oracle = OraclePredictor(street.reference, lambda k: np.ones((64, 208)), NO_NOISE, FACTOR)
+    growing = GrowingSequence(street.intrinsics, street.camera_height_m)
+
+    def arriving() -> Iterator[Frame]:
+        for k in range(len(street)):
+            growing.stamps = street.stamps[: k + 1]
+            yield street.frame(k)
+
+    settings = load_config(None, ["geometry.enabled=false", "mapping.enabled=false", "loops.enabled=false"])
+    seen = SlamPipeline(growing, oracle, settings).estimate(frames=arriving()).drive
+    assert [index for index, _, _ in seen.examples] == [0, 4, 8, 12, 16, 20, 24]
 
 
 def test_without_metres_the_map_is_as_fine_as_the_scene_is_near(street: Excerpt) -> None:
@@ -359,6 +377,6 @@ def test_calibrated_network_factors_are_used_at_every_step(street: Excerpt) -> N
 def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
     settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "geometry.enabled=false"])
-    seen = SlamPipeline(street, oracle, settings).run().observations
+    seen = SlamPipeline(street, oracle, settings).run().drive
     assert [keyframe.index for keyframe in seen.keyframes] == [0, 5, 10, 15, 20]
     assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)

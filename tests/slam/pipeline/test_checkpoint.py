@@ -251,13 +251,13 @@ def test_folders_that_cannot_be_continued(go_on: Callable[..., RunFolder], begun
 def test_damage_anywhere_in_the_keyframes_is_one_error_or_none(begun: RunFolder, tmp_path: Path) -> None:
     """Compressed archives fail in several ways, in zlib among them."""
     folder = Path(shutil.copytree(begun.path, tmp_path / "damaged"))
-    path, intact = folder / KEYFRAMES, SessionCheckpoint.open(folder).state.seen.keyframes
+    path, intact = folder / KEYFRAMES, SessionCheckpoint.open(folder).state.drive.keyframes
     whole = path.read_bytes()
     refused = 0
     for start in range(0, len(whole), len(whole) // 60):
         path.write_bytes(whole[:start] + bytes(255 - byte for byte in whole[start : start + 8]) + whole[start + 8 :])
         try:
-            keyframes = SessionCheckpoint.open(folder).state.seen.keyframes
+            keyframes = SessionCheckpoint.open(folder).state.drive.keyframes
         except RunError as error:
             assert "keyframes.npz is damaged" in str(error)
             refused += 1

@@ -1,4 +1,5 @@
 import importlib.util
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 from slam import Slam
 from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, RelativePose
+from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
+from slam.pipeline.checkpoint import SERIALISER
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
-from slam.pipeline.observations import Observations
-from slam.pipeline.observer import Observer
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
 from slam.se3 import chain, from_rotation_vector
@@ -22,13 +24,13 @@ room = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(room)
 
 
-def steps(count: int, scatter: float) -> Observations:
+def steps(count: int, scatter: float) -> Drive:
     rng = np.random.default_rng(0)
     motions = []
     for k in range(count):
         T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, scatter, 3))
         motions.append(Motion(RelativePose(k, k + 1, T, np.ones(6), "essential"), np.ones(3)))
-    return Observations(motions=motions)
+    return Drive(motions=motions)
 
 
 @pytest.mark.parametrize(("count", "scatter", "vehicle"), [(60, 0.02, True), (60, 1.0, False), (20, 0.02, None)])
@@ -59,10 +61,10 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
             observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
-        closed = observer.closed()
-    started = min(closed.window.segments)
-    assert started < 10 and len(closed.window.segments) == 40 - len(blank) - started
-    late = [motion.ends for motion in observer.seen.motions if motion.ends[0] > 19]
+        closed = observer.completed()
+    started = min(closed.map_poses.segments)
+    assert started < 10 and len(closed.map_poses.segments) == 40 - len(blank) - started
+    late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
     assert late == [(23, 26), (31, 32), (32, 33), (33, 34)]
     assert set(closed.interpolated) == {*blank, *repeated}
 
@@ -83,14 +85,42 @@ def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: 
             observer.add(k, room.frame(k, T))
             if k in interrupted:
                 observer.state()
-        state, closed = observer.state(), observer.closed()
+        state, closed = observer.state(), observer.completed()
     assert state.keyframes is not None
     keyframes = state.keyframes.segments[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)
     late = {k for k in predicted if k >= 20}
     assert late == {22, 26, 30, 34, 38} | {keyframe.index for keyframe in keyframes if keyframe.index >= 20}
-    assert [snippet.target for snippet in closed.gaps.trusted if snippet.target > 18] == [22, 26, 30, 34]
-    assert len(closed.gaps.trusted[0].sources) == 4 and not closed.interpolated
+    assert [snippet.target for snippet in closed.trusted if snippet.target > 18] == [22, 26, 30, 34]
+    assert len(closed.trusted[0].sources) == 4 and not closed.interpolated
+
+
+def written(state: FrontEndState, path: Path) -> list[bytes]:
+    SERIALISER.write(path, state)
+    with zipfile.ZipFile(path) as file:
+        return [file.read(name) for name in file.namelist()]
+
+
+def test_a_state_stays_as_it_was_given_out(tmp_path: Path) -> None:
+    """While frames follow, in the front end that gave it out and in another that resumed from it."""
+    truth = room.walk(40)
+    oracle = OraclePredictor(truth, lambda k: room.depth_map(truth[k]))
+
+    def observer(state: FrontEndState | None = None) -> Observer:
+        return Observer(oracle, room.INTRINSICS, KEYFRAMES_ALONE, Stopwatch(), state=state)
+
+    with observer() as first:
+        for k in range(26):
+            first.add(k, room.frame(k, truth[k]))
+        state = first.state()
+        before = written(state, tmp_path / "before")
+        with observer(state) as second:
+            for k in range(26, 40):
+                first.add(k, room.frame(k, truth[k]))
+                second.add(k, room.frame(k, truth[k]))
+            after = [written(each.state(), tmp_path / "after") for each in (first, second)]
+    assert state.keyframes is not None and state.keyframes.segments[-1].started
+    assert written(state, tmp_path / "again") == before and after[0] == after[1] != before
 
 
 def test_what_keyframes_measured_stays_when_the_camera_is_lost() -> None:

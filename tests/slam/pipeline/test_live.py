@@ -128,12 +128,14 @@ def test_wrong_frames_and_modes_are_refused() -> None:
         with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
             slam.add_frame(image, stamp)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
-    with pytest.raises(SlamError, match="reference needs a whole sequence"):
+    with pytest.raises(SlamError, match="reference needs true poses; live has none"):
         started(load_config(None, ["scale.mode=reference"]))
-    with pytest.raises(SlamError, match=r"lidar\.factors=true needs a whole sequence"):
+    with pytest.raises(SlamError, match=r"lidar\.factors=true needs LiDAR scans"):
         started(load_config(None, ["lidar.factors=true"]))
-    with pytest.raises(SlamError, match="needs camera_height_m"):
+    with pytest.raises(SlamError, match="camera-height needs a known height; live has none"):
         Slam(oracle(), drive().intrinsics, load_config(None, ["scale.mode=camera-height"]))
+    with pytest.raises(SlamError, match="known needs frames of a whole sequence, and live grows"):
+        started(load_config(None, ["scale.mode=known", "scale.known_between=[0,5]", "scale.known_m=3"]))
 
 
 @pytest.mark.parametrize("image", [None, [[1]], "image.png"])
@@ -255,7 +257,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
         assert len(failed) == 1 and 8 < failed[0] <= 11
         trajectory = slam.trajectory()
         slam.save(tmp_path / "drive.zip")
-    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.seen.unusable
+    unusable = SessionCheckpoint.read(tmp_path / "drive.zip").state.drive.unusable
     if question == "depth":
         assert unusable.pop(8) == "it could not be measured (out of memory at frame 8)"
     assert set(unusable) <= {9, 10}, "the black frame, or the one that was measured when the snippet failed"

@@ -9,13 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from slam.config import SlamConfig, WindowConfig
-from slam.frames import RelativeSimilarity
+from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.odometry import WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
 from slam.loops import maps
-from slam.loops.descriptors import View
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
@@ -149,8 +148,8 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
 ) -> None:
     """As by a session that is resumed after every frame, and remembers no earlier map."""
     truth = there_and_back(110, roll=0.4, closer=0.3)[places]
-    config, states = WindowConfig(max_corners=400, use="always"), [WindowState(), WindowState()]
-    going_on, resumed = (KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, state) for state in states)
+    config = WindowConfig(max_corners=400, use="always")
+    going_on, resumed = (KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, WindowState()) for _ in range(2))
     for k, T in enumerate(truth):
         frame, depth = room.frame(k, T, 9 if k in unseen else 0), room.depth_map(T)
         for tracking in (going_on, resumed):
@@ -159,8 +158,8 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
                 tracking.learn(frame, depth)
                 tracking.look_for_lost(frame, depth)
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
-    assert [each.frame for each in states[0].events if each.event == "relocalised"] == relocalised
-    assert states[0].events == states[1].events
+    assert [each.frame for each in going_on.events if each.event == "relocalised"] == relocalised
+    assert going_on.events == resumed.events
 
 
 def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:

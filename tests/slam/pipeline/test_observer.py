@@ -21,10 +21,11 @@ from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.doubts import doubled_frames
-from slam.pipeline.observer import Observer, ObserverState
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.reading import read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.timing import Stopwatch
@@ -119,13 +120,13 @@ def config_with(*overrides: str) -> SlamConfig:
     return load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", *overrides])
 
 
-def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> SlamResult:
+def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> Estimate:
     sequence = Damaged(street(), damage, bad)
     return SlamPipeline(sequence, oracle_of(sequence), config_with("mapping.width_px=104", *overrides)).run()
 
 
 @functools.cache
-def run_on(damage: Damage) -> tuple[SlamResult, str]:
+def run_on(damage: Damage) -> tuple[Estimate, str]:
     """A run with ten damaged frames, and its warnings."""
     lines: list[str] = []
 
@@ -142,7 +143,7 @@ def run_on(damage: Damage) -> tuple[SlamResult, str]:
         logger.removeHandler(listing)
 
 
-def ate(result: SlamResult) -> float:
+def ate(result: Estimate) -> float:
     return float(trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
@@ -155,7 +156,7 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     for each in (result.network, result.odometry, result.optimised):
         assert len(each) == FRAMES and np.isfinite(each.T_world_camera).all()
         np.testing.assert_array_equal(each.T_world_camera[0], np.eye(4))
-    seen = result.observations
+    seen = result.drive
     assert set(seen.interpolated) == set(BAD)
     assert warnings.count("are interpolated") == warnings.count("frames 25 to 34 are interpolated") == 1
     interpolated = [factor for factor in result.factors if factor.source == INTERPOLATED_SOURCE]
@@ -183,8 +184,8 @@ def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     sequence = Doubled(street(), black, range(0))
     sequence.reference = street().reference[rows]
     result = SlamPipeline(sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")).run()
-    assert doubled_frames(FRAMES, result.observations, result.state) == [21, 42]
-    assert result.observations.interpolated == {} and ate(result) < 0.6
+    assert doubled_frames(result.drive) == [21, 42]
+    assert result.drive.interpolated == {} and ate(result) < 0.6
 
 
 def rolling_exposure(sequence: SimulatedSequence, index: int) -> Frame:
@@ -210,16 +211,16 @@ def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> 
 
 
 def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
-    assert (result := run(bad=range(0))).observations.interpolated == {}
-    assert doubled_frames(FRAMES, result.observations, result.state) == []
+    assert (result := run(bad=range(0))).drive.interpolated == {}
+    assert doubled_frames(result.drive) == []
 
 
-def observe(frames: int, state: ObserverState | None, damage: Damage, bad: range, *overrides: str) -> ObserverState:
+def observe(frames: int, state: FrontEndState | None, damage: Damage, bad: range, *overrides: str) -> FrontEndState:
     """The state after so many frames of a damaged drive, from a state on."""
     sequence = Damaged(street(), damage, bad)
     config = config_with("mapping.enabled=false", "geometry.enabled=false", *overrides)
     with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state) as observer:
-        for index in range(0 if state is None else len(state.seen.roads), frames):
+        for index in range(0 if state is None else len(state.drive.roads), frames):
             observer.add(index, read_frame(sequence, index))
         return observer.state()
 
@@ -227,9 +228,9 @@ def observe(frames: int, state: ObserverState | None, damage: Damage, bad: range
 def test_missing_images_never_end_a_run_and_unreadable_ones_do() -> None:
     """Forty missing in a row are a gap in time; the thirty-first unreadable one is an error."""
     state = observe(50, None, missing, range(8, 48))
-    assert sorted(state.seen.unusable) == list(range(8, 48)) and state.unread == 0
+    assert sorted(state.drive.unusable) == list(range(8, 48)) and state.unread == 0
     state = observe(38, None, unreadable, range(8, 48))
-    assert sorted(state.seen.unusable) == list(range(8, 38)) and state.unread == 30
+    assert sorted(state.drive.unusable) == list(range(8, 38)) and state.unread == 30
     with pytest.raises(SequenceError, match=r"image 38\.png is truncated"):
         observe(39, state, unreadable, range(8, 48))
 
@@ -267,7 +268,7 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on() -> None:
             going_on.add(index, frame)
             flushed.add(index, Frame(index, frame.stamp, frame.image))
             flushed.flush()
-            assert len(flushed.state().seen.roads) == flushed.frames == going_on.frames == index + 1
+            assert len(flushed.state().drive) == flushed.frames == going_on.frames == index + 1
         assert_same(going_on, flushed)
 
 
@@ -275,7 +276,7 @@ def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_p
     sequence = Damaged(street(), black, range(12, 14))
     config = config_with("mapping.enabled=false")
 
-    def begin(state: ObserverState | None = None) -> Observer:
+    def begin(state: FrontEndState | None = None) -> Observer:
         return Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state)
 
     with begin() as going_on:
@@ -293,7 +294,7 @@ def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_p
 
 def assert_same(one: Observer, other: Observer) -> None:
     """Both have measured the same bytes, of every kind."""
-    first, second = one.closed(), other.closed()
+    first, second = one.completed(), other.completed()
     assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 15
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (

@@ -11,7 +11,8 @@ from slam.errors import ConfigError, SlamError
 from slam.frames import Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.geodesy import GpsTrack, LocalFrame
-from slam.pipeline.batch import SlamPipeline, SlamResult
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
@@ -62,12 +63,12 @@ def track(rng: np.random.Generator, sigma_m: float, outliers: int = 0) -> GpsTra
     return GpsTrack(stamps, LocalFrame(PLACE).places(points), np.ones(len(stamps)))
 
 
-def run(gps: GpsTrack | None, *overrides: str, noise: OracleNoise | None = None) -> SlamResult:
+def run(gps: GpsTrack | None, *overrides: str, noise: OracleNoise | None = None) -> Estimate:
     oracle = OraclePredictor(path(), depth, noise or OracleNoise(), 0.2)
     return SlamPipeline(drive(), oracle, load_config(None, [*SETTINGS, *overrides]), gps_track=gps).run()
 
 
-def worst(result: SlamResult) -> float:
+def worst(result: Estimate) -> float:
     """Largest distance from the truth, without any alignment, metres."""
     return float(np.linalg.norm(result.optimised.positions - path()[:, :3, 3], axis=1).max())
 

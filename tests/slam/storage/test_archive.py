@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError, SlamError
-from slam.frames import Intrinsics
-from slam.loops.descriptors import View
+from slam.frames import Intrinsics, View
 from slam.loops.places import Places
 from slam.pipeline.checkpoint import SessionCheckpoint, read_keyframes, write_keyframes
 from slam.pipeline.observer import Keyframe

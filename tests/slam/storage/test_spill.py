@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,17 @@ def test_arrays_come_back_in_any_order() -> None:
     for array, each in reversed(list(zip([*arrays, arrays[0]], kept, strict=True))):
         np.testing.assert_array_equal(each.read(), array)
         assert each.read().dtype == array.dtype
+
+
+def test_threads_read_while_others_write() -> None:
+    spill_file = SpillFile()
+
+    def write_and_read(number: int) -> bool:
+        kept = [spill_file.put(np.full(2000, 1000 * number + k)) for k in range(50)]
+        return all((each.read() == 1000 * number + k).all() for k, each in enumerate(kept))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(write_and_read, range(40)))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")

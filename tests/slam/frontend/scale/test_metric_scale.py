@@ -10,8 +10,9 @@ import pytest
 from slam import se3
 from slam.config import LengthConfig
 from slam.frames import Ends, RelativePose
+from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.scale.metric_scale import LengthMeasurements, Scale, find_scale
+from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import ScaleEstimate
@@ -37,19 +38,19 @@ def step(ends: Ends, unit: float, source: str) -> RelativePose:
 
 def measured(
     road=True, planes=True, bias: float = 1.0, lidar: int = 0, height_m: float = HEIGHT_M, steps=SINGLE
-) -> LengthMeasurements:
+) -> tuple[Drive, list[RelativePose]]:
     """A straight drive; ``bias`` makes the learned road lie too near, the first ``lidar`` steps have scans."""
-    motions = {ends: Motion(step(ends, UNIT, "essential"), np.zeros(3)) for ends in steps}
+    motions = [Motion(step(ends, UNIT, "essential"), np.zeros(3)) for ends in steps]
     plane: GroundPlane | MeasurementFailure = (
         GroundPlane(bias * HEIGHT_M * UNIT, DOWN, 1.0) if planes else MeasurementFailure("dark")
     )
     roads = {ends: RoadStep(metres(ends) / height_m, 0.06, DOWN) for ends in steps} if road else {}
     scans = [step(ends, 1.0, "lidar") for ends in SINGLE[:lidar]]
-    return LengthMeasurements([plane] * FRAMES, motions, roads, scans)
+    return Drive(roads=[plane] * FRAMES, motions=motions, road_steps=roads), scans
 
 
-def find(mode, measurements: LengthMeasurements, height_m: float | None = HEIGHT_M) -> Scale:
-    return find_scale(mode, height_m, measurements, LengthConfig())
+def find(mode, measurements: tuple[Drive, list[RelativePose]], height_m: float | None = HEIGHT_M) -> Scale:
+    return find_scale(mode, height_m, *measurements, LengthConfig())
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:
@@ -133,7 +134,7 @@ def test_lengths_are_unscaled_by_the_unit_at_their_first_frames():
     steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
     drifting = np.linspace(1.0, 1.1, FRAMES)
     planes = [GroundPlane(HEIGHT_M * UNIT / unit, DOWN, 1.0) for unit in drifting]
-    scale = find("camera-height", replace(measured(road=False, steps=steps), planes=planes))
+    scale = find("camera-height", (replace(measured(road=False, steps=steps)[0], roads=planes), []))
     assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
     for ends in steps:
         assert scale.lengths[ends].value == pytest.approx(UNIT * metres(ends), rel=1e-4)

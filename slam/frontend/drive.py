@@ -1,0 +1,203 @@
+"""The measurements of one drive: collected frame by frame, then completed after the last frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from slam.config import MappingConfig
+from slam.depth_sampling import resized_depth
+from slam.frames import DepthMap, Ends, Frame, Image, RelativePose, SnippetPoses, TrackingEvent, View
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.scale.road_homography import RoadStep
+from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.segments import Segment
+from slam.frontend.step_table import StepTable
+from slam.frontend.visual.motion import Motion
+from slam.frontend.visual.relative_rotation import RelativeRotation
+from slam.frontend.window.odometry import Segment as MapSegment
+from slam.frontend.window.relative_poses import WindowPoses
+from slam.storage.spill import SpilledArray, SpillFile
+
+T = TypeVar("T")
+
+_EXAMPLES, _MOST_EXAMPLES = 5, 8
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame for fusion, thinned and spilled to disk."""
+
+    index: int
+    spilled_image: SpilledArray
+    spilled_depth: SpilledArray
+
+    @classmethod
+    def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile, config: MappingConfig) -> Keyframe:
+        """Thin a frame and its depth ``(H, W)`` to about ``width_px`` and spill both."""
+        height, width = depth_unscaled.shape
+        ratio = min(config.width_px / width, 1.0)
+        image, depth = frame.image, depth_unscaled
+        if ratio < 1.0:
+            size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
+            depth = resized_depth(depth, *size)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return cls(frame.index, spill_file.put(image), spill_file.put(depth))
+
+    @property
+    def image(self) -> Image:
+        """``(h, w, 3)``."""
+        return self.spilled_image.read()
+
+    @property
+    def depth_unscaled(self) -> DepthMap:
+        """``(h, w)``."""
+        return self.spilled_depth.read()
+
+
+class Examples:
+    """Chooses frames to keep whole for the report, evenly spread over a drive.
+
+    Of a recording there are five, known before its first frame. Of a drive that grows, whose end nobody knows, every
+    frame of a stride is kept, and the stride doubles where more than eight would be.
+    """
+
+    def __init__(self, recording: range | None = None) -> None:
+        """Choose among the frames of a recording; None is a drive that grows."""
+        self._stride = 1
+        self._frames: frozenset[int] | None = None
+        if recording is not None:
+            spread = np.linspace(recording.start, recording.stop - 1, _EXAMPLES + 2).round().astype(int)
+            self._frames = frozenset(spread[1:-1].tolist())
+
+    def __contains__(self, index: int) -> bool:
+        return index % self._stride == 0 if self._frames is None else index in self._frames
+
+    def keep(self, frame: Frame, depth: DepthMap, kept: list[tuple[int, Image, DepthMap]]) -> None:
+        """Add a chosen frame with its depth ``(H, W)`` to those that are kept."""
+        kept.append((frame.index, frame.image, depth))
+        if self._frames is None and len(kept) > _MOST_EXAMPLES:
+            self._stride *= 2
+            kept[:] = [example for example in kept if example[0] in self]
+
+
+@dataclass
+class Drive:
+    """Measurements of a drive in the networks' unit of length.
+
+    Collected frame by frame, each list and dictionary growing at its end:
+        ``motions`` are all steps that image geometry measured, ``road_steps`` the lengths by the road's homography,
+        ``relative_rotations`` the rotations across several steps; ``failures`` are unmeasured steps with the reason.
+        ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
+        frames with the image of the one before, ``moving`` those of them just before which the camera moved.
+
+    Added by `slam.frontend.gap_interpolation.completed`, which also leaves out views and keyframes of interpolated
+    frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
+        ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
+        with the reason, ``gap_steps`` their steps. ``maps`` are those of keyframes, ``map_poses`` the poses by them and
+        ``events`` what became of them; a drive measured by steps alone has none.
+    """
+
+    snippets: list[SnippetPoses] = field(default_factory=list)
+    motions: list[Motion] = field(default_factory=list)
+    road_steps: dict[Ends, RoadStep] = field(default_factory=dict)
+    relative_rotations: list[RelativeRotation] = field(default_factory=list)
+    failures: list[tuple[int, int, str]] = field(default_factory=list)
+    roads: list[GroundPlane | MeasurementFailure] = field(default_factory=list)
+    views: list[View] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
+    examples: list[tuple[int, Image, DepthMap]] = field(default_factory=list)
+    unusable: dict[int, str] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
+    moving: list[int] = field(default_factory=list)
+
+    trusted: list[SnippetPoses] = field(default_factory=list)
+    interpolated: dict[int, str] = field(default_factory=dict)
+    gap_steps: list[RelativePose] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
+    maps: list[MapSegment] = field(default_factory=list)
+    map_poses: WindowPoses = field(default_factory=WindowPoses)
+    events: list[TrackingEvent] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.roads)
+
+    @property
+    def steps(self) -> StepTable:
+        """The steps of image geometry by their frames."""
+        return StepTable.of(self.motions)
+
+    def repeat(self, index: int, moving: bool) -> None:
+        """Add a frame with the image of the one before."""
+        self.repeated.append(index)
+        if moving:
+            self.moving.append(index)
+
+    def copy(self) -> Drive:
+        """A snapshot: what is measured later is added to one of both alone."""
+        return Drive(**{name: values.copy() for name, values in self.collected().items()})
+
+    def collected(self) -> dict[str, Any]:
+        """The lists and dictionaries that grow with the frames, by name."""
+        return {name: getattr(self, name) for name in _COLLECTED}
+
+    def since(self, first: int) -> Drive:
+        """What was measured from frame ``first`` on, which becomes frame 0; without views and keyframes.
+
+        It takes as long as there are frames since, however long the drive.
+        """
+
+        def last(items: Iterable[T], start: Callable[[T], int]) -> list[T]:
+            """The items that begin in the window, of items in order of time that may span a few frames."""
+            return list(takewhile(lambda item: start(item) >= first, items))[::-1]
+
+        return Drive(
+            snippets=[
+                replace(s, target=s.target - first, sources=tuple(source - first for source in s.sources))
+                for s in last(reversed(self.snippets), lambda s: min(s.sources))
+            ],
+            motions=[
+                replace(motion, relative_pose=_moved(motion.relative_pose, first))
+                for motion in last(reversed(self.motions), lambda m: m.ends[0])
+            ],
+            road_steps={
+                (ends[0] - first, ends[1] - first): step
+                for ends, step in last(reversed(self.road_steps.items()), lambda item: item[0][0])
+            },
+            relative_rotations=[
+                _moved(rotation, first) for rotation in last(reversed(self.relative_rotations), lambda r: min(r.ends))
+            ],
+            failures=[(a - first, b - first, why) for a, b, why in last(reversed(self.failures), lambda f: f[0])],
+            roads=self.roads[first:],
+            unusable={k - first: why for k, why in last(reversed(self.unusable.items()), lambda item: item[0])},
+            repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
+        )
+
+    def with_maps(self, poses: WindowPoses, joins: Iterable[TrackingEvent]) -> Drive:
+        """The same with poses by joined maps, which also relate segments of the drive that lie in one map."""
+        segments: list[Segment] = []
+        for segment in self.segments:
+            if segments and poses.relates(segment.first):
+                segments[-1] = replace(segments[-1], last=segment.last)
+            else:
+                segments.append(segment)
+        events = sorted([*self.events, *joins], key=lambda event: event.frame)
+        return replace(self, map_poses=poses, segments=segments, events=events)
+
+
+_COLLECTED = (
+    *("snippets", "motions", "road_steps", "relative_rotations", "failures", "roads"),
+    *("views", "keyframes", "examples", "unusable", "repeated", "moving"),
+)
+
+_Between = TypeVar("_Between", RelativePose, RelativeRotation)
+
+
+def _moved(measured: _Between, first: int) -> _Between:
+    return replace(measured, from_index=measured.from_index - first, to_index=measured.to_index - first)

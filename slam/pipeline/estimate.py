@@ -1,0 +1,44 @@
+"""The estimate of a drive: the trajectory that fits its measurements, and everything it was made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam.frames import RelativePose
+from slam.frontend.drive import Drive
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import LidarPath
+from slam.frontend.scale.metric_scale import Scale
+from slam.loops.closure import LoopClosures
+from slam.mapping.map import TsdfMap
+from slam.pipeline.observer import FrontEndState
+from slam.pipeline.positioning import Location
+from slam.pose_graph import PoseGraph
+from slam.runtime.timing import Stopwatch
+from slam.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Trajectories with one row a frame, the factors and loops they fit, the graph, and the map once it is fused.
+
+    ``drive`` is completed, its rotations smoothed. ``state`` is that of the front end, for a run that continues this
+    one; frames before ``first`` are of earlier runs. ``location`` is None without a GPS track, and the reason where the
+    track cannot be used.
+    """
+
+    network: Trajectory
+    odometry: Trajectory
+    optimised: Trajectory
+    lidar: LidarPath | MeasurementFailure | None
+    reference: Trajectory | None
+    drive: Drive
+    state: FrontEndState
+    scale: Scale
+    factors: list[RelativePose]
+    loops: LoopClosures
+    graph: PoseGraph
+    location: Location | MeasurementFailure | None
+    first: int
+    stopwatch: Stopwatch
+    map: TsdfMap | None = None

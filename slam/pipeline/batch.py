@@ -201,8 +201,8 @@ class SlamPipeline:
             return seen.closure.closures(measured.scale)
         with self._watch.stage("loops"):
             scaled = [view.scaled(float(measured.scale.per_frame[view.index])) for view in seen.views]
-            intrinsics, config = self._sequence.intrinsics, self._config.loops
-            return close_loops(scaled, measured.T_odometry, intrinsics, config, self._get_or_compute, self._seed)
+            intrinsics, config, is_metric = self._sequence.intrinsics, self._config.loops, measured.scale.is_metric
+            return close_loops(scaled, measured.T_odometry, intrinsics, config, is_metric, self._seed)
 
     def fuse(
         self,

@@ -111,7 +111,7 @@ class Observer:
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
-        self._features = FeatureExtractor(intrinsics, get_or_compute)
+        self._features = FeatureExtractor(intrinsics)
         self._window: tuple[Frame, ...] = () if state is None else state.window
         self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
         self._unread = 0 if state is None else state.unread

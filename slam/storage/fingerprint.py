@@ -49,7 +49,7 @@ def sources(root: Path) -> list[Path]:
 
 
 def _imported(path: Path) -> Iterator[str]:
-    """Names that a file imports, with the folders around them; the doors of both packages compute nothing themselves."""
+    """Names that a file imports, with the folders around them; the doors of both packages compute nothing."""
     for node in ast.walk(ast.parse(path.read_bytes())):
         names: list[str] = []
         if isinstance(node, ast.Import):

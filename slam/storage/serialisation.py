@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slam.errors import RunError
 from slam.storage.archive import opened_archive
 
-_FORMAT = 3
+_FORMAT = 4
 Tree = Any  # of JSON
 
 

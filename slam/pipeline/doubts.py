@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 
 from slam.frames import runs
-from slam.frontend.moving_cover import crossings
 from slam.pipeline.observations import ClosedObservations
 from slam.pipeline.observer import ObserverState
 
@@ -38,13 +37,6 @@ def warn_of_doubts(frames: int, seen: ClosedObservations, state: ObserverState) 
             "exposure, or its flicker under lamps",
             gate.exposed,
             gate.compared,
-        )
-    for first, last in crossings(gate.crossed):
-        logger.warning(
-            "frames %d to %d: something uniform moves over the images, such as a windscreen wiper: their poses are "
-            "less certain",
-            first,
-            last,
         )
     end = frames - 1
     for first, last in runs(state.seen.repeated):

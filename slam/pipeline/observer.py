@@ -100,7 +100,7 @@ class Observer:
         self._stopwatch = stopwatch
         self._examples = examples or Examples(range(0))
         self._seen = Observations() if state is None else state.seen
-        self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
+        self._gate = ImageGate(None if state is None else state.gate)
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )

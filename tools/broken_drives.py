@@ -212,6 +212,8 @@ def ate(
     squares = []
     for first, last in segments:
         rows = frames[(frames >= first) & (frames <= last)]
+        if not len(rows):  # a segment of broken frames alone
+            continue
         true, estimated = T_reference[rows], T_estimate[rows]
         similarity = umeyama(true[:, :3, 3], estimated[:, :3, 3], with_scale=True)
         moved = similarity.apply_to_poses(estimated)

@@ -23,7 +23,7 @@ INTERPOLATED_SOURCE = "interpolated"
 _STEPS_OF_A_MOTION = 3
 # the first step of a camera that stood, in steps before it stood
 _LONGEST_START = 2.0
-# frames that the gate may refuse after a frozen video, whose first new image is of another place
+# frames without a usable image between a frozen video and the first new image
 _LONGEST_DOUBT = 2
 _SIGMA_FLOOR = 1e-6
 _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees

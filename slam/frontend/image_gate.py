@@ -1,4 +1,7 @@
-"""Rejection of unusable images before they are measured: blank, noise, upside down, mirrored, frozen."""
+"""Detection of images that show nothing new or nothing at all, before they are measured: blank, noise, frozen.
+
+Whether an image shows the scene of the one before is not asked here: tracking finds out.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import Frame
+from slam.frames import Frame, Grey
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.moving_cover import is_crossed
-from slam.storage.cache import GetOrCompute, without_cache
 
 _THUMBNAIL = (32, 16)  # width, height
 _SHRINKING = 4  # averages out compression noise
@@ -22,26 +23,14 @@ _MOVING = 3.0
 # copies of dark or blurred images differ by more: up to this ratio of the motion before, and twice the usual difference
 _COPY_OVER_MOTION = 0.25
 _LARGEST_COPY = 2.0
-_LEAST_FLIPPED_CORRELATION = 0.3
 # of the median grey level from an image to the next, in logarithms
 _EXPOSURE_STEP = 0.1
-# corners followed from the last image to a flipped one: a least share, and so many times those without flipping
-_WIDTH_OF_TRACKING = 208
-_CORNERS = 100
-_LEAST_TRACKED = 0.25
-_TRACKED_OVER_UNFLIPPED = 2.0
-_FLIPS = {
-    "upside down": (slice(None, None, -1), slice(None, None, -1)),
-    "mirrored": (slice(None), slice(None, None, -1)),
-}
+_BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
+_NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
+_REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
 Verdict = Literal["new", "repeated"] | MeasurementFailure
 _Layer = NDArray[np.float32]
-_Grey = NDArray[np.uint8]
-_BLANK_CONTRAST = 3.0  # standard deviation of grey levels below which a frame is blank
-_NOISE_CONTRAST = 0.3  # contrast after blurring over contrast before, below which a frame is noise
-_MIN_CORRELATION = 0.2  # least correlation with the frames before
-_REPEAT_DIFFERENCE = 0.1  # largest difference of a re-encoded copy to its image, over the mean image gradient
 
 
 @dataclass(frozen=True)
@@ -49,30 +38,21 @@ class GateState:
     """State of the gate: what the next image is compared with.
 
     ``last`` frame and its ``verdict``; ``shrunk``, the last new image at a quarter of its size, and its ``difference``
-    from the one before; ``usable`` and ``doubtful`` thumbnails, zero mean and unit length; ``tracked``, the image of
-    ``usable`` at a smaller size, turned the right way; ``flip``, how the image before was flipped;
-    of all ``compared`` images, ``exposed`` are much brighter or darker than the one before, and frames ``crossed`` have
-    something before the scene that moves.
+    from the one before; of all ``compared`` images, ``exposed`` are much brighter or darker than the one before.
     """
 
     last: Frame | None = None
     verdict: Verdict = "new"
     shrunk: _Layer | None = None
     difference: float = 0.0
-    usable: _Layer | None = None
-    doubtful: _Layer | None = None
-    tracked: _Grey | None = None
-    flip: str | None = None
     compared: int = 0
     exposed: int = 0
-    crossed: tuple[int, ...] = ()
 
 
 class ImageGate:
     """Classifies the images of one sequence in time order."""
 
-    def __init__(self, state: GateState | None = None, get_or_compute: GetOrCompute = without_cache) -> None:
-        self._get_or_compute = get_or_compute
+    def __init__(self, state: GateState | None = None) -> None:
         self._state = state or GateState()
 
     def state(self) -> GateState:
@@ -98,107 +78,35 @@ class ImageGate:
         contrast = float(np.mean(cv2.meanStdDev(frame.image)[1]))
         if contrast < _BLANK_CONTRAST:
             # images after a dark one are not compared with those before it
-            state = self._state
-            self._state = GateState(compared=state.compared, exposed=state.exposed, crossed=state.crossed)
+            self._state = GateState(compared=self._state.compared, exposed=self._state.exposed)
             return MeasurementFailure("the image is blank")
         thumbnail = cv2.resize(frame.grey, _THUMBNAIL, interpolation=cv2.INTER_AREA)
-        thumbnail = thumbnail.astype(np.float32) - np.float32(thumbnail.mean())
-        length = float(np.linalg.norm(thumbnail))
-        if length / np.sqrt(thumbnail.size) < _NOISE_CONTRAST * contrast:
+        if float(thumbnail.std()) < _NOISE_CONTRAST * contrast:
             return MeasurementFailure("the image is noise")
-        thumbnail /= np.float32(length)
-        small = _reduced(frame.grey)
-        failure = self._scene_failure(thumbnail, small)
-        if failure is not None:
-            return failure
-        self._compare_with_last(frame.index, small)
-        self._state = replace(self._state, usable=thumbnail, doubtful=None, tracked=small, flip=None)
-        return "repeated" if self._is_copy(frame) else "new"
+        return self._compared(_shrunk(frame.grey))
 
-    def _compare_with_last(self, index: int, small: _Grey) -> None:
-        """Count a change of exposure, and something that moves over the image."""
-        state = self._state
-        if state.tracked is not None:
-            before, now = np.median(state.tracked), np.median(small)
-            exposed = abs(float(np.log((now + 1.0) / (before + 1.0)))) > _EXPOSURE_STEP
-            crossed = (*state.crossed, index) if is_crossed(state.tracked, small) else state.crossed
-            exposed_now = state.exposed + exposed
-            self._state = replace(state, compared=state.compared + 1, exposed=exposed_now, crossed=crossed)
+    def _compared(self, shrunk: _Layer) -> Verdict:
+        """Compare an image with the last new one: its exposure, and whether it is a re-encoded copy of it.
 
-    def _scene_failure(self, thumbnail: _Layer, small: _Grey) -> MeasurementFailure | None:
-        state, flip = self._state, self._flip_of(thumbnail, small)
-        if flip is not None:
-            turned, tracked = np.ascontiguousarray(thumbnail[_FLIPS[flip]]), np.ascontiguousarray(small[_FLIPS[flip]])
-            self._state = replace(state, usable=turned, doubtful=None, tracked=tracked, flip=flip)
-            return MeasurementFailure(f"the image is {flip}")
-        known = [each for each in (state.usable, state.doubtful) if each is not None]
-        doubt = bool(known) and max(float((thumbnail * each).sum()) for each in known) < _MIN_CORRELATION
-        # after flipped images correlation is not enough; two such images in a row are a new scene, not damage
-        if doubt or (
-            state.flip and state.doubtful is None and self._tracked_share(state.tracked, small) < _LEAST_TRACKED
-        ):
-            self._state = replace(state, doubtful=thumbnail)
-            return MeasurementFailure("the image does not correlate with those before it")
-        return None
-
-    def _flip_of(self, thumbnail: _Layer, small: _Grey) -> str | None:
-        """How the image is flipped, or None: corners of the last image are found once it is flipped back.
-
-        Correlation alone is not enough: in a street or a turn the flipped image may correlate better than the true one.
+        A copy is frozen where the camera moved just before: a camera that comes to a stop slows down first.
         """
-        usable, before = self._state.usable, self._state.tracked
-        if usable is None:
-            return None
-        for name, flip in _FLIPS.items():
-            if float((thumbnail[flip] * usable).sum()) < _LEAST_FLIPPED_CORRELATION:
-                continue
-            tracked = self._tracked_share(before, np.ascontiguousarray(small[flip]))
-            if tracked > max(_LEAST_TRACKED, _TRACKED_OVER_UNFLIPPED * self._tracked_share(before, small)):
-                return name
-        return None
-
-    def _tracked_share(self, before: _Grey | None, now: _Grey) -> float:
-        """Share of corners that are followed to the other image and back to where they were."""
-        if before is None or before.shape != now.shape:
-            return 0.0
-        (share,) = self._get_or_compute("share of corners", (before, now), lambda: (_followed(before, now),))
-        return float(share[0])
-
-    def _is_copy(self, frame: Frame) -> bool:
-        """Whether the image is a re-encoded copy of the last new one, although the camera moved just before.
-
-        A camera that comes to a stop slows down first; a video that freezes does not.
-        """
-        height, width = (max(side // _SHRINKING, 1) for side in frame.grey.shape)
-        shrunk = cv2.resize(frame.grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        before, limit, motion = self._state.shrunk, _REPEAT_DIFFERENCE, self._state.difference
+        state, before = self._state, self._state.shrunk
         if before is None or before.shape != shrunk.shape:
-            self._state = replace(self._state, shrunk=shrunk, difference=0.0)
-            return False
+            self._state = replace(state, shrunk=shrunk, difference=0.0)
+            return "new"
+        is_exposed = abs(float(np.log((np.median(shrunk) + 1.0) / (np.median(before) + 1.0)))) > _EXPOSURE_STEP
+        self._state = replace(state, compared=state.compared + 1, exposed=state.exposed + is_exposed)
         difference = _difference(before, shrunk)
-        largest = min(max(limit, _COPY_OVER_MOTION * motion), _LARGEST_COPY * limit)
-        if difference < largest and self.was_moving:
-            return True
+        largest = max(_REPEAT_DIFFERENCE, _COPY_OVER_MOTION * state.difference)
+        if difference < min(largest, _LARGEST_COPY * _REPEAT_DIFFERENCE) and self.was_moving:
+            return "repeated"
         self._state = replace(self._state, shrunk=shrunk, difference=difference)
-        return False
+        return "new"
 
 
-def _reduced(grey: _Grey) -> _Grey:
-    height, width = grey.shape
-    scale = min(_WIDTH_OF_TRACKING / width, 1.0)
-    size = max(round(scale * width), 1), max(round(scale * height), 1)
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _followed(before: _Grey, now: _Grey) -> NDArray[np.float64]:
-    """The share ``(1,)`` of corners that are followed there and back."""
-    corners = cv2.goodFeaturesToTrack(before, _CORNERS, 0.01, 5)
-    if corners is None:
-        return np.zeros(1)
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, now, corners, None, winSize=(9, 9))
-    back, found_again, _ = cv2.calcOpticalFlowPyrLK(now, before, moved, None, winSize=(9, 9))
-    returned = np.linalg.norm(back - corners, axis=-1) < 0.5
-    return np.array([(returned & (found == 1) & (found_again == 1)).mean()])
+def _shrunk(grey: Grey) -> _Layer:
+    height, width = (max(side // _SHRINKING, 1) for side in grey.shape)
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _difference(before: _Layer, now: _Layer) -> float:

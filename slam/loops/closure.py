@@ -12,12 +12,11 @@ import numpy as np
 from slam.config import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
 from slam.loops.consistency import agreeing
-from slam.loops.retrieval import find_candidates
+from slam.loops.retrieval import find_candidates, least_path
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
-from slam.storage.cache import GetOrCompute, without_cache
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +92,7 @@ def close_loops(
     T_world_camera: FloatArray,
     intrinsics: Intrinsics,
     config: LoopsConfig,
-    get_or_compute: GetOrCompute = without_cache,
+    is_metric: bool,
     seed: int = 0,
 ) -> LoopClosures:
     """Find the loops of a drive, once after its last frame.
@@ -103,15 +102,17 @@ def close_loops(
         T_world_camera: odometry ``(N, 4, 4)``.
         intrinsics: of the images that the views were taken from.
         config: thresholds.
-        get_or_compute: cache of words, matches and features.
+        is_metric: whether lengths are metres.
+        seed: of all RANSAC draws.
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
     steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     path = np.concatenate([[0.0], np.cumsum(steps)])
-    candidates = find_candidates(views, path[np.array([view.index for view in views], dtype=int)], get_or_compute)
+    path = path[np.array([view.index for view in views], dtype=int)]
+    candidates = find_candidates(views, path, least_path(views, is_metric))
     thresholds = LoopThresholds.of_frames(config)
-    verifier = LoopVerifier(thresholds, intrinsics, get_or_compute, seed)
+    verifier = LoopVerifier(thresholds, intrinsics, seed)
     verdicts = side_by_side(lambda c: verifier.verify(views[c.earlier], views[c.later], c.score), candidates)
     verified = [verdict for verdict in verdicts if isinstance(verdict, Loop)]
     refused = [verdict for verdict in verdicts if isinstance(verdict, RejectedLoop)]

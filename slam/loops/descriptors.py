@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View
-from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
@@ -22,9 +21,8 @@ _MAX_FEATURES = 500  # largest number of corners kept of a frame
 class FeatureExtractor:
     """Extracts features of the frames of one sequence, spread over the image by a grid."""
 
-    def __init__(self, intrinsics: Intrinsics, get_or_compute: GetOrCompute = without_cache) -> None:
+    def __init__(self, intrinsics: Intrinsics) -> None:
         self._intrinsics = intrinsics
-        self._get_or_compute = get_or_compute
         self._orb = cv2.ORB.create(
             nfeatures=_DETECTED_PER_KEPT * _MAX_FEATURES,
             nlevels=6,
@@ -41,14 +39,11 @@ class FeatureExtractor:
             height_unscaled: camera height in the same unit; where known, depths farther than
                 ``max_depth_heights`` of it are not trusted.
         """
-        settings = (_MAX_FEATURES, _CORNER_CONTRAST)
-        pixels, descriptors = self._get_or_compute(
-            "features", (frame, repr(settings)), lambda: self._features(frame.grey)
-        )
+        pixels, descriptors = self._features(frame.grey)
         points = self._points(pixels, depth_unscaled, height_unscaled)
         return View(frame.index, pixels, descriptors, points)
 
-    def _features(self, grey: Grey) -> Answer:
+    def _features(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
         found = self._orb.detect(grey, None)
         strongest = _strongest_per_cell(found, grey.shape, _MAX_FEATURES)

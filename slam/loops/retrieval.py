@@ -17,7 +17,6 @@ from slam.frames import Descriptors, View
 from slam.loops.descriptors import hamming
 from slam.runtime.threads import side_by_side
 from slam.se3 import FloatArray
-from slam.storage.cache import Answer, GetOrCompute, without_cache
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3
@@ -27,7 +26,9 @@ _CANDIDATES_PER_FRAME = 2  # largest number of places verified for a frame
 _PEAK_FRAMES = 10  # least distance between candidate places, frames
 _MIN_SCORE = 0.2  # least retrieval score, relative to that of neighbouring frames
 _WORDS = 1000  # size of the binary vocabulary learned on the run
-_LEAST_PATH_M = 15.0  # least distance of the two frames of a loop along the path
+# least distance of the two frames of a loop along the path: in metres, and over the median depth of the corners
+_LEAST_PATH_M = 15.0
+_LEAST_PATH_OVER_DEPTH = 0.75
 _LEAST_GAP_FRAMES = 30  # least distance of the two frames of a loop, frames
 
 
@@ -40,25 +41,31 @@ class Candidate:
     score: float
 
 
-def find_candidates(
-    views: Sequence[View], path_m: FloatArray, get_or_compute: GetOrCompute = without_cache
-) -> list[Candidate]:
-    """For each view the most similar earlier views, the best first, none within 30 frames or 15 m of path.
+def least_path(views: Sequence[View], is_metric: bool) -> float:
+    """Least distance of the two frames of a loop along the path, in the unit of the points of the views.
+
+    It is 15 m. Where lengths are no metres, it is three quarters of the median depth of the corners: a camera that has
+    moved less still sees what it saw, whatever the unit and the frame rate, and on streets these are 12 to 19 m.
+    """
+    if is_metric:
+        return _LEAST_PATH_M
+    depths = np.concatenate([np.zeros(0), *(view.points[:, 2] for view in views)])
+    depths = depths[np.isfinite(depths)]
+    return _LEAST_PATH_OVER_DEPTH * float(np.median(depths)) if len(depths) else np.inf
+
+
+def find_candidates(views: Sequence[View], path: FloatArray, least_path: float) -> list[Candidate]:
+    """For each view the most similar earlier views, the best first, none within 30 frames.
 
     Args:
         views: in time order.
-        path_m: distance driven up to each view ``(V,)``, in the unit of the trajectory.
-        get_or_compute: cache of the words.
+        path: distance driven up to each view ``(V,)``.
+        least_path: distance along the path within which there is no candidate, in the same unit.
     """
     everything = _all_descriptors(views)
     if len(views) < 2 or len(everything) == 0:
         return []
-
-    def learn() -> Answer:
-        return (nearest_words(everything, train_vocabulary(everything, _WORDS)),)
-
-    (word,) = get_or_compute("words of a drive", (everything, repr(_WORDS)), learn)
-    counts = _word_counts(views, word, _WORDS)
+    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, _WORDS)), _WORDS)
     weighted = _weighted(counts, _inverse_frequency(counts))
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
@@ -69,7 +76,7 @@ def find_candidates(
         block = rows[start : start + _BLOCK]
         scores = (weighted[block] @ weighted.T).toarray() / expected[block, None]  # (block, V)
         near = indices[block, None] - indices[None, :] < _LEAST_GAP_FRAMES
-        near |= path_m[block, None] - path_m[None, :] < _LEAST_PATH_M
+        near |= path[block, None] - path[None, :] < least_path
         scores[near] = 0.0
         for later, row in zip(block, scores, strict=True):
             found += [Candidate(k, int(later), float(row[k])) for k in _peaks(row, indices)]

@@ -16,7 +16,6 @@ from slam.loops.descriptors import hamming
 from slam.loops.thresholds import LoopThresholds
 from slam.resection import Resection, consensus, refine
 from slam.se3 import FloatArray, invert, make, rotation_angle
-from slam.storage.cache import GetOrCompute, without_cache
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
 _RANSAC_ITERATIONS = 200  # RANSAC iterations of PnP
@@ -70,20 +69,15 @@ class LoopVerifier:
         self,
         thresholds: LoopThresholds,
         intrinsics: Intrinsics,
-        get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
     ) -> None:
         self._thresholds = thresholds
         self._intrinsics = intrinsics
-        self._get_or_compute = get_or_compute
         self._seed = seed
 
     def verify(self, earlier: View, later: View, score: float) -> Loop | RejectedLoop:
         """Measure the pose of the later view in the earlier one, or reject it with a reason."""
-        given = (earlier.descriptors, later.descriptors, repr((self._thresholds.max_hamming, _RATIO)))
-        rows_earlier, rows_later = self._get_or_compute(
-            "loop matches", given, lambda: matches(earlier, later, self._thresholds)
-        )
+        rows_earlier, rows_later = matches(earlier, later, self._thresholds)
 
         def refused(reason: str, inliers: int = 0, T: FloatArray | None = None) -> RejectedLoop:
             return RejectedLoop(earlier.index, later.index, reason, score, inliers, T)

@@ -185,7 +185,7 @@ class SlamPipeline:
         with self._watch.stage("loops"):
             scaled = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
             intrinsics, config = self._sequence.intrinsics, self._config.loops
-            return close_loops(scaled, T_odometry, intrinsics, config, self._get_or_compute, self._seed)
+            return close_loops(scaled, T_odometry, intrinsics, config, scale.is_metric, self._seed)
 
     def fuse(
         self,

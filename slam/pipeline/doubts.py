@@ -7,7 +7,6 @@ import logging
 from slam.frames import runs
 from slam.frontend.drive import Drive
 from slam.frontend.image_gate import GateState
-from slam.frontend.moving_cover import crossings
 
 logger = logging.getLogger(__name__)
 
@@ -37,13 +36,6 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
             "exposure, or its flicker under lamps",
             gate.exposed,
             gate.compared,
-        )
-    for first, last in crossings(gate.crossed):
-        logger.warning(
-            "frames %d to %d: something uniform moves over the images, such as a windscreen wiper: their poses are "
-            "less certain",
-            first,
-            last,
         )
     end = len(drive) - 1
     for first, last in runs(drive.repeated):

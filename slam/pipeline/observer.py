@@ -99,7 +99,7 @@ class Observer:
         self._stopwatch = stopwatch
         self._examples = examples or Examples(range(0))
         self._drive = Drive() if state is None else state.drive.copy()
-        self._gate = ImageGate(None if state is None else state.gate, get_or_compute)
+        self._gate = ImageGate(None if state is None else state.gate)
         self._odometry = VisualOdometry(
             config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
         )
@@ -110,7 +110,7 @@ class Observer:
             config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
         )
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
-        self._features = FeatureExtractor(intrinsics, get_or_compute)
+        self._features = FeatureExtractor(intrinsics)
         self._window: tuple[Frame, ...] = () if state is None else state.window
         self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
         self._unread = 0 if state is None else state.unread

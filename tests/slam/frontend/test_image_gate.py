@@ -1,9 +1,8 @@
-"""Images of a street are usable in any light; blank, noisy, frozen, upside-down and mirrored ones are detected."""
+"""Images of a scene are usable in any light, whatever they show; blank, noisy and frozen ones are detected."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -14,9 +13,6 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import ImageGate
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
-UNCORRELATED = "the image does not correlate with those before it"
-UPSIDE_DOWN = "the image is upside down"
-MIRRORED = "the image is mirrored"
 QUALITIES = range(60, 90, 3)
 
 
@@ -43,14 +39,6 @@ def jpeg(image: Image, quality: int) -> Image:
     """Re-encoded as JPEG."""
     _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
-
-
-def upside_down(image: Image) -> Image:
-    return np.ascontiguousarray(image[::-1, ::-1])
-
-
-def mirrored(image: Image) -> Image:
-    return np.ascontiguousarray(image[:, ::-1])
 
 
 @functools.cache
@@ -85,10 +73,10 @@ def test_noise_is_refused_also_where_it_repeats() -> None:
     assert found == ["new"] * 2 + ["the image is noise"] * 3 + ["new"] * 3
 
 
-def test_an_uncorrelated_image_is_unusable_and_two_in_a_row_are_a_new_scene() -> None:
-    other = panned(10.0 * np.arange(3))
-    assert verdicts([*street()[:3], other[0], *street()[4:6]]) == [*["new"] * 3, UNCORRELATED, *["new"] * 2]
-    assert verdicts([*street()[:3], *other]) == [*["new"] * 3, UNCORRELATED, *["new"] * 2]
+def test_a_camera_that_turns_fast_and_another_scene_are_not_judged_here() -> None:
+    """By half an image a frame, as a hand-held camera may, and by a cut to another place."""
+    assert set(verdicts(panned(100.0 * np.arange(6)))) == {"new"}
+    assert set(verdicts([*street()[:3], *panned(10.0 * np.arange(3))])) == {"new"}
 
 
 def test_an_image_of_the_same_bytes_is_a_repetition() -> None:
@@ -142,21 +130,9 @@ def test_a_simulated_stop_is_not_frozen() -> None:
     assert set(verdicts(images)) == {"new"}
 
 
-@pytest.mark.parametrize("hazards", [(), ("exposure", "blur"), ("rain", "moving-cars")])
-@pytest.mark.parametrize(("flip", "named"), [(upside_down, UPSIDE_DOWN), (mirrored, MIRRORED)])
-def test_ten_flipped_images_are_refused_and_the_drive_goes_on(
-    hazards: tuple[str, ...], flip: Callable[[Image], Image], named: str
-) -> None:
-    images = street(hazards)
-    found = verdicts([*images[:10], *map(flip, images[10:20]), *images[20:]])
-    assert found[:10] + found[20:] == ["new"] * 20
-    assert "new" not in found[10:20]
-    assert found.count(named) >= 9  # in a blurred image no corners are found
-
-
 def test_a_gate_resumes_from_its_state() -> None:
     images = [*street()[:8], *(jpeg(street()[7], quality) for quality in QUALITIES), *street()[18:]]
-    images[20:24] = map(upside_down, images[20:24])
+    images[20:24] = [noise(k) for k in range(4)]
     whole = verdicts(images)
     assert len(set(whole)) == 3
     for split in range(len(images)):
@@ -167,19 +143,9 @@ def test_a_gate_resumes_from_its_state() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["00", "02", "05"])
-def test_freezes_and_flips_are_detected_on_real_frames(data_root, name: str) -> None:
+def test_freezes_are_detected_on_real_frames(data_root, name: str) -> None:
     folder = data_root / "kitti_odometry" / "sequences" / name / "image_0"
     images = [cv2.imread(str(path)) for path in sorted(folder.iterdir())[:60]]
     assert set(verdicts(images)) == {"new"}
     frozen = [*images[:20], *(jpeg(images[19], quality) for quality in QUALITIES), *images[30:]]
     assert verdicts(frozen) == ["new"] * 20 + ["repeated"] * 10 + ["new"] * 30
-    for flip, named in ((upside_down, UPSIDE_DOWN), (mirrored, MIRRORED)):
-        flipped = [*images[:20], *map(flip, images[20:30]), *images[30:]]
-        assert verdicts(flipped) == ["new"] * 20 + [named] * 10 + ["new"] * 30
-
-
-@pytest.mark.data
-def test_a_fast_turn_is_not_upside_down(data_root) -> None:
-    """At five frames a second, the images of this turn correlate better with those before when turned over."""
-    folder = data_root / "kitti_odometry" / "sequences" / "00" / "image_0"
-    assert set(verdicts([cv2.imread(str(path)) for path in sorted(folder.iterdir())[80:240:2]])) == {"new"}

@@ -54,10 +54,15 @@ def ate(result: Estimate, name: str) -> float:
     return float(trajectory_metrics(getattr(result, name), result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
+@functools.cache
+def closed(seed: int) -> tuple[SimulatedSequence, Estimate]:
+    sequence = drive("loop", 250, seed)
+    return sequence, run(sequence, "loops.frame_stride=3")
+
+
 @pytest.mark.parametrize("seed", [610, pytest.param(611, marks=pytest.mark.slow)])
 def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
-    sequence = drive("loop", 250, seed)
-    result = run(sequence, "loops.frame_stride=3")
+    sequence, result = closed(seed)
     accepted = result.loops.accepted
     assert len(accepted) >= 5
     assert not any(is_false(loop, sequence.reference) for loop in accepted)
@@ -67,6 +72,22 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
     assert summary["candidates"] >= summary["verified"] >= summary["accepted"]
     assert 0 < len(summary["rejected"]) <= MOST_REJECTED and all(r["reason"] for r in details["rejected"])
     assert {"from", "to", "inliers", "score", "reason", "T_from_to"} <= set(details["accepted"][0])
+
+
+def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
+    """In a unit of 20 m, where 15 units are longer than the loop, and in one of 5 cm."""
+    sequence, result = closed(610)
+    per_frame = result.scale.per_frame
+
+    def ends(scale: float, is_metric: bool) -> set[tuple[int, int]]:
+        T_world_camera = result.odometry.T_world_camera.copy()
+        T_world_camera[:, :3, 3] *= scale
+        views = [view.scaled(scale * float(per_frame[view.index])) for view in result.observations.views]
+        found = close_loops(views, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric)
+        return {loop.ends for loop in found.accepted}
+
+    assert len(ends(1.0, is_metric=True)) >= 5
+    assert ends(1.0, is_metric=True) == ends(0.05, is_metric=False) == ends(20.0, is_metric=False)
 
 
 def test_a_straight_drive_has_no_loop() -> None:
@@ -98,5 +119,5 @@ def test_features_are_spread_and_bounded() -> None:
 
 def test_no_views_no_loops() -> None:
     sequence = drive("straight", 20, 621)
-    closures = close_loops([], sequence.reference, sequence.intrinsics, LoopsConfig())
+    closures = close_loops([], sequence.reference, sequence.intrinsics, LoopsConfig(), is_metric=False)
     assert closures.candidates == 0 and closures.accepted == ()

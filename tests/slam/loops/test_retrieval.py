@@ -50,7 +50,7 @@ def test_descriptors_keep_their_word_through_flipped_bits() -> None:
 
 def test_revisited_places_are_found() -> None:
     views = drive(20, 5)
-    found = find_candidates(views, np.arange(50.0))
+    found = find_candidates(views, np.arange(50.0), 15.0)
     best = {}
     for candidate in found:
         best.setdefault(candidate.later, candidate)
@@ -62,11 +62,11 @@ def test_revisited_places_are_found() -> None:
 
 @pytest.mark.parametrize("path_m", [np.zeros(50), np.linspace(0.0, 4.0, 50)])
 def test_a_standing_camera_finds_nothing(path_m: np.ndarray) -> None:
-    assert find_candidates(drive(20, 5), path_m) == []
+    assert find_candidates(drive(20, 5), path_m, 15.0) == []
 
 
 def test_candidates_are_few_and_apart() -> None:
-    found = find_candidates(drive(20, 5), np.arange(50.0))
+    found = find_candidates(drive(20, 5), np.arange(50.0), 15.0)
     for later in {c.later for c in found}:
         earlier = [c.earlier for c in found if c.later == later]
         assert len(earlier) <= 2
@@ -76,11 +76,11 @@ def test_candidates_are_few_and_apart() -> None:
 @pytest.mark.parametrize("count", [0, 1, 30])
 def test_images_without_corners(count: int) -> None:
     blank = [view(k, np.zeros((0, 32), np.uint8)) for k in range(count)]
-    assert find_candidates(blank, np.arange(float(count))) == []
+    assert find_candidates(blank, np.arange(float(count)), 15.0) == []
 
 
 def test_blank_frames_among_others_are_no_candidates() -> None:
     views = drive(20, 5)
     views[3] = views[44] = view(views[3].index, np.zeros((0, 32), np.uint8))
-    found = find_candidates(views, np.arange(50.0))
+    found = find_candidates(views, np.arange(50.0), 15.0)
     assert not {3, 44} & {row for c in found for row in (c.earlier, c.later)}

@@ -62,11 +62,6 @@ def repeated_as_jpeg(sequence: SimulatedSequence, index: int) -> Frame:
     return Frame(index, float(sequence.stamps[index]), np.ascontiguousarray(decoded[..., ::-1]))
 
 
-def upside_down(sequence: SimulatedSequence, index: int) -> Frame:
-    image = np.ascontiguousarray(sequence.frame(index).image[::-1, ::-1])
-    return Frame(index, float(sequence.stamps[index]), image)
-
-
 def missing(sequence: SimulatedSequence, index: int) -> Frame:
     raise MissingFrameError(f"there is no image {index}.png")
 
@@ -147,7 +142,7 @@ def ate(result: Estimate) -> float:
     return float(trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]["ate_rmse_m"])
 
 
-DAMAGES = [black, noise, repeated, repeated_as_jpeg, upside_down, missing, unreadable]
+DAMAGES = [black, noise, repeated, repeated_as_jpeg, missing, unreadable]
 
 
 @pytest.mark.parametrize("damage", DAMAGES, ids=lambda damage: damage.__name__)
@@ -168,9 +163,8 @@ def test_ten_frames_are_interpolated_and_reported(damage: Damage) -> None:
     assert not {view.index for view in seen.views} & set(BAD)
 
 
-@pytest.mark.parametrize("damage", [repeated_as_jpeg, upside_down], ids=lambda damage: damage.__name__)
-def test_frozen_and_flipped_frames_cost_no_more_than_black_ones(damage: Damage) -> None:
-    assert ate(run_on(damage)[0]) < 2 * ate(run_on(black)[0])
+def test_frozen_frames_cost_no_more_than_black_ones() -> None:
+    assert ate(run_on(repeated_as_jpeg)[0]) < 2 * ate(run_on(black)[0])
 
 
 def test_doubled_frames_are_counted_and_cost_nothing() -> None:

@@ -1,8 +1,10 @@
-"""The fingerprint changes with the code behind cached results."""
+"""The fingerprint changes with the code behind cached results, and with no other."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -11,59 +13,71 @@ import pytest
 import scipy
 import torch
 
-import erfsfm
 import slam
-from slam.storage import fingerprint as module
-from slam.storage.fingerprint import code_fingerprint, fingerprint
+from slam.storage.fingerprint import code_fingerprint, fingerprint, sources
 
-PACKAGES = [Path(package.__file__ or "").parent for package in (erfsfm, slam)]
-ABOVE = {"slam/exports", "slam/results", "slam/localisation", "erfsfm/training"}
-SUBPACKAGES = sorted(
-    {path.parent.relative_to(folder.parent).as_posix() for folder in PACKAGES for path in folder.rglob("*.py")}
-)
+ROOT = Path(slam.__file__ or "").parents[1]
 
 
 @pytest.fixture(scope="module")
-def copies(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("code")
-    ignored = shutil.ignore_patterns("__pycache__", "weights", "_configs")
-    return [Path(shutil.copytree(folder, root / folder.name, ignore=ignored)) for folder in PACKAGES]
+    for package in ("erfsfm", "slam"):
+        ignored = shutil.ignore_patterns("__pycache__", "weights", "_configs")
+        shutil.copytree(ROOT / package, root / package, ignore=ignored)
+    return root
 
 
-def changed(copies: list[Path], path: Path) -> bool:
-    before, content = fingerprint(copies), path.read_bytes()
+def is_noticed(root: Path, name: str) -> bool:
+    path, before = root / name, fingerprint(root)
+    content = path.read_bytes()
     path.write_bytes(content + b"#")
     try:
-        return fingerprint(copies) != before
+        return fingerprint(root) != before
     finally:
         path.write_bytes(content)
 
 
-@pytest.mark.parametrize("package", [package for package in SUBPACKAGES if package not in ABOVE])
-def test_a_byte_in_any_package_behind_cached_results_changes_the_fingerprint(copies: list[Path], package: str) -> None:
-    folder = copies[0].parent / package
-    above = {"cli.py", "__main__.py", "doctor.py", "run.py"} if folder in copies else set()
-    sources = [path for path in folder.glob("*.py") if path.name not in above]
-    assert sources and all(changed(copies, path) for path in sources)
+def test_every_module_that_a_prediction_loads_is_among_the_sources() -> None:
+    """The doors of both packages are not: they load everything and compute nothing."""
+    names = "slam.prediction.assembly", "slam.pipeline.batch"
+    loads = f"import sys, {', '.join(names)}; print(*(m.__file__ for m in sys.modules.values() if "
+    loads += "m.__name__.startswith(('slam.prediction', 'slam.frontend', 'slam.loops', 'erfsfm.networks'))))"
+    loaded = subprocess.run([sys.executable, "-c", loads], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert len(loaded.stdout.split()) > 30
+    assert set(map(Path, loaded.stdout.split())) <= set(sources(ROOT))
 
 
-def test_reports_and_command_lines_leave_it_as_it_is(copies: list[Path]) -> None:
-    root = copies[0].parent
-    assert not any(changed(copies, root / name) for name in ("slam/cli.py", "slam/run.py", "slam/results/report.py"))
+@pytest.mark.parametrize("name", ["slam/prediction/networks.py", "slam/se3.py", "erfsfm/networks/presets.py"])
+def test_a_byte_behind_cached_results_is_noticed(copy: Path, name: str) -> None:
+    assert is_noticed(copy, name)
 
 
-def test_a_new_and_a_renamed_source_are_noticed(copies: list[Path]) -> None:
-    before, new = fingerprint(copies), copies[0] / "networks" / "another.py"
+@pytest.mark.parametrize(
+    "folder",
+    ["batch", "calibration", "downloads", "exports", "live", "localisation", "results"],
+)
+def test_reports_and_command_lines_leave_it_as_it_is(folder: str) -> None:
+    assert not [path for path in sources(ROOT) if path.is_relative_to(ROOT / "slam" / folder)]
+    assert ROOT / "slam" / "cli.py" not in sources(ROOT)
+
+
+def test_a_new_source_is_noticed_where_something_imports_it(copy: Path) -> None:
+    before, new = fingerprint(copy), copy / "slam" / "frontend" / "another.py"
     new.write_text("")
-    added = fingerprint(copies)
-    new = new.rename(new.with_name("other.py"))
-    renamed = fingerprint(copies)
+    assert fingerprint(copy) == before
+    user = copy / "slam" / "frontend" / "failure.py"
+    content = user.read_bytes()
+    user.write_bytes(content + b"\nfrom slam.frontend import another\n")
+    imported = fingerprint(copy)
+    new.write_text("# changed")
+    assert len({before, imported, fingerprint(copy)}) == 3
+    user.write_bytes(content)
     new.unlink()
-    assert len({before, added, renamed}) == 3 and fingerprint(copies) == before
 
 
 def test_the_libraries_below_are_named() -> None:
     known = code_fingerprint()
     for library in (torch, np, cv2, scipy):
         assert f"{library.__name__} {library.__version__.partition('+')[0]}" in known
-    assert module.fingerprint(PACKAGES[::-1]) in known
+    assert fingerprint(ROOT) in known

@@ -42,11 +42,6 @@ class NetworkConfig(Section):
     height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
     width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
 
-    @property
-    def encodes_single_images(self) -> bool:
-        """Whether the pose network encodes each image by itself, so that features serve several snippets."""
-        return self.pose.endswith("posenet-lite0")
-
     @model_validator(mode="after")
     def _can_be_halved(self) -> Self:
         if self.alignment == "images" and (self.height % _COARSEST or self.width % _COARSEST):

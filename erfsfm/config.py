@@ -8,9 +8,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from erfsfm import config_tree
-from erfsfm.config_tree import Section
-from erfsfm.config_tree import dump_yaml as dump_yaml
+from erfsfm.common import config_tree
+from erfsfm.common.config_tree import Section
+from erfsfm.common.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
 TrainedNetworks = Literal["both", "depth", "pose"]

@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from erfsfm.common.errors import CheckpointError, ConfigError, DataError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
+from erfsfm.common.readers.images import resize_image
+from erfsfm.common.threads import usable_cores
 from erfsfm.data.splits import overlapping as overlapping  # for slam, which imports only this module
-from erfsfm.errors import CheckpointError, ConfigError, DataError
-from erfsfm.files import write_atomically
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
-from erfsfm.readers.images import read_image as read_image  # images are read as for training
-from erfsfm.readers.images import resize_image
-from erfsfm.threads import usable_cores
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
     from erfsfm.checkpoint import Model

@@ -24,11 +24,11 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import ValidationSnippets, split_recordings
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.networks.presets import describe
 from erfsfm.training.objective import to_network_range

@@ -13,7 +13,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock, Encoder, Layer
 
 STEM_CHANNELS = 32

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.image_alignment import Alignment

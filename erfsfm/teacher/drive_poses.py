@@ -16,8 +16,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from erfsfm.errors import TrainingError
-from erfsfm.readers.pinhole import Pinhole
+from erfsfm.common.errors import TrainingError
+from erfsfm.common.readers.pinhole import Pinhole
 
 FPS = 10.0
 CAMERA_HEIGHT_M = 1.65  # any: poses are given in camera heights

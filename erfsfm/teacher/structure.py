@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.files import write_atomically
+from erfsfm.common.files import write_atomically
 from erfsfm.multiview import rays
 from erfsfm.teacher.road import impose_road, road_plane
 from erfsfm.teacher.two_view import MotionAndDepth, two_view

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
+from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, TrainedNetworks
-from erfsfm.errors import TrainingError
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry.transforms import pose_vector_to_matrix

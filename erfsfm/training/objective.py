@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig
-from erfsfm.errors import ConfigError
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
 from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample

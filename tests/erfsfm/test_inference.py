@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import Model, build_networks, save_model
+from erfsfm.common.errors import CheckpointError, ConfigError, DataError
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import CheckpointError, ConfigError, DataError
 from erfsfm.inference import (
     DepthPosePredictor,
     choose_device,

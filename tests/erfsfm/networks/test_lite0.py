@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv

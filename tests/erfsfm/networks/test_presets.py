@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.lite0_depth import Lite0DepthNet
 from erfsfm.networks.pose_net import PoseNet

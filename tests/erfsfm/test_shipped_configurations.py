@@ -14,6 +14,7 @@ from erfsfm.checkpoint import load_model
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.snippets import split_recordings
+from erfsfm.model_record import SHIPPED
 from erfsfm.training.run import train
 
 NAMES = sorted(path.stem for path in (Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
@@ -55,6 +56,11 @@ def measured(config: ExperimentConfig, folder: Path) -> None:
             drive.label_file(target).parent.mkdir(exist_ok=True)
             least = np.full(size, 0.25, np.float16)
             np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
+
+
+@pytest.mark.parametrize("weights", sorted(path.name for path in SHIPPED.iterdir()))
+def test_weights_have_the_name_of_the_configuration_that_trains_them(weights: str) -> None:
+    assert load_model(weights).record.network == load_experiment(weights).network
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -77,7 +77,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^make ", "it sets up, lints or starts these very tests"),
     (r"^pip install ", "it downloads"),
     (
-        r"--config lite0-gpu ",
+        r"--config default-gpu ",
         "it wants hours of labels, and a GPU; tests/erfsfm/training/test_pack.py packs small data",
     ),
     (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),

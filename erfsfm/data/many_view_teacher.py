@@ -28,9 +28,9 @@ from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
-from erfsfm.teacher.drive_poses import drive_poses
-from erfsfm.teacher.many_views import NEIGHBOURS, label
-from erfsfm.teacher.structure import TeacherStructure
+from erfsfm.labels.drive_poses import drive_poses
+from erfsfm.labels.many_views import NEIGHBOURS, label
+from erfsfm.labels.structure import TeacherStructure
 
 VERSION = 1
 # pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift

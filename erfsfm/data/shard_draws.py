@@ -22,7 +22,7 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import training_sample
 from erfsfm.data.shards import Clip, InShards
 from erfsfm.data.snippets import chances, usable
-from erfsfm.teacher.structure import StructureCache, TeacherStructure
+from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 _ORDER, _WITHIN = 0, 1  # what is drawn for a pass over the data
 

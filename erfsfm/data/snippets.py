@@ -26,7 +26,7 @@ from erfsfm.data.samples import as_tensors, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
-from erfsfm.teacher.structure import StructureCache, TeacherStructure
+from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are 
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    Measurements of the teacher (`erfsfm.teacher.structure`), where one is used: ``T_source_target``
+    Measurements of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
     With simulated weather: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """

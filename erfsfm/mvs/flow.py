@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.refinement.projection import Projection
+from erfsfm.mvs.projection import Projection
 
 Grey = NDArray[np.uint8]
 Array = NDArray[np.float32]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from erfsfm.multiview import rays
-from erfsfm.teacher import structure as module
-from erfsfm.teacher.road import on_road, road_plane, under_road
-from erfsfm.teacher.structure import StructureCache, TeacherStructure, measure_structure
-from erfsfm.teacher.two_view import two_view
+from erfsfm.labels import structure as module
+from erfsfm.labels.road import on_road, road_plane, under_road
+from erfsfm.labels.structure import StructureCache, TeacherStructure, measure_structure
+from erfsfm.labels.two_view import two_view
+from erfsfm.mvs.flow import rays
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.refinement.appearance import Appearance, Array
-from erfsfm.refinement.projection import Projection, halved
-from erfsfm.refinement.semi_global import smoothed
-from erfsfm.refinement.sweep import is_inside, lowest, sweep, warped
+from erfsfm.mvs.appearance import Appearance, Array
+from erfsfm.mvs.projection import Projection, halved
+from erfsfm.mvs.semi_global import smoothed
+from erfsfm.mvs.sweep import is_inside, lowest, sweep, warped
 
 STEPS = 2
 WINDOW_PX = 5

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from erfsfm.multiview import combine, guided_flow, measure, rays, triangulate
-from erfsfm.refinement.projection import Projection
+from erfsfm.mvs.flow import combine, guided_flow, measure, rays, triangulate
+from erfsfm.mvs.projection import Projection
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 

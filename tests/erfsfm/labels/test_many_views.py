@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.teacher.many_views import direction_of_travel, label, sky_mask
+from erfsfm.labels.many_views import direction_of_travel, label, sky_mask
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)

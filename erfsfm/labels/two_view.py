@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.multiview import OFF_LINE_PX, Array, Grey, optical_flow, triangulate
+from erfsfm.mvs.flow import OFF_LINE_PX, Array, Grey, optical_flow, triangulate
 
 EPIPOLAR_PX = 0.4
 STILL_PX = 0.3

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.multiview import Array, Grey, MeasuredDepth, measure, rays
-from erfsfm.teacher.road import impose_road, road_plane
+from erfsfm.labels.road import impose_road, road_plane
+from erfsfm.mvs.flow import Array, Grey, MeasuredDepth, measure, rays
 
 NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
 MIN_SNR = 5.0  # inverse depth over its sigma

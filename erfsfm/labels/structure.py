@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.files import write_atomically
-from erfsfm.multiview import rays
-from erfsfm.teacher.road import impose_road, road_plane
-from erfsfm.teacher.two_view import MotionAndDepth, two_view
+from erfsfm.labels.road import impose_road, road_plane
+from erfsfm.labels.two_view import MotionAndDepth, two_view
+from erfsfm.mvs.flow import rays
 
 VERSION = 4
 MIN_SNR = 5.0  # inverse depth over its sigma

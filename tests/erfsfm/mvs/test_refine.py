@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.refinement.appearance import Appearance
-from erfsfm.refinement.refine import RefinedDepth, Road, refine
+from erfsfm.mvs.appearance import Appearance
+from erfsfm.mvs.refine import RefinedDepth, Road, refine
 
 H, W = 96, 240
 K = np.array([[150.0, 0.0, 119.5], [0.0, 150.0, 47.5], [0.0, 0.0, 1.0]])

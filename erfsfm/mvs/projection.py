@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.refinement.appearance import Array
+from erfsfm.mvs.appearance import Array
 
 LEAST_Z = 1e-3
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.refinement.appearance import Array
-from erfsfm.refinement.projection import Projection
-from erfsfm.refinement.semi_global import LARGEST_COST, UNIT, Costs
+from erfsfm.mvs.appearance import Array
+from erfsfm.mvs.projection import Projection
+from erfsfm.mvs.semi_global import LARGEST_COST, UNIT, Costs
 
 # changes of the logarithm of inverse depth, denser near the guess; negative is farther
 CHANGES: Array = np.array([-2.4, -1.6, -1.0, -0.7, *(np.arange(-5, 7) / 10), 0.8, 1.0, 1.25], dtype=np.float32)

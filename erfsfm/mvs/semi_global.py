@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.refinement.appearance import Array
+from erfsfm.mvs.appearance import Array
 
 Costs = NDArray[np.int16]
 

@@ -15,10 +15,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import nn
 
+from erfsfm.common.config_tree import dump_yaml
+from erfsfm.common.errors import CheckpointError, ConfigError
+from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig
-from erfsfm.config_tree import dump_yaml
-from erfsfm.errors import CheckpointError, ConfigError
-from erfsfm.files import write_atomically
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record
 from erfsfm.networks.presets import PRESETS, NetworkKind, build
 

@@ -12,10 +12,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from erfsfm import __version__, command_line
+from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
 from erfsfm.cli_pack import pack
+from erfsfm.common import command_line
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +87,8 @@ def predict(
 
     Example: erfsfm predict drive/images --weights default --output depth
     """
-    from erfsfm.errors import DataError
+    from erfsfm.common.errors import DataError
+    from erfsfm.common.readers.images import list_images
     from erfsfm.inference import (
         DepthPosePredictor,
         colour_disparity,
@@ -95,7 +97,6 @@ def predict(
         save_depth,
         save_image,
     )
-    from erfsfm.readers.images import list_images
 
     if output.is_file():
         raise DataError(f"{output} is a file: give a folder as --output")
@@ -179,11 +180,11 @@ def receptive_field(
     import torch
 
     from erfsfm.checkpoint import load_model
-    from erfsfm.errors import DataError
-    from erfsfm.figure_file import require_figure
+    from erfsfm.common.errors import DataError
+    from erfsfm.common.figure_file import require_figure
+    from erfsfm.common.readers.images import list_images, resize_image
     from erfsfm.inference import choose_device, read_image
     from erfsfm.networks.presets import PRESETS
-    from erfsfm.readers.images import list_images, resize_image
     from erfsfm.receptive_field.figure import draw_fields
     from erfsfm.receptive_field.measure import field_table, measure_fields
     from erfsfm.receptive_field.street import street_snippet

@@ -45,7 +45,7 @@ def evaluate_depth(
 
     Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
     """
-    from erfsfm.errors import ConfigError
+    from erfsfm.common.errors import ConfigError
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.many_view_truth import many_view_protocol
     from erfsfm.evaluation.protocols import depth_protocol

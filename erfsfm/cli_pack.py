@@ -30,7 +30,7 @@ def pack(
     Real recordings are packed whole, simulated ones shortened until all fits. With --shard-megabytes all is packed,
     into tar files that training reads one after the other, also over HTTP.
 
-    Example: erfsfm pack --config lite0-gpu --dataset KITTI --dataset worlds --set teacher.cache=labels --output pack
+    Example: erfsfm pack --config default-gpu --dataset KITTI --dataset worlds --set teacher.cache=labels --output pack
     """
     from erfsfm.config import load_experiment
     from erfsfm.training.pack import TEACHER_FOLDER

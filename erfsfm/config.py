@@ -8,9 +8,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from erfsfm import config_tree
-from erfsfm.config_tree import Section
-from erfsfm.config_tree import dump_yaml as dump_yaml
+from erfsfm.common import config_tree
+from erfsfm.common.config_tree import Section
+from erfsfm.common.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
 TrainedNetworks = Literal["both", "depth", "pose"]
@@ -41,11 +41,6 @@ class NetworkConfig(Section):
     )
     height: int = Field(default=128, ge=32, le=4096, description="height of the network input, pixels")
     width: int = Field(default=416, ge=32, le=4096, description="width of the network input, pixels")
-
-    @property
-    def encodes_single_images(self) -> bool:
-        """Whether the pose network encodes each image by itself, so that features serve several snippets."""
-        return self.pose.endswith("posenet-lite0")
 
     @model_validator(mode="after")
     def _can_be_halved(self) -> Self:

@@ -22,8 +22,8 @@ from torch import Tensor
 
 import erfsfm
 from erfsfm.checkpoint import Absent, Model, build_networks, fill_network, save_model
+from erfsfm.common.errors import CheckpointError
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import CheckpointError
 from erfsfm.model_record import ModelRecord, commit
 from erfsfm.networks.presets import NetworkKind
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import Absent, Model
+from erfsfm.common.errors import ExportError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.onnx_session import open_session
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import ExportError
-from erfsfm.files import write_atomically
 from erfsfm.networks.onnx_export import exported
 from erfsfm.networks.presets import NetworkKind
-from erfsfm.onnx_session import open_session
 
 # of the largest output; a thousand roundings of float32
 TOLERANCE = 1e-4

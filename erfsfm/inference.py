@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar
@@ -17,20 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from erfsfm.common.errors import CheckpointError, ConfigError, DataError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
+from erfsfm.common.readers.images import resize_image
+from erfsfm.common.threads import usable_cores
 from erfsfm.data.splits import overlapping as overlapping  # for slam, which imports only this module
-from erfsfm.errors import CheckpointError, ConfigError, DataError
-from erfsfm.files import write_atomically
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
-from erfsfm.readers.images import read_image as read_image  # images are read as for training
-from erfsfm.readers.images import resize_image
-from erfsfm.threads import usable_cores
 
 if TYPE_CHECKING:  # PyTorch takes seconds to import, and is needed only where no graph of the networks is kept
-    from torch import nn
-
     from erfsfm.checkpoint import Model
 
 logger = logging.getLogger(__name__)
@@ -77,19 +75,14 @@ def _may_have_gpu() -> bool:
 
 @dataclass
 class PreparedImage:
-    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``.
-
-    ``features`` are those of a pose network that encodes each image by itself, once they were asked for.
-    """
+    """An image as a predictor's networks take it: resized, in [-1, 1], ``(1, 3, h, w)``."""
 
     array: Array
-    features: Array | None = None
 
 
 class _Networks(NamedTuple):
     depth: Network
     pose: Network
-    features: Network | None = None  # of one image, for a pose network that encodes each by itself
 
 
 @lru_cache(maxsize=1)
@@ -98,21 +91,16 @@ def _graphs(folder: Path, sha256: str) -> _Networks:
     network = read_record(folder / "model.yaml").network
 
     @cache
-    def parts() -> dict[str, nn.Module]:
+    def model() -> Model:
         from erfsfm.checkpoint import load_model
-        from erfsfm.networks.torch_network import inference_parts
 
-        model = load_model(folder)
-        return inference_parts(model.depth_net, model.pose_net)
+        return load_model(folder)
 
-    names = ("depth", "pose", "features") if network.encodes_single_images else ("depth", "pose")
-    graphs = {
-        name: OnnxGraph(partial(lambda name: parts()[name], name), NETWORK_THREADS, f"{name} {sha256} {network!r}")
-        for name in names
-    }
-    if not graphs["depth"].is_kept((1, 3, network.height, network.width)):
-        parts()  # damaged weights are found before the first image
-    return _Networks(**graphs)
+    depth = OnnxGraph(lambda: model().depth_net, NETWORK_THREADS, f"depth {sha256} {network!r}")
+    pose = OnnxGraph(lambda: model().pose_net, NETWORK_THREADS, f"pose {sha256} {network!r}")
+    if not depth.is_kept((1, 3, network.height, network.width)):
+        model()  # damaged weights are found before the first image
+    return _Networks(depth, pose)
 
 
 class DepthPosePredictor:
@@ -141,11 +129,10 @@ class DepthPosePredictor:
         Raises:
             ConfigError: a device that is not there.
         """
-        from erfsfm.networks.torch_network import TorchNetwork, inference_parts
+        from erfsfm.networks.torch_network import TorchNetwork
 
         chosen = choose_device(device)
-        parts = inference_parts(model.depth_net, model.pose_net)
-        networks = _Networks(**{name: TorchNetwork(part, chosen) for name, part in parts.items()})
+        networks = _Networks(TorchNetwork(model.depth_net, chosen), TorchNetwork(model.pose_net, chosen))
         return cls(model.record, networks, chosen, sha256)
 
     @classmethod
@@ -230,7 +217,7 @@ class DepthPosePredictor:
         if len(images) != self.sources + 1:
             raise ValueError(f"a snippet must have {self.sources + 1} images; got {len(images)}")
         middle = self.sources // 2
-        inputs = [self._pose_input(image) for image in images]
+        inputs = [self._array(image) for image in images]
         target = inputs.pop(middle)
         vectors = self._finite(self._networks.pose(target, inputs)[0].astype(np.float64), "pose")
         T_source_target = np.tile(np.eye(4), (len(vectors), 1, 1))
@@ -253,16 +240,6 @@ class DepthPosePredictor:
         resized = resize_image(image, self.record.network.height, self.record.network.width)
         scaled = resized.astype(np.float32) / np.float32(127.5) - np.float32(1)
         return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
-
-    def _pose_input(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
-        """The image, or its features where the pose network encodes each image by itself."""
-        features = self._networks.features
-        if features is None:
-            return self._array(image)
-        prepared = image if isinstance(image, PreparedImage) else self.prepare(image)
-        if prepared.features is None:
-            prepared.features = features(prepared.array)
-        return prepared.features
 
     def _array(self, image: NDArray[np.uint8] | PreparedImage) -> Array:
         return image.array if isinstance(image, PreparedImage) else self._input(image)

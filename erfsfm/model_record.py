@@ -10,10 +10,10 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field, ValidationError
 
+from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.errors import CheckpointError
+from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import NetworkConfig
-from erfsfm.config_tree import Section, first_problem
-from erfsfm.errors import CheckpointError
-from erfsfm.yaml_file import YamlError, read_yaml
 
 FORMAT: Literal[1] = 1
 SHIPPED = Path(__file__).parent / "weights"

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from erfsfm.config_tree import Section, dump_yaml, first_problem
-from erfsfm.errors import CheckpointError
-from erfsfm.files import write_atomically
-from erfsfm.yaml_file import YamlError, read_yaml
+from erfsfm.common.config_tree import Section, dump_yaml, first_problem
+from erfsfm.common.errors import CheckpointError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.yaml_file import YamlError, read_yaml
 
 FloatArray = NDArray[np.float64]
 # target, sources, T_source_target (N, 4, 4), photometric residuals (N,); None: residuals of 1

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from erfsfm import __version__, command_line
+from erfsfm import __version__
+from erfsfm.common import command_line
 from slam.batch.cli import verbs as batch_verbs
 from slam.calibration.cli import verbs as calibration_verbs
 from slam.downloads.cli import verbs as download_verbs

@@ -11,8 +11,8 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from erfsfm.config_tree import Section
-from erfsfm.config_tree import dump_explained as dump_yaml
+from erfsfm.common.config_tree import Section
+from erfsfm.common.config_tree import dump_explained as dump_yaml
 from slam.config_file import load_sections
 from slam.config_frontend import (
     FrontendConfig,

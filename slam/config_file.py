@@ -8,9 +8,9 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-import erfsfm.errors
-from erfsfm.config_tree import OldNames
-from erfsfm.config_tree import load_config as load_tree
+import erfsfm.common.errors
+from erfsfm.common.config_tree import OldNames
+from erfsfm.common.config_tree import load_config as load_tree
 from slam.errors import ConfigError
 
 M = TypeVar("M", bound=BaseModel)
@@ -53,5 +53,5 @@ def load_sections(
     """
     try:
         return load_tree(model, file_or_name, overrides, SHIPPED, OLD_NAMES, sections)
-    except erfsfm.errors.ConfigError as error:
+    except erfsfm.common.errors.ConfigError as error:
         raise ConfigError(str(error)) from error

@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from erfsfm.config_tree import Section
+from erfsfm.common.config_tree import Section
 
 ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps"]
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from erfsfm.config_tree import Section
+from erfsfm.common.config_tree import Section
 
 
 class WindowConfig(Section):

@@ -1,4 +1,4 @@
-"""Keyframes' learned depth refined by their neighbours at the optimised poses (`erfsfm.refinement`)."""
+"""Keyframes' learned depth refined by their neighbours at the optimised poses (`erfsfm.mvs`)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from erfsfm.refinement.appearance import Appearance
-from erfsfm.refinement.refine import RefinedDepth, Road, refine
+from erfsfm.mvs.appearance import Appearance
+from erfsfm.mvs.refine import RefinedDepth, Road, refine
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.se3 import FloatArray, invert, rotation_angle
 

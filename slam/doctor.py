@@ -8,7 +8,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
 from slam.errors import SlamError
 from slam.runtime.imports import import_open3d

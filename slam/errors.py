@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from erfsfm.errors import DataError, OneLineError
+from erfsfm.common.errors import DataError, OneLineError
 
 
 class SlamError(OneLineError):
@@ -46,7 +46,7 @@ class EmptyMapError(SlamError):
 
 @contextmanager
 def sequence_errors() -> Iterator[None]:
-    """Raise what the readers of `erfsfm.readers` refuse as a `SequenceError`; also a decorator."""
+    """Raise what the readers of `erfsfm.common.readers` refuse as a `SequenceError`; also a decorator."""
     try:
         yield
     except DataError as error:

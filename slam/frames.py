@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.readers.pinhole import Pinhole
+from erfsfm.common.readers.pinhole import Pinhole
 from slam.se3 import FloatArray, invert
 
 T = TypeVar("T")

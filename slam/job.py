@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.errors import ErfsfmError
-from erfsfm.signals import Terminated
-from erfsfm.threads import limit_library_threads, take_working_memory
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.signals import Terminated
+from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config import SlamConfig, dump_yaml
 from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics

@@ -12,10 +12,10 @@ from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from erfsfm import __version__
-from erfsfm.config_tree import first_problem
+from erfsfm.common.config_tree import first_problem
+from erfsfm.common.lock import FolderLock
+from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
-from erfsfm.lock import FolderLock
-from erfsfm.signals import raising_on_termination
 from slam.config import SlamConfig, load_config
 from slam.continuation import (
     inputs_to_continue,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from erfsfm.files import read_text
+from erfsfm.common.files import read_text
 from slam import se3
 from slam.errors import TrajectoryError
 from slam.se3 import FloatArray

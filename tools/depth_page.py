@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, save_image
 from slam.config import load_config
 from slam.errors import SlamError

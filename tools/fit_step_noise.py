@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import minimize
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
 from slam.config import FrontendConfig, GeometryConfig, load_config
 from slam.errors import SlamError

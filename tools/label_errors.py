@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError, ErfsfmError
+from erfsfm.common.readers.images import read_image
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import DriveLabels, Guess, ManyViewTeacher
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError, ErfsfmError
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
-from erfsfm.readers.images import read_image
 from erfsfm.training.supervision import GuessedDepth
 
 SIZE = (128, 416)

@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from erfsfm.errors import DataError, ErfsfmError
-from erfsfm.files import write_atomically
-from erfsfm.readers.images import image_size, list_images, read_values, resize_image
+from erfsfm.common.errors import DataError, ErfsfmError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.readers.images import image_size, list_images, read_values, resize_image
 
 MARK = "prepared.json"
 CAMERAS = ("image_0", "image_1", "image_2", "image_3")

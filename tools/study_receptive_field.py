@@ -24,23 +24,18 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, load_experiment
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import ValidationSnippets, split_recordings
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
-from erfsfm.files import write_atomically
 from erfsfm.geometry.transforms import pose_vector_to_matrix
-from erfsfm.networks.presets import PRESETS, describe
+from erfsfm.networks.presets import describe
 from erfsfm.training.objective import to_network_range
 from erfsfm.training.run import train
 
-# a plain network and its variants of wider fields
-FAMILIES = {
-    "posenet": ("erf-posenet-dilated", "erf-posenet-dfc"),
-    "posenet-lite0": ("erf-posenet-lite0",),
-}
-NETWORKS = [name for plain, wider in FAMILIES.items() for name in (plain, *wider)]
-PRETRAINED_STEPS = 4  # times fewer: matched features of a pretrained encoder need no more
+PLAIN = "posenet"
+NETWORKS = [PLAIN, "erf-posenet-dilated", "erf-posenet-dfc"]
 LEVEL = 0.95  # of the intervals
 FIELDS = {
     "simulated_ate": "ATE, worlds",
@@ -59,7 +54,7 @@ saw. Networks are paired by seed: a pair has the same draws of snippets.
 
 `{command}`
 
-{steps} steps of {batch} snippets at {width}x{height} and width {pose_width}, learning rate {rate:g}{pretrained}.
+{steps} steps of {batch} snippets at {width}x{height} and width {pose_width}, learning rate {rate:g}.
 {seeds} seeds; {training} drives and worlds. Mean and standard deviation over seeds of snippet ATE and RE (radians) on
 {simulated} snippets of simulated worlds 600 to 602 and {real} of KITTI 00, 02 and 05 (frames 250 to 299). CPU seconds
 are those of one training with one thread.
@@ -171,9 +166,6 @@ def of_run(common: ExperimentConfig, pose: str, seed: int) -> ExperimentConfig:
     tree["training"]["seed"] = seed
     tree["data"]["exclude"] += tree["data"]["validation"]
     tree["data"]["validation"] = []
-    if PRESETS[pose].encoder == "lite0":
-        tree["training"]["steps"] //= PRETRAINED_STEPS
-        tree["pretrained"] = "imagenet"
     return ExperimentConfig.model_validate(tree)
 
 
@@ -211,7 +203,6 @@ def write_page(
         f"--report docs/{report.name}",
         steps=config.training.steps,
         rate=config.training.learning_rate,
-        pretrained=_of_pretrained(rows, config),
         batch=config.training.batch,
         width=config.network.width,
         height=config.network.height,
@@ -227,13 +218,6 @@ def write_page(
         conclusion=conclusion(rows),
     )
     write_atomically(report, lambda path: path.write_text(page))
-
-
-def _of_pretrained(rows: Sequence[StudyRow], config: ExperimentConfig) -> str:
-    """What differs for networks with a pretrained encoder, where there are any."""
-    if not any(PRESETS[name].encoder == "lite0" for name in by_network(rows)):
-        return ""
-    return f"; {config.training.steps // PRETRAINED_STEPS} steps on the pretrained encoder, whose weights are frozen"
 
 
 def by_network(rows: Sequence[StudyRow]) -> dict[str, list[StudyRow]]:
@@ -281,18 +265,18 @@ def ratio_interval(plain: Sequence[StudyRow], wider: Sequence[StudyRow], field: 
     return float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half))
 
 
-def _pairs(rows: Sequence[StudyRow]) -> list[tuple[str, str]]:
-    present = by_network(rows)
-    return [(plain, name) for plain, wider in FAMILIES.items() for name in wider if {plain, name} <= set(present)]
+def _wider(runs: dict[str, list[StudyRow]]) -> list[str]:
+    """Networks of wider fields, where the plain one was trained too."""
+    return [name for name in runs if name != PLAIN] if PLAIN in runs else []
 
 
 def differences(rows: Sequence[StudyRow]) -> str:
-    """Each wider network against its plain one."""
+    """Each wider network against the plain one."""
     runs = by_network(rows)
     lines = [f"| pair | {' | '.join(FIELDS.values())} |", "|---|---|---|---|---|"]
-    for plain, name in _pairs(rows):
-        cells = ["{:.2f} ({:.2f} to {:.2f})".format(*ratio_interval(runs[plain], runs[name], f)) for f in FIELDS]
-        lines.append(f"| `{name}` / `{plain}` | {' | '.join(cells)} |")
+    for name in _wider(runs):
+        cells = ["{:.2f} ({:.2f} to {:.2f})".format(*ratio_interval(runs[PLAIN], runs[name], f)) for f in FIELDS]
+        lines.append(f"| `{name}` / `{PLAIN}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -300,15 +284,15 @@ def conclusion(rows: Sequence[StudyRow]) -> str:
     """Which intervals exclude no difference."""
     runs = by_network(rows)
     lines = []
-    for plain, name in _pairs(rows):
+    for name in _wider(runs):
         better, worse = [], []
         for field, label in FIELDS.items():
-            _, low, high = ratio_interval(runs[plain], runs[name], field)
+            _, low, high = ratio_interval(runs[PLAIN], runs[name], field)
             better += [label] if high < 1 else []
             worse += [label] if low > 1 else []
         parts = [f"{word} in {', '.join(found)}" for word, found in (("better", better), ("worse", worse)) if found]
         said = f"is {' and '.join(parts)} than" if parts else "does not differ clearly from"
-        lines.append(f"- `{name}` {said} `{plain}`.")
+        lines.append(f"- `{name}` {said} `{PLAIN}`.")
     return "\n".join(lines)
 
 

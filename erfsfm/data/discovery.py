@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
+from erfsfm.common.readers.folder import image_folder, recording_name, video_name
+from erfsfm.common.readers.images import first_size, list_images
+from erfsfm.common.readers.kitti_calibration import ODOMETRY_CALIBRATION, CalibrationFile
+from erfsfm.common.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_drives, find_odometry_root
+from erfsfm.common.readers.numbering import by_name, by_number
+from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos
 from erfsfm.data.kitti_raw import open_drive
 from erfsfm.data.pack_index import INDEX_FILE, read_pack
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video
-from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.camera_file import CAMERA_FILE, read_camera_file
-from erfsfm.readers.folder import image_folder, recording_name, video_name
-from erfsfm.readers.images import first_size, list_images
-from erfsfm.readers.kitti_calibration import ODOMETRY_CALIBRATION, CalibrationFile
-from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_drives, find_odometry_root
-from erfsfm.readers.numbering import by_name, by_number
-from erfsfm.readers.video import VIDEO_SUFFIXES, list_videos
 
 _COLOUR = (2, 3)
 

@@ -1,4 +1,4 @@
-"""KITTI raw drives as training recordings; `erfsfm.readers.kitti_drives` describes their layout.
+"""KITTI raw drives as training recordings; `erfsfm.common.readers.kitti_drives` describes their layout.
 
 Images may be smaller than the original: the calibration follows them.
 """
@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from erfsfm.common.readers.images import first_size, list_images
+from erfsfm.common.readers.kitti_calibration import CAM_TO_CAM, CalibrationFile
+from erfsfm.common.readers.kitti_drives import RAW_CAMERAS, drive_name
+from erfsfm.common.readers.numbering import by_number
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.images import first_size, list_images
-from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CalibrationFile
-from erfsfm.readers.kitti_drives import RAW_CAMERAS, drive_name
-from erfsfm.readers.numbering import by_number
 
 _COLOUR = ("02", "03")
 

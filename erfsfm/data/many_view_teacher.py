@@ -21,16 +21,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError, TrainingError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError, TrainingError
-from erfsfm.files import write_atomically
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.video import VideoFrames
-from erfsfm.teacher.drive_poses import drive_poses
-from erfsfm.teacher.many_views import NEIGHBOURS, label
-from erfsfm.teacher.structure import TeacherStructure
+from erfsfm.labels.drive_poses import drive_poses
+from erfsfm.labels.many_views import NEIGHBOURS, label
+from erfsfm.labels.structure import TeacherStructure
 
 VERSION = 1
 # pixels of the images that are measured: finer flow is slower and no surer; twice the networks' width would shift

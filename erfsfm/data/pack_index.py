@@ -9,13 +9,13 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from erfsfm.config_tree import Section, dump_yaml, first_problem
+from erfsfm.common.config_tree import Section, dump_yaml, first_problem
+from erfsfm.common.errors import DataError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shards import InShards, ShardIndex, Shards
-from erfsfm.errors import DataError
-from erfsfm.files import write_atomically
 from erfsfm.geometry.camera import Camera
-from erfsfm.yaml_file import YamlError, read_yaml
 
 INDEX_FILE = "pack.yaml"
 

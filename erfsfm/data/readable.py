@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import NetworkConfig
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 
 logger = logging.getLogger(__name__)
 

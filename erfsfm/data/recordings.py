@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import read_image, read_values, resize_image
+from erfsfm.common.readers.numbering import NumberedFiles
 from erfsfm.config import Fidelity
 from erfsfm.data.shards import InShards
 from erfsfm.data.video import Video
-from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.images import read_image, read_values, resize_image
-from erfsfm.readers.numbering import NumberedFiles
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from erfsfm.config import ExperimentConfig
 from erfsfm.data.augmentation import augment
 from erfsfm.data.weather import weathered
 from erfsfm.geometry.camera import Camera
-from erfsfm.teacher.structure import TeacherStructure
+from erfsfm.labels.structure import TeacherStructure
 
 # An image does not show its focal length. Under a teacher with one scale a drive, lengths are those of a camera of this
 # focal length, in image heights (KITTI's), so that cameras and random crops agree (Yin et al. 2023, Metric3D).

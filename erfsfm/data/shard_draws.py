@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import motion_alone, snippet_motion
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import training_sample
 from erfsfm.data.shards import Clip, InShards
 from erfsfm.data.snippets import chances, usable
-from erfsfm.errors import DataError
-from erfsfm.teacher.structure import StructureCache, TeacherStructure
+from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 _ORDER, _WITHIN = 0, 1  # what is drawn for a pass over the data
 

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from erfsfm.config_tree import Section
+from erfsfm.common.config_tree import Section
+from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.files import read_bytes
+from erfsfm.common.readers.images import decode_image
 from erfsfm.data.compact_label import Bound, decode
-from erfsfm.errors import ConfigError, DataError
-from erfsfm.files import read_bytes
-from erfsfm.readers.images import decode_image
 
 logger = logging.getLogger(__name__)
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.image_cache import ImageCache
@@ -24,9 +26,7 @@ from erfsfm.data.samples import as_tensors, training_sample
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.standstill import moving_parts
 from erfsfm.data.window import Snippet, SnippetReader, load_window, readable
-from erfsfm.errors import DataError
-from erfsfm.readers.frame_range import EVERYTHING, FrameRange
-from erfsfm.teacher.structure import StructureCache, TeacherStructure
+from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
 

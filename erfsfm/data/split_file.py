@@ -11,10 +11,10 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
+from erfsfm.common.config_tree import Section, first_problem
+from erfsfm.common.errors import DataError
+from erfsfm.common.yaml_file import YamlError, read_yaml
 from erfsfm.config import config_folders
-from erfsfm.config_tree import Section, first_problem
-from erfsfm.errors import DataError
-from erfsfm.yaml_file import YamlError, read_yaml
 
 _FRAMES = re.compile(r"(?P<recording>.+)\[(?P<runs>[\d:, ]+)\]")
 _RUN = re.compile(r"(?P<first>\d+)(?::(?P<stop>\d+)(?::(?P<step>[1-9]\d*))?)?")

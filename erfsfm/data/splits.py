@@ -1,13 +1,13 @@
 """The leak record: frames a network was trained on, and their overlap with those of an evaluation.
 
-Names are those of `erfsfm.readers.frame_range`.
+Names are those of `erfsfm.common.readers.frame_range`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from erfsfm.readers.frame_range import FrameRange, seed_span
+from erfsfm.common.readers.frame_range import FrameRange, seed_span
 
 
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.kitti_oxts import velocity
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
-from erfsfm.readers.kitti_oxts import velocity
 
 logger = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.readers.images import Image, resize_image
-from erfsfm.readers.video import VideoFrames
+from erfsfm.common.readers.images import Image, resize_image
+from erfsfm.common.readers.video import VideoFrames
 
 _kept: dict[Path, Image] = {}  # of this process: the frames ``(N, height, width, 3)`` of each video at one size
 

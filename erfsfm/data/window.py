@@ -10,9 +10,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.image_cache import ImageCache
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 
 logger = logging.getLogger(__name__)
 

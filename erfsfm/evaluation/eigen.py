@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.images import read_image, resize_image
 from erfsfm.config import Fidelity
 from erfsfm.data.split_file import read_split_file
-from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import CAP_M, PoseDepthNetworks, refuse_leak
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, flat_road_depth, lidar_depth
-from erfsfm.files import read_text
 from erfsfm.model_record import ModelRecord
-from erfsfm.readers.images import read_image, resize_image
 
 _STILL_M = 0.1
 _FLAT_ROAD_M = 20.0

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher, Progress
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import PoseDepthNetworks, named_recordings, refuse_leak
 

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 from erfsfm.evaluation.protocols import PoseDepthNetworks, refuse_leak, windows
 from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from erfsfm.pose_noise import FloatArray, PoseNoise, Snippet, difference, pair_poses

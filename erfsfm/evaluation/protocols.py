@@ -10,13 +10,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import Fidelity
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network, snippets_from_trajectory
-from erfsfm.readers.frame_range import EVERYTHING, FrameRange
 
 CAP_M = 80.0
 

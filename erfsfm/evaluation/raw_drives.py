@@ -1,7 +1,7 @@
 """Single frames of KITTI raw drives: the images around one, its LiDAR depth, and how far the car moved.
 
 Layout: ``ROOT/2011_09_26/2011_09_26_drive_0013_sync/{image_02,velodyne_points,oxts}/data``, calibration in the folder
-of the date (`erfsfm.readers.kitti_drives`). Images may be smaller than the original: the calibration follows them.
+of the date (`erfsfm.common.readers.kitti_drives`). Images may be smaller than the original; the calibration follows.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.config import Fidelity
-from erfsfm.errors import DataError
-from erfsfm.readers.kitti_calibration import (
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.kitti_calibration import (
     ASPECT_TOLERANCE,
     CAM_TO_CAM,
     CAMERA_HEIGHT_M,
@@ -24,7 +23,8 @@ from erfsfm.readers.kitti_calibration import (
     CalibrationFile,
     FloatArray,
 )
-from erfsfm.readers.kitti_oxts import velocity
+from erfsfm.common.readers.kitti_oxts import velocity
+from erfsfm.config import Fidelity
 
 _FRAME = re.compile(
     r"(?:(?P<date>\d{4}_\d\d_\d\d)/)?(?P<drive>(?P<day>\d{4}_\d\d_\d\d)_drive_\d{4})(?:_sync)?"

@@ -36,12 +36,6 @@ def cell_rays(rows: int, columns: int, cell: tuple[float, float], device: torch.
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
-def image_positions(points: Tensor) -> Tensor:
-    """Points of the image plane ``(..., 2)`` in the coordinates of ``grid_sample``: -1 to 1 from edge to edge."""
-    x, y = points.unbind(-1)
-    return torch.stack([2 * (x * FOCAL[0] + CENTRE[0]) - 1, 2 * (y * FOCAL[1] + CENTRE[1]) - 1], dim=-1)
-
-
 def project(rays: Tensor, inverse_depth: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Points of a target seen from its source.
 

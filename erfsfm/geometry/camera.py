@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from erfsfm.common.readers.pinhole import Pinhole
 from erfsfm.config import Fidelity
-from erfsfm.readers.pinhole import Pinhole
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from erfsfm.files import read_bytes, write_atomically
+from erfsfm.common.files import read_bytes, write_atomically
 
 _MOST_BYTES = 2**30
 _MOST_GRAPHS = 16

@@ -13,7 +13,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock, Encoder, Layer
 
 STEM_CHANNELS = 32
@@ -94,23 +94,23 @@ class InvertedResidual(nn.Module):
 
 
 class Lite0Encoder(Encoder):
-    """Stem and seven stages or the first of them, then a `context` of 3 x 3 convolutions; each output is kept.
+    """Stem and seven stages, then a `context` of 3 x 3 convolutions; each output is kept.
 
     Batch statistics stay ImageNet's: a batch of four video frames is too few for its own.
     """
 
-    def __init__(self, in_channels: int, context: list[ConvBlock], pretrained: int = 1 + len(STAGES)) -> None:
+    def __init__(self, in_channels: int, context: ConvBlock) -> None:
         super().__init__([])
         self.stages.append(nn.Sequential(Lite0Conv(in_channels, STEM_CHANNELS, Layer(3, 2))))
         inside = STEM_CHANNELS
-        for repeats, kernel, stride, expansion, outside in STAGES[: pretrained - 1]:
+        for repeats, kernel, stride, expansion, outside in STAGES:
             blocks = []
             for repeat in range(repeats):
                 layer = Layer(kernel, stride if repeat == 0 else 1)
                 blocks.append(InvertedResidual(inside, outside, layer, expansion))
                 inside = outside
             self.stages.append(nn.Sequential(*blocks))
-        self.stages.append(nn.Sequential(*context))
+        self.stages.append(nn.Sequential(context))
 
     def blocks(self) -> Iterator[ConvBlock | Lite0Conv]:  # type: ignore[override]
         """Convolutions wider than one pixel, first to last."""

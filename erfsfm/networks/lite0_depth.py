@@ -32,7 +32,7 @@ class Lite0DepthNet(nn.Module):
         deformable = variant == "dfc"
         wide = Layer(3, 1, deformable=deformable)
         context = ConvBlock(CHANNELS, channels[0], wide)
-        self.encoder = Lite0Encoder(self.input_channels, [context])
+        self.encoder = Lite0Encoder(self.input_channels, context)
         skips = [*reversed(SKIP_CHANNELS), 0]  # 1/16 to 1/2; the image itself is not a skip
         before = nn.ModuleList()
         after = nn.ModuleList()

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 
+from erfsfm.common.onnx_session import open_session
 from erfsfm.networks.graph_folder import is_kept, keep, kept
-from erfsfm.onnx_session import open_session
 
 if TYPE_CHECKING:
     from torch import nn

@@ -6,13 +6,12 @@ from typing import Literal, get_args
 
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import Activation, Fidelity, Normalisation, Variant, let_leak
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.image_alignment import Alignment
 from erfsfm.networks.lite0_depth import Lite0DepthNet
-from erfsfm.networks.lite0_pose import Lite0PoseNet
-from erfsfm.networks.pose_net import MAX_SOURCES, PoseNet
+from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.receptive_field import Network, multiply_adds, theoretical
 
 NetworkKind = Literal["depth", "pose"]
@@ -59,8 +58,6 @@ PRESETS: dict[str, Preset] = {
     "erf-posenet-dilated": Preset("pose", "dilated"),
     "erf-posenet-dfc": Preset("pose", "dfc"),
     "erf-posenet-dfcv2": Preset("pose", "dfcv2"),
-    "posenet-lite0": Preset("pose", "plain", "lite0"),
-    "erf-posenet-lite0": Preset("pose", "dfc", "lite0"),
 }
 
 
@@ -99,9 +96,9 @@ def build(
     _check_choice("activation", activation, get_args(Activation))
     network: Network
     if preset.encoder == "lite0":
-        if preset.kind == "pose" and alignment != "none":
-            raise ConfigError(f"{name} solves for the motion by itself: set network.alignment to none")
-        network = _build_lite0(name, preset, fidelity, width, sources, mask_branch)
+        if fidelity == "paper":
+            raise ConfigError(f"{name} is not of the paper: set network.fidelity to default")
+        network = Lite0DepthNet(preset.variant, width)
     elif preset.kind == "depth":
         network = DepthNet(preset.variant, fidelity, width, normalisation)
     else:
@@ -112,20 +109,6 @@ def build(
     if activation == "leaky":
         let_leak(network)
     return network
-
-
-def _build_lite0(
-    name: str, preset: Preset, fidelity: Fidelity, width: float, sources: int, mask_branch: bool
-) -> Lite0DepthNet | Lite0PoseNet:
-    if fidelity == "paper":
-        raise ConfigError(f"{name} is not of the paper: set network.fidelity to default")
-    if preset.kind == "depth":
-        return Lite0DepthNet(preset.variant, width)
-    if mask_branch:
-        raise ConfigError(f"{name} has no explainability masks: set network.masks to false")
-    if not 1 <= sources <= MAX_SOURCES:
-        raise ConfigError(f"sources must be 1 to {MAX_SOURCES}; got {sources}")
-    return Lite0PoseNet(preset.variant, width, sources)
 
 
 def describe(fidelity: Fidelity = "default", width: float = 1.0, sources: int = 4) -> list[NetworkSummary]:

@@ -5,21 +5,21 @@ The paper compares its networks by the receptive field of one pixel of the last 
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from erfsfm.networks.blocks import Encoder, Layer
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.lite0_depth import Lite0DepthNet
-from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.pose_net import PoseNet
 
-Network = DepthNet | PoseNet | Lite0DepthNet | Lite0PoseNet
+Network = DepthNet | PoseNet | Lite0DepthNet
 
 # Gradients below this ratio of the largest are rounding of the sampling positions in float64.
 _ROUNDING = 1e-11
@@ -204,30 +204,11 @@ def multiply_adds(network: Network, height: int = 128, width: int = 416) -> int:
         ConfigError: if the network cannot run forward.
     """
     shadow = copy.deepcopy(network).to("meta").eval()
-    total = 0
-
-    def count(places: Callable[[Tensor, Tensor], int], each: int) -> Callable[..., None]:
-        def hook(_module: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-            nonlocal total
-            total += places(inputs[0], output) * each
-
-        return hook
-
-    for module in shadow.modules():
-        if isinstance(module, nn.ConvTranspose2d):  # every input pixel is multiplied by the whole kernel
-            module.register_forward_hook(count(lambda before, _: before[0, 0].numel(), module.weight.numel()))
-        elif isinstance(module, nn.Conv2d):
-            module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), module.weight.numel()))
-        elif isinstance(module, DeformableConv2d):  # its kernel is used, not called
-            weights = module.kernel.weight.numel()
-            module.register_forward_hook(count(lambda _, after: after[0, 0].numel(), weights))
     image = torch.empty(1, 3, height, width, device="meta")
-    with torch.no_grad():
-        if isinstance(shadow, PoseNet | Lite0PoseNet):
-            shadow(image, [image] * shadow.sources)
-        else:
-            shadow(image)
-    return total
+    images = (image, [image] * shadow.sources) if isinstance(shadow, PoseNet) else (image,)
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        shadow(*images)
+    return int(counter.get_total_flops()) // 2
 
 
 def _set_offsets(encoder: Encoder, offsets_px: float | Literal["learned"]) -> set[nn.Module]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 
 PARTING = 0.05  # of a tensor's standard deviation
 

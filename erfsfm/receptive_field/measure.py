@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.checkpoint import Model
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import Fidelity
-from erfsfm.errors import ConfigError
 from erfsfm.networks.presets import PRESETS, build
 from erfsfm.networks.receptive_field import (
     MeasuredField,

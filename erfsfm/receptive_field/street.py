@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.readers.kitti_calibration import CAMERA_HEIGHT_M
+from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M
 
 _HALF_WIDTH_M = 7.0
 _FOCAL_SHARE = 0.58  # focal length over image width, as KITTI's

@@ -13,9 +13,9 @@ from lightning.pytorch.callbacks import Callback
 
 import erfsfm
 from erfsfm.checkpoint import KINDS, Absent, Model, save_model
+from erfsfm.common.errors import TrainingError
 from erfsfm.config import TrainedNetworks
 from erfsfm.data.splits import merge
-from erfsfm.errors import TrainingError
 from erfsfm.model_record import ModelRecord, commit, read_record
 from erfsfm.training.module import SelfSupervision
 

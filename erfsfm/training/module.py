@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Self
 
 import lightning
@@ -13,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
+from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig, TrainedNetworks
-from erfsfm.errors import TrainingError
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.pose_metrics import snippet_errors, snippet_from_network
 from erfsfm.geometry.transforms import pose_vector_to_matrix
@@ -23,11 +22,9 @@ from erfsfm.losses.photometric import photometric_error
 from erfsfm.losses.structure import Bounds
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv, Lite0Encoder
-from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.presets import NetworkKind
-from erfsfm.training.feature_memory import FeatureMemory, features_recur
 from erfsfm.training.muon import Muon, is_matrix
-from erfsfm.training.objective import PoseFunction, SnippetBatch, evaluate_objective, to_network_range
+from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_network_range
 
 # Spread of a disparity map (standard deviation over mean) below which it is a constant; fresh networks have 0.04.
 _CONSTANT = 1e-3
@@ -53,9 +50,6 @@ class SelfSupervision(lightning.LightningModule):
         self.depth_net, self.pose_net = build_networks(config.network)
         self.known: TrainedNetworks = config.training.networks  # those that are trained here, or were before
         self._choose_trained()
-        self._features: FeatureMemory | None = None
-        if isinstance(self.pose_net, Lite0PoseNet) and features_recur(config):
-            self._features = FeatureMemory(self.pose_net, config.data.cache_mb)
         self.train()  # Lightning keeps the mode of each module
         self.validation_metrics: dict[str, float] = {}
         self._validation: dict[str, list[float]] = {}
@@ -98,10 +92,7 @@ class SelfSupervision(lightning.LightningModule):
         snippets = SnippetBatch(
             batch["target"], batch["sources"], batch["K"], batch.get("T_source_target"), bounds, batch.get("shown")
         )
-        pose_net: torch.nn.Module | PoseFunction = self.pose_net
-        if self._features is not None:
-            pose_net = partial(self._features.poses, frames=batch["frames"])
-        result = evaluate_objective(self.depth_net, pose_net, snippets, self._config_of_step())
+        result = evaluate_objective(self.depth_net, self.pose_net, snippets, self._config_of_step())
         if not torch.isfinite(result.total):
             parts = ", ".join(f"{name} {value.item():.3g}" for name, value in result.terms.items())
             raise TrainingError(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig
-from erfsfm.errors import ConfigError
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
 from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample
@@ -24,17 +23,14 @@ from erfsfm.losses.regularisation import (
 )
 from erfsfm.losses.structure import Bounds, disagreement, step_disagreement, translation_disagreement
 
-PoseFunction = Callable[[Tensor, Sequence[Tensor]], list[Tensor] | Tensor]
-
 HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are then as small as initial outputs
-_COARSE_WEIGHT = 0.3  # of each estimate of the motion before the last
 
 
 @dataclass(frozen=True)
 class SnippetBatch:
     """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
-    Measurements of the teacher (`erfsfm.teacher.structure`), where one is used: ``T_source_target``
+    Measurements of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
     ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
     With simulated weather: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """
@@ -76,7 +72,7 @@ def to_network_range(image: Tensor) -> Tensor:
 
 
 def evaluate_objective(
-    depth_net: nn.Module, pose_net: nn.Module | PoseFunction, batch: SnippetBatch, config: ExperimentConfig
+    depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig
 ) -> ObjectiveResult:
     """Predict depth and poses of a batch and evaluate the loss.
 
@@ -85,7 +81,7 @@ def evaluate_objective(
 
     Args:
         depth_net: in training mode, where it gives a pyramid of disparities.
-        pose_net: for as many sources as the batch has; a function where poses come from known features.
+        pose_net: for as many sources as the batch has.
         batch: images and intrinsics.
         config: its ``loss``, ``network`` and ``teacher`` sections are used.
     """
@@ -96,21 +92,15 @@ def evaluate_objective(
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Outputs of the networks in the images' precision; ``adjacent`` are disparities of the two nearest sources.
-
-    ``coarse_poses`` are the estimates of a network that goes from coarse to fine, before its last.
-    """
+    """Outputs of the networks in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
 
     disparities: list[Tensor]
     pose_vectors: Tensor
-    coarse_poses: list[Tensor]
     masks: list[Tensor] | None
     adjacent: tuple[Tensor, ...]
 
     @staticmethod
-    def of(
-        depth_net: nn.Module, pose_net: nn.Module | PoseFunction, batch: SnippetBatch, config: ExperimentConfig
-    ) -> _Prediction:
+    def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
         precise = batch.target.dtype
         target, sources = batch.seen()
         disparities: list[Tensor] = []
@@ -119,22 +109,19 @@ class _Prediction:
                 raise ValueError("the objective needs the depth network in training mode")
             disparities = [disparity.to(precise) for disparity in depth_net(target)]
         masks: list[Tensor] | None = None
-        coarse: list[Tensor] = []
         if config.network.masks:
-            pose_vectors, masks = pose_net.forward_with_masks(target, sources)  # type: ignore[operator, union-attr]
+            pose_vectors, masks = pose_net.forward_with_masks(target, sources)  # type: ignore[operator]
             masks = [mask.to(precise) for mask in masks]
             _require_sizes(masks, disparities, config)
         elif needs_poses(config):
-            answer = pose_net(target, sources)
-            *coarse, pose_vectors = answer if isinstance(answer, list) else [answer]
+            pose_vectors = pose_net(target, sources)
         else:
             pose_vectors = target.new_zeros(len(target), len(sources), 6)
         adjacent: tuple[Tensor, ...] = ()
         if config.loss.consistency_weight > 0:
             nearest = [sources[k] for k in _adjacent(len(sources))]
             adjacent = depth_net(torch.cat(nearest))[0].to(precise).chunk(len(nearest))
-        coarse = [vectors.to(precise) for vectors in coarse]
-        return _Prediction(disparities, pose_vectors.to(precise), coarse, masks, adjacent)
+        return _Prediction(disparities, pose_vectors.to(precise), masks, adjacent)
 
 
 def needs_depth(config: ExperimentConfig) -> bool:
@@ -227,13 +214,8 @@ def _teacher_terms(
             terms["edge"] = step_disagreement(disparities[0], bounds)
     if needs_poses(config):
         t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
-        estimates = [(1.0, T_source_target)]
-        estimates += [(_COARSE_WEIGHT, pose_vector_to_matrix(vectors)) for vectors in prediction.coarse_poses]
-        rotations, translations = [], []
-        for weight, T in estimates:
-            rotations.append(weight * rotation_disagreement(T[..., :3, :3], T_measured[..., :3, :3]))
-            translations.append(weight * translation_disagreement(T[..., :3, 3], t_measured))
-        terms["rotation"], terms["translation"] = torch.stack(rotations).sum(), torch.stack(translations).sum()
+        terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
+        terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_measured)
     return terms
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
+from erfsfm.common.errors import ConfigError, TrainingError
+from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig, dump_yaml, load_experiment
-from erfsfm.errors import ConfigError, TrainingError
-from erfsfm.files import write_atomically
 
 CONFIG = "config.yaml"
 # what a damaged checkpoint makes torch.load raise besides

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.compact_label import encode
 from erfsfm.data.many_view_teacher import DriveLabels, ManyViewTeacher
@@ -29,8 +31,6 @@ from erfsfm.data.pack_index import (
 from erfsfm.data.readable import readable_parts
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import ValidationSnippets, split_recordings, usable
-from erfsfm.errors import ConfigError, DataError
-from erfsfm.files import write_atomically
 from erfsfm.training.progress import stage_bars
 from erfsfm.training.run import trained_on
 from erfsfm.training.supervision import measured_views

@@ -23,18 +23,18 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import KINDS, load_model
+from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.files import write_atomically
+from erfsfm.common.lock import FolderLock
+from erfsfm.common.signals import Terminated, raising_on_termination
+from erfsfm.common.threads import single_threaded_opencv
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
 from erfsfm.data.splits import merge
-from erfsfm.errors import ConfigError, DataError
-from erfsfm.files import write_atomically
 from erfsfm.inference import choose_device
-from erfsfm.lock import FolderLock
 from erfsfm.networks.transfer import take_over
-from erfsfm.signals import Terminated, raising_on_termination
-from erfsfm.threads import single_threaded_opencv
 from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
@@ -176,7 +176,7 @@ def _fit(
             trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
     except DataError as error:
         # an error of a worker process has its traceback before the message, its last line
-        raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.errors.DataError: ")) from error
+        raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.common.errors.DataError: ")) from error
     except SystemExit as error:
         number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
         raise Terminated(number, f" at step {trainer.global_step}: continue with --resume") from error

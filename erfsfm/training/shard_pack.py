@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.compact_label import encode
 from erfsfm.data.many_view_teacher import ManyViewTeacher
@@ -29,7 +30,6 @@ from erfsfm.data.shards import (
     webdataset,
 )
 from erfsfm.data.snippets import split_recordings, usable
-from erfsfm.errors import DataError
 from erfsfm.training.pack import TEACHER_FOLDER, jpeg, require_room, validation_drives, write_drive
 from erfsfm.training.progress import stage_bars
 from erfsfm.training.run import trained_on

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from erfsfm.errors import ErfsfmError
-from erfsfm.yaml_file import read_yaml
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.yaml_file import read_yaml
 from slam.errors import SequenceError
 from slam.sequences.catalogue import sequence_names
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from erfsfm.figure_file import save_figure
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.common.figure_file import save_figure
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.calibration.solve import Calibration
 from slam.sequences.recording import ImageSource
 from slam.sequences.undistortion import Undistortion

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from erfsfm.errors import DataError
-from erfsfm.figure_file import require_figure
-from erfsfm.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.readers.folder import image_folder
-from erfsfm.readers.images import list_images
-from erfsfm.readers.numbering import in_order
-from erfsfm.readers.video import VideoFrames
+from erfsfm.common.errors import DataError
+from erfsfm.common.figure_file import require_figure
+from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.folder import image_folder
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.readers.video import VideoFrames
 from slam.calibration.board import Board
 from slam.calibration.picture import write_picture
 from slam.calibration.solve import Calibration, Model, calibrate

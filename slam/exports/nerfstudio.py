@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from slam.errors import RunError, SlamError
 from slam.formats.ply import Ply, write_ply
 from slam.formats.transforms import TRANSFORMS, write_transforms

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from erfsfm.files import read_text
+from erfsfm.common.files import read_text
 from slam.errors import RunError
 from slam.frames import RelativePose
 from slam.se3 import FloatArray

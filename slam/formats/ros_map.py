@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from erfsfm.files import read_text
+from erfsfm.common.files import read_text
 from slam.errors import RunError
 from slam.storage.files import write_atomically
 

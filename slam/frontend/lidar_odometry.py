@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from slam.errors import SlamError
 from slam.frames import RelativePose, Sequence
 from slam.frontend.failure import MeasurementFailure

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 
+from erfsfm.common.lock import FolderLock
+from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.lock import FolderLock
-from erfsfm.signals import raising_on_termination
 from slam.config import load_config
 from slam.errors import SlamError
 from slam.job import Job, Stream, complete

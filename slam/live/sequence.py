@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from slam.errors import SequenceError
 from slam.frames import Frame, Image, Intrinsics
 from slam.live.reader import Arrival, Reader

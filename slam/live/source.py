@@ -14,9 +14,9 @@ from typing import Any, BinaryIO, Protocol
 import cv2
 import numpy as np
 
-from erfsfm.errors import DataError
-from erfsfm.files import open_written
-from erfsfm.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
+from erfsfm.common.errors import DataError
+from erfsfm.common.files import open_written
+from erfsfm.common.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Image
 from slam.sequences.camera_file import DEFAULT_FPS

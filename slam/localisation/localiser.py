@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.errors import DataError
-from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile
-from erfsfm.readers.folder import image_folder
-from erfsfm.readers.images import list_images, read_image
-from erfsfm.readers.numbering import in_order
-from erfsfm.threads import take_working_memory
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
+from erfsfm.common.readers.folder import image_folder
+from erfsfm.common.readers.images import list_images, read_image
+from erfsfm.common.readers.numbering import in_order
+from erfsfm.common.threads import take_working_memory
 from slam.config import LoopsConfig, load_stored
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics, View

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.readers.pinhole import Pinhole, impossible
+from erfsfm.common.readers.pinhole import Pinhole, impossible
 from slam.errors import RunError
 from slam.frames import Intrinsics, View
 from slam.se3 import FloatArray, is_se3

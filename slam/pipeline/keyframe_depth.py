@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from erfsfm.refinement.refine import RefinedDepth, Road
+from erfsfm.mvs.refine import RefinedDepth, Road
 from slam.config import DepthConfig, MappingConfig
 from slam.depth_refinement import DepthRefiner
 from slam.frames import DepthMap, Image, Intrinsics

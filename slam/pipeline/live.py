@@ -10,10 +10,10 @@ from typing import Concatenate, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
 
+from erfsfm.common.readers.camera_file import HIGHEST_M
+from erfsfm.common.readers.pinhole import impossible
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
-from erfsfm.readers.camera_file import HIGHEST_M
-from erfsfm.readers.pinhole import impossible
 from slam.config import SlamConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.files import MAX_IMAGE_BYTES, read_bytes
-from erfsfm.readers.images import natural_key, read_values
-from erfsfm.readers.numbering import by_name
+from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
+from erfsfm.common.readers.images import natural_key, read_values
+from erfsfm.common.readers.numbering import by_name
 from slam.config import DepthConfig
 from slam.errors import SlamError, sequence_errors
 from slam.frames import DepthMap, Frame

@@ -18,10 +18,10 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
-from erfsfm.files import read_bytes
+from erfsfm.common.files import read_bytes
+from erfsfm.common.onnx_session import open_session
+from erfsfm.common.readers.images import resize_image
 from erfsfm.inference import NETWORK_THREADS
-from erfsfm.onnx_session import open_session
-from erfsfm.readers.images import resize_image
 from slam.config import DepthConfig
 from slam.errors import SlamError
 from slam.frames import Frame, Image

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from erfsfm.lock import FolderLock
+from erfsfm.common.lock import FolderLock
 from slam.errors import RunError
 from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
 from slam.results.output import TRAJECTORIES as TRAJECTORIES

@@ -13,7 +13,7 @@ from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from erfsfm.files import unfinished_name, write_atomically
+from erfsfm.common.files import unfinished_name, write_atomically
 from slam.errors import RunError
 from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps

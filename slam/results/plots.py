@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from erfsfm.figure_file import require_figure, save_figure
+from erfsfm.common.figure_file import require_figure, save_figure
 from slam.errors import RunError
 from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
 from slam.frames import DepthMap, Image

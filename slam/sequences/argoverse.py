@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from erfsfm.errors import DataError
-from erfsfm.readers.camera_file import camera_of
-from erfsfm.readers.images import has_images, list_images
-from erfsfm.readers.numbering import by_name
-from erfsfm.readers.scan import measured_points
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import camera_of
+from erfsfm.common.readers.images import has_images, list_images
+from erfsfm.common.readers.numbering import by_name
+from erfsfm.common.readers.scan import measured_points
 from slam import se3
 from slam.errors import SequenceError
 from slam.runtime.imports import import_feather

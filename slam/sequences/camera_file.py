@@ -1,6 +1,6 @@
 """Which camera a sequence has: a ``camera.yaml`` or a field of view given by the user, or the recording's own.
 
-The keys of ``camera.yaml`` are described in `erfsfm.readers.camera_file`.
+The keys of ``camera.yaml`` are described in `erfsfm.common.readers.camera_file`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from erfsfm.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
+from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
 from slam.errors import SequenceError, sequence_errors
 
 DEFAULT_FPS = 10.0

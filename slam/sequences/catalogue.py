@@ -7,9 +7,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from erfsfm.errors import DataError
-from erfsfm.readers.kitti_drives import drive_name, find_odometry_root
-from erfsfm.readers.video import VIDEO_SUFFIXES
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
+from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Sequence
 from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from erfsfm.readers.frame_range import EVERYTHING, FrameRange
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Frame, Intrinsics, Sequence
 from slam.se3 import FloatArray, invert

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.errors import DataError
-from erfsfm.readers.images import read_values
-from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import read_values
+from erfsfm.common.readers.numbering import NumberedFiles
 from slam.se3 import FloatArray
 
 KITTI_PER_METRE = 256.0

@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from erfsfm.errors import ErfsfmError
-from erfsfm.files import read_text
-from erfsfm.readers.camera_file import CameraFile, camera_of
-from erfsfm.readers.numbering import by_table
-from erfsfm.yaml_file import parse_yaml
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.camera_file import CameraFile, camera_of
+from erfsfm.common.readers.numbering import by_table
+from erfsfm.common.yaml_file import parse_yaml
 from slam import se3
 from slam.errors import SequenceError
 from slam.se3 import FloatArray

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from erfsfm.readers.folder import image_folder, recording_name
-from erfsfm.readers.images import list_images
-from erfsfm.readers.numbering import NumberedFiles, by_name
+from erfsfm.common.readers.folder import image_folder, recording_name
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.numbering import NumberedFiles, by_name
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.files import read_text
+from erfsfm.common.files import read_text
 from slam.errors import SequenceError
 from slam.geodesy import GpsTrack
 from slam.se3 import FloatArray

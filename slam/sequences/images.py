@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from erfsfm.readers.images import first_usual, read_image
-from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.common.readers.images import first_usual, read_image
+from erfsfm.common.readers.numbering import NumberedFiles
 from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Image
 

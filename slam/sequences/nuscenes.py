@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from erfsfm.readers.camera_file import camera_of
-from erfsfm.readers.numbering import by_table
-from erfsfm.readers.scan import read_velodyne
+from erfsfm.common.readers.camera_file import camera_of
+from erfsfm.common.readers.numbering import by_table
+from erfsfm.common.readers.scan import read_velodyne
 from slam import se3
 from slam.errors import SequenceError
 from slam.se3 import FloatArray

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.files import read_text
+from erfsfm.common.files import read_text
 from slam import se3
 from slam.errors import SequenceError
 from slam.se3 import FloatArray

@@ -15,8 +15,8 @@ from typing import Protocol
 
 import numpy as np
 
-from erfsfm.files import read_text
-from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.numbering import NumberedFiles
 from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
 from slam.se3 import FloatArray, is_se3

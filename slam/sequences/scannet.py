@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.files import read_text
-from erfsfm.readers.camera_file import CameraFile, camera_of
-from erfsfm.readers.images import has_images, list_images
-from erfsfm.readers.numbering import by_name
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.camera_file import CameraFile, camera_of
+from erfsfm.common.readers.images import has_images, list_images
+from erfsfm.common.readers.numbering import by_name
 from slam.errors import SequenceError
 from slam.sequences.camera_file import Sized, own_camera
 from slam.sequences.depth_maps import DepthMaps

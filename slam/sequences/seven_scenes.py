@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.readers.camera_file import CameraFile
-from erfsfm.readers.numbering import by_table
+from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.numbering import by_table
 from slam.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.depth_maps import DepthMaps

@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from erfsfm.files import read_text
-from erfsfm.readers.camera_file import CameraFile
-from erfsfm.readers.numbering import NumberedFiles
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.numbering import NumberedFiles
 from slam.errors import SequenceError
 from slam.se3 import FloatArray
 from slam.sequences.camera_file import beside, find_camera_file

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.depth_sampling import sampled_depth
 from slam.errors import SequenceError
 from slam.frames import DepthMap, Image, Intrinsics, Sequence

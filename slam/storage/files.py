@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from erfsfm import files
+from erfsfm.common import files
 from slam.errors import SlamError
 
 # some keyframes of a pass that has not ended (`slam.pipeline.checkpoint`)
@@ -16,7 +16,7 @@ KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")
 def write_atomically(
     path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
 ) -> None:
-    """`erfsfm.files.write_atomically` that raises a `SlamError`.
+    """`erfsfm.common.files.write_atomically` that raises a `SlamError`.
 
     Raises:
         SlamError: (or the given kind) the file cannot be written.

@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from erfsfm.config_tree import first_problem
-from erfsfm.files import read_text
+from erfsfm.common.config_tree import first_problem
+from erfsfm.common.files import read_text
 from slam.errors import RunError
 
 _MAX_BYTES = 64 * 2**20

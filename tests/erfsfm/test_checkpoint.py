@@ -13,9 +13,9 @@ from safetensors.torch import load_file, save_file
 
 import erfsfm.model_record as model_record
 from erfsfm.checkpoint import Model, build_networks, load_model, save_model
+from erfsfm.common.errors import CheckpointError
+from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import CheckpointError
-from erfsfm.files import write_atomically
 from erfsfm.model_record import ModelRecord, find_weights, weights_sha256
 
 FILES = ("depth.safetensors", "pose.safetensors")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, NetworkConfig, config_folders, dump_yaml, load_experiment
-from erfsfm.errors import ConfigError
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
 

@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.errors import CheckpointError
 from erfsfm.convert import convert, read_old
-from erfsfm.errors import CheckpointError
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.networks.deformable import deform_conv2d
 

@@ -14,8 +14,8 @@ from torch import nn
 
 import erfsfm.export
 from erfsfm.checkpoint import Absent, Model, build_networks
+from erfsfm.common.errors import ConfigError, ExportError
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import ConfigError, ExportError
 from erfsfm.export import export_onnx, pose_path
 from erfsfm.model_record import ModelRecord
 from erfsfm.networks.deformable import DeformableConv2d

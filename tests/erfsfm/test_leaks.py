@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import ExperimentConfig
-from erfsfm.errors import DataError
 from erfsfm.evaluation.eigen import eigen_protocol
 from erfsfm.evaluation.protocols import pose_protocol
 from erfsfm.inference import DepthPosePredictor

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from erfsfm.errors import CheckpointError
+from erfsfm.common.errors import CheckpointError
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, pair_poses, read_pose_noise, write_pose_noise
 
 NOISE = PoseNoise(

@@ -16,7 +16,7 @@ import yaml
 
 import slam.results.metrics
 import slam.run
-from erfsfm.signals import Terminated
+from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.config import PoseGraphConfig, load_config
 from slam.errors import RunError, SlamError

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from erfsfm.errors import BusyError
-from erfsfm.signals import Terminated
+from erfsfm.common.errors import BusyError
+from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.cli import main
 from slam.errors import RunError, SlamError

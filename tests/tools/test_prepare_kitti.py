@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
-from erfsfm.errors import DataError
 from erfsfm.evaluation.raw_drives import RawFrame, lidar_depth
 
 TOOL = Path(__file__).parents[2] / "tools" / "prepare_kitti.py"

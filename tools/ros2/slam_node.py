@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from tf2_ros import TransformBroadcaster
 
-from erfsfm.errors import ErfsfmError
+from erfsfm.common.errors import ErfsfmError
 from slam import Slam
 from slam.config import load_config
 from slam.errors import SlamError

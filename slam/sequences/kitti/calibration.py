@@ -1,4 +1,4 @@
-"""Poses of one sensor of KITTI's car from those of another; files are read by `erfsfm.readers.kitti_calibration`."""
+"""Poses of one sensor of KITTI's car from those of another; `common.readers.kitti_calibration` reads the files."""
 
 from __future__ import annotations
 

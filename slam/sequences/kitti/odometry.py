@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.readers.camera_file import CameraFile
-from erfsfm.readers.images import list_images
-from erfsfm.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CALIBRATION, CalibrationFile
-from erfsfm.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_odometry_root, odometry_camera
-from erfsfm.readers.numbering import NumberedFiles, by_number
-from erfsfm.readers.scan import read_velodyne
+from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CALIBRATION, CalibrationFile
+from erfsfm.common.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_odometry_root, odometry_camera
+from erfsfm.common.readers.numbering import NumberedFiles, by_number
+from erfsfm.common.readers.scan import read_velodyne
 from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray

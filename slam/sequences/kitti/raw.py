@@ -8,14 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.files import read_text
-from erfsfm.readers.camera_file import CameraFile
-from erfsfm.readers.images import has_images, list_images
-from erfsfm.readers.kitti_calibration import CAM_TO_CAM, CAMERA_HEIGHT_M, IMU_TO_VELO, VELO_TO_CAM, CalibrationFile
-from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name, find_drives
-from erfsfm.readers.kitti_oxts import read_packet
-from erfsfm.readers.numbering import NumberedFiles, by_number
-from erfsfm.readers.scan import read_velodyne
+from erfsfm.common.files import read_text
+from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.images import has_images, list_images
+from erfsfm.common.readers.kitti_calibration import (
+    CAM_TO_CAM,
+    CAMERA_HEIGHT_M,
+    IMU_TO_VELO,
+    VELO_TO_CAM,
+    CalibrationFile,
+)
+from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name, find_drives
+from erfsfm.common.readers.kitti_oxts import read_packet
+from erfsfm.common.readers.numbering import NumberedFiles, by_number
+from erfsfm.common.readers.scan import read_velodyne
 from slam import se3
 from slam.errors import SequenceError
 from slam.frames import Intrinsics

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from erfsfm.readers.camera_file import CameraFile
-from erfsfm.readers.images import first_usual
+from erfsfm.common.readers.camera_file import CameraFile
+from erfsfm.common.readers.images import first_usual
 from slam.errors import SequenceError
 from slam.frames import Image
 from slam.se3 import FloatArray

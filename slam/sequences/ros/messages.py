@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from erfsfm.errors import DataError
-from erfsfm.readers.camera_file import CameraFile, camera_of
-from erfsfm.readers.images import decode_image, eight_bits
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import CameraFile, camera_of
+from erfsfm.common.readers.images import decode_image, eight_bits
 from slam.errors import SequenceError
 from slam.frames import Image
 from slam.se3 import FloatArray

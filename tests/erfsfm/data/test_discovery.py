@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.recordings import Recording
-from erfsfm.errors import DataError
 
 CAMERA = {"width": 48, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 23.5, "cy": 15.5, "fps": 10}
 

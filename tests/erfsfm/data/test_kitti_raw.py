@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.kitti_raw import open_drive
-from erfsfm.errors import DataError
 
 WriteDrive = Callable[..., Path]
 NAME = "kitti_raw/2011_09_26_drive_0001"

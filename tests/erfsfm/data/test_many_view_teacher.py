@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import TrainingError
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws
-from erfsfm.errors import TrainingError
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 SIZE = (64, 208)

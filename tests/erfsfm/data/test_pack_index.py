@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.pack_index import (
     INDEX_FILE,
@@ -19,7 +20,6 @@ from erfsfm.data.pack_index import (
     poses_file,
     write_index,
 )
-from erfsfm.errors import DataError
 
 CAMERA = PackedCamera(width=64, height=32, fx=40, fy=41, cx=31, cy=15)
 

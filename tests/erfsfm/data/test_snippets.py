@@ -16,12 +16,12 @@ import yaml
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.samples import as_tensors
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.data.splits import overlapping
-from erfsfm.errors import DataError
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
 
 FRAMES = 9

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.split_file import Split, read_split_file
 from erfsfm.data.splits import overlapping
-from erfsfm.errors import DataError
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[3] / "configs" / "splits").glob("*.yaml"))
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from erfsfm.common.errors import ConfigError
+from erfsfm.common.readers.frame_range import FrameRange
+from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
 from erfsfm.data.splits import merge, overlapping
-from erfsfm.errors import ConfigError
-from erfsfm.readers.frame_range import FrameRange
-from erfsfm.readers.kitti_drives import ODOMETRY_DRIVES
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.kitti_raw import open_drive
 from erfsfm.data.recordings import Recording
 from erfsfm.data.standstill import moving_parts
-from erfsfm.errors import DataError
 
 WriteDrive = Callable[..., Path]
 

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data import many_view_teacher
 from erfsfm.data import video as module
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.video import Video
-from erfsfm.errors import DataError
 from erfsfm.geometry.camera import Camera
-from erfsfm.readers.video import VideoFrames
 
 FRAMES, SIZE = 40, (48, 32)
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from erfsfm.common.errors import DataError
 from erfsfm.config import NetworkConfig
 from erfsfm.data.splits import overlapping
-from erfsfm.errors import DataError
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.evaluation.protocols import depth_protocol

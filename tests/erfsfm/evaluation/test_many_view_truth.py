@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.errors import DataError
 from erfsfm.evaluation.many_view_truth import many_view_protocol
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 

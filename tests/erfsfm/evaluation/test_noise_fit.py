@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from erfsfm.common.errors import DataError
 from erfsfm.data.splits import overlapping
-from erfsfm.errors import DataError
 from erfsfm.evaluation.noise_fit import PairErrors, calibrate, coverage, fit, pair_errors
 
 ROTATION, LENGTH_RATIO, UNIT = 0.002, 0.05, 0.3

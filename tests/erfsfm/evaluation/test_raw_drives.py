@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from erfsfm.errors import DataError
+from erfsfm.common.errors import DataError
 from erfsfm.evaluation.raw_drives import RawFrame, displacements, lidar_depth
 
 DRIVE = "2011_09_26_drive_0099"

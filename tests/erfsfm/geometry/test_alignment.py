@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from erfsfm.geometry.alignment import align, cell_rays, image_positions, project, rotation_to_euler, solve
+from erfsfm.geometry.alignment import align, cell_rays, project, rotation_to_euler, solve
 from erfsfm.geometry.transforms import euler_to_rotation
 
 ROWS, COLUMNS = 16, 52
@@ -58,13 +58,6 @@ def test_an_uncertain_depth_turns_the_camera_less(rays, inverse_depth):
         return float((R_found.transpose(1, 2) @ R - torch.eye(3)).norm())
 
     assert angle(0.5) < 0.7 * angle(0.02)
-
-
-def test_positions_are_those_of_grid_sample(rays):
-    image = torch.arange(float(ROWS * COLUMNS)).view(1, 1, ROWS, COLUMNS)
-    grid = image_positions(rays[:, :2]).view(1, ROWS, COLUMNS, 2)
-    same = torch.nn.functional.grid_sample(image, grid, align_corners=False)
-    torch.testing.assert_close(same, image, atol=1e-2, rtol=0)
 
 
 def test_linear_systems_and_angles():

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import Layer
 from erfsfm.networks.depth_net import DepthNet
 

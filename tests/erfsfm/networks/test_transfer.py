@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from erfsfm.networks.presets import build
 from erfsfm.networks.transfer import take_over
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from erfsfm.checkpoint import Model, build_networks
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import NetworkConfig
-from erfsfm.errors import ConfigError
 from erfsfm.model_record import ModelRecord
 from erfsfm.receptive_field.measure import measure_fields
 from erfsfm.receptive_field.street import street_snippet

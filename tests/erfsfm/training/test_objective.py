@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from erfsfm.checkpoint import build_networks
+from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig, TeacherConfig
-from erfsfm.errors import ConfigError
 from erfsfm.geometry.transforms import pose_vector_to_matrix
 from erfsfm.losses.structure import Bounds
 from erfsfm.training.objective import ObjectiveResult, SnippetBatch, evaluate_objective

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.config import ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
-from erfsfm.errors import ConfigError, DataError
 from erfsfm.training.pack import PackSummary, pack
 from erfsfm.training.run import train, trained_on
 

@@ -26,14 +26,14 @@ from torch import Tensor
 
 import erfsfm.training.run
 from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_model
+from erfsfm.common.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
+from erfsfm.common.lock import FolderLock
+from erfsfm.common.signals import Terminated
 from erfsfm.config import ExperimentConfig, TrainedNetworks, dump_yaml, load_experiment
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.lock import FolderLock
 from erfsfm.model_record import ModelRecord
-from erfsfm.signals import Terminated
 from erfsfm.training.keeper import decisive, licence_of
 from erfsfm.training.module import SelfSupervision, learning_rate_factor
 from erfsfm.training.run import train

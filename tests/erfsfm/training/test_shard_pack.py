@@ -25,11 +25,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.config import ExperimentConfig, dump_yaml
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, split_recordings
-from erfsfm.errors import ConfigError, DataError
 from erfsfm.training.run import train
 from erfsfm.training.shard_pack import ShardSummary, pack_shards
 

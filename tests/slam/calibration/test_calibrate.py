@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
 from slam.calibration.board import Board
 from slam.cli import main
 from slam.sequences.catalogue import open_sequence

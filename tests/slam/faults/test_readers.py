@@ -17,6 +17,10 @@ import pytest
 import torch
 
 from erfsfm.checkpoint import load_model
+from erfsfm.common.readers.camera_file import read_camera_file
+from erfsfm.common.readers.images import read_image, read_values
+from erfsfm.common.readers.kitti_oxts import read_packet
+from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import load_experiment
 from erfsfm.convert import read_old
 from erfsfm.data.pack_index import read_pack
@@ -24,10 +28,6 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import read_split_file
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
-from erfsfm.readers.camera_file import read_camera_file
-from erfsfm.readers.images import read_image, read_values
-from erfsfm.readers.kitti_oxts import read_packet
-from erfsfm.readers.video import VideoFrames
 from slam import run_slam, se3
 from slam.config import load_config
 from slam.formats.g2o import check_g2o

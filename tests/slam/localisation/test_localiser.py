@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.config import LoopsConfig, dump_yaml, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.refinement.refine import RefinedDepth
+from erfsfm.mvs.refine import RefinedDepth
 from slam.frames import Intrinsics
 from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth

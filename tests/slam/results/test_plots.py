@@ -13,7 +13,7 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from erfsfm.errors import ConfigError
+from erfsfm.common.errors import ConfigError
 from slam.errors import RunError
 from slam.evaluation.drift import aligned, segment_drifts
 from slam.results.folder import RunFolder

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.errors import DataError
-from erfsfm.readers.images import list_images
-from erfsfm.readers.numbering import by_name
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import list_images
+from erfsfm.common.readers.numbering import by_name
 from slam.errors import MissingFrameError, SequenceError
 from slam.sequences.images import ImageFiles
 

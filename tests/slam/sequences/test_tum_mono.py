@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from erfsfm.readers.camera_file import camera_of
+from erfsfm.common.readers.camera_file import camera_of
 from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.undistortion import Undistortion

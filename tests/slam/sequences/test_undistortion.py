@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from erfsfm.readers.camera_file import CameraFile
+from erfsfm.common.readers.camera_file import CameraFile
 from slam.errors import SequenceError
 from slam.frames import Intrinsics
 from slam.sequences.undistortion import Undistortion, calibrated

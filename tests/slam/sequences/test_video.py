@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.readers import video as reader
+from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.discovery import discover
-from erfsfm.readers import video as reader
-from erfsfm.readers.video import VideoFrames
 from slam.errors import SequenceError
 from slam.sequences import video
 from slam.sequences.catalogue import open_sequence, sequence_names

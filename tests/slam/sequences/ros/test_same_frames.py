@@ -10,8 +10,8 @@ from typing import Any
 
 import cv2
 
-from erfsfm.readers.camera_file import CameraFile, read_camera_file
-from erfsfm.readers.pinhole import Pinhole
+from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+from erfsfm.common.readers.pinhole import Pinhole
 from slam.run import run_slam
 from slam.sequences.catalogue import open_sequence
 

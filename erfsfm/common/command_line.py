@@ -1,0 +1,118 @@
+"""What both command lines share: their words are checked once, and every error is one line and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NoReturn
+
+import typer
+
+from erfsfm.common.errors import OUT_OF_MEMORY, OneLineError, one_line
+from erfsfm.common.memory import require_memory
+from erfsfm.common.signals import Terminated
+
+SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
+_LOADING_BYTES = 256 * 2**20  # of NumPy and SciPy: OpenBLAS waits for ever for memory that it cannot have
+# what they would say of a file is said in our own line; twice the pixels of the largest camera that is read
+_OPENCV = {
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27),
+}
+_INTERRUPTED = 130  # exit code that typer gives to ctrl-C
+_NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
+_OPTION = re.compile(r"--[a-z][a-z-]*=")
+_MAY_BE_EMPTY = ("--hazards", "--hazards=")
+# what libraries in C++ say when memory ran out, whatever they raise
+_MEMORY = re.compile(
+    r"(not enough|insufficient|cannot allocate|shared) memory|bad_?alloc|could not create a primitive"
+    r"|failed to map segment|can't start new thread|pthread_create|DataLoader worker .* (exited|killed)",
+    re.IGNORECASE,
+)
+
+
+def run(app: Callable[..., object], name: str) -> None:
+    """Run a command line on ``sys.argv``; a known error becomes one line on stderr and exit code 1."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for variable, value in _OPENCV.items():
+        os.environ.setdefault(variable, value)
+    try:
+        require_memory(_LOADING_BYTES)
+        _check_current_folder(name)
+        app(args=_checked(sys.argv[1:], name), prog_name=name)
+    except SystemExit as end:
+        if end.code == _INTERRUPTED or isinstance(end, Terminated):
+            why = str(end) if isinstance(end, Terminated) else "interrupted"
+            _say(f"{name}: {why}; what was written stays")
+        raise
+    except Exception as error:  # the last place where an error can become one line
+        if os.environ.get(SHOW_TRACEBACK, "0") not in ("", "0"):
+            raise
+        _end(f"{name}: {_explained(error)}", 1)
+
+
+def _check_current_folder(name: str) -> None:
+    """End where it was removed, for libraries that cannot be loaded then, or where files cannot hold its name."""
+    try:
+        folder = Path.cwd()
+    except FileNotFoundError:
+        _end(f"{name}: the folder that you are in was removed: change to another one", 1)
+    if not _is_text(str(folder)):
+        _end(f"{name}: the name of the folder that you are in {_NOT_UTF8}", 1)
+
+
+def _checked(words: Sequence[str], name: str) -> list[str]:
+    """The words with ``~/`` as the home folder.
+
+    An empty one, as of a shell variable that is not set, is refused, and one that no text file can hold.
+    """
+    checked = []
+    for before, word in zip(["", *words], words):
+        if not _is_text(word):
+            _end(f"{name}: {word!a} {_NOT_UTF8}", 1)
+        option = _OPTION.match(word)
+        start, value = (option.group(), word[option.end() :]) if option else ("", word)
+        if not value and before not in _MAY_BE_EMPTY and start not in _MAY_BE_EMPTY:
+            where = start.rstrip("=") or (before if before.startswith("--") else "one of its words")
+            _end(f"{name}: {where} is empty: give a value or leave it out (is a shell variable not set?)", 2)
+        checked.append(start + (str(Path(value).expanduser()) if value.startswith("~/") else value))
+    return checked
+
+
+def _is_text(word: str) -> bool:
+    try:
+        word.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _explained(error: Exception) -> str:
+    if isinstance(error, MemoryError) or _MEMORY.search(str(error)):
+        return OUT_OF_MEMORY
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return one_line(f"{error.filename}: {error.strerror}: check the path")
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.strerror:
+        return f"{error.strerror}: standard output, or the folder for temporary files; what was written stays"
+    if isinstance(error, OneLineError | OSError):
+        return one_line(str(error))
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    what = one_line(f"{type(error).__name__}: {error}")
+    return f"unexpected {what} ({Path(place.filename).name}:{place.lineno}); set {SHOW_TRACEBACK}=1 and report this"
+
+
+def _end(line: str, code: int) -> NoReturn:
+    _say(line)
+    sys.exit(code)
+
+
+def _say(line: str) -> None:
+    with suppress(OSError, ValueError):  # nobody is listening
+        typer.echo(line, err=True)

@@ -1,0 +1,245 @@
+"""Configurations of both packages: YAML files and ``section.key=value`` overrides, validated by a pydantic model."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from erfsfm.common.errors import ConfigError
+from erfsfm.common.yaml_file import YamlError, parse_yaml, read_yaml
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class Section(BaseModel):
+    """A frozen group of settings that refuses unknown keys and numbers that are not finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class OldNames:
+    """Keys and values of earlier releases and what they are called now, for the errors that refuse them.
+
+    Attributes:
+        keys: dotted old key or section to dotted new one; the keys of a section follow it.
+        values: dotted key and old value to new value.
+    """
+
+    keys: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[tuple[str, str], str] = field(default_factory=dict)
+
+    def refuse(self, tree: Mapping[str, Any], origin: str) -> None:
+        """Refuse a tree that holds old names.
+
+        Raises:
+            ConfigError: one line with every old name and its new one.
+        """
+        found = []
+        for key, value in _leaves(tree):
+            new_key = self._new_key(key)
+            if new_key is not None:
+                found.append(f"'{key}' is now '{new_key}'")
+            elif isinstance(value, str) and (key, value) in self.values:
+                found.append(f"'{key}: {value}' is now '{key}: {self.values[key, value]}'")
+        if found:
+            raise ConfigError(f"old names in {origin}: {'; '.join(found)}")
+
+    def _new_key(self, key: str) -> str | None:
+        if key in self.keys:
+            return self.keys[key]
+        section, _, last = key.rpartition(".")
+        new_section = self._new_key(section) if section else None
+        return None if new_section is None else f"{new_section}.{last}"
+
+
+def load_config(
+    model: type[M],
+    file_or_name: str | Path | None,
+    overrides: Sequence[str],
+    shipped: Sequence[Path],
+    old_names: OldNames | None = None,
+    sections: Collection[str] | None = None,
+) -> M:
+    """Read a configuration and change some of its keys.
+
+    Args:
+        model: what the configuration must be.
+        file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
+        overrides: ``section.key=value`` each, the value in YAML; later ones win.
+        shipped: folders of named configurations, the first one that has a name wins.
+        old_names: of earlier releases.
+        sections: of the file that are read, without keys that are unknown now; the others keep their defaults. None
+            for all sections, and no unknown key.
+
+    Raises:
+        ConfigError: one line that names the key and the file or override, what came and what is allowed.
+    """
+    old_names = old_names or OldNames()
+    tree: dict[str, Any] = {}
+    origin = "the defaults"
+    if file_or_name is not None:
+        path = find_config(file_or_name, shipped)
+        origin, tree = str(path), _read_tree(path)
+        if sections is not None:
+            tree = {name: tree[name] for name in sections if name in tree}
+        old_names.refuse(tree, origin)
+        if sections is not None:
+            known = set(_known_keys(model))
+            tree = {name: _only(section, name, known) for name, section in tree.items()}
+    for text in overrides:
+        change: dict[str, Any] = {}
+        _override(change, text)
+        old_names.refuse(change, f"--set {text}")
+        _override(tree, text)
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_one_line(error, model, origin, overrides)) from error
+
+
+def find_config(file_or_name: str | Path, shipped: Sequence[Path]) -> Path:
+    """The YAML file of a path or of a shipped name.
+
+    Raises:
+        ConfigError: neither a file nor a known name.
+    """
+    path = Path(file_or_name)
+    if path.is_file():
+        return path
+    known = {file.stem: file for folder in reversed(shipped) for file in sorted(folder.glob("*.yaml"))}
+    if str(file_or_name) in known:
+        return known[str(file_or_name)]
+    if path.is_dir():
+        raise ConfigError(f"configuration '{file_or_name}' is a folder, not a YAML file")
+    nearest = difflib.get_close_matches(path.stem, known, 1)
+    hint = f"; did you mean '{nearest[0]}'?" if nearest else ""
+    names = ", ".join(name for name in sorted(known) if "-" not in name)  # variants of one of these have a dash
+    raise ConfigError(f"no configuration file or name '{file_or_name}' (known names: {names or 'none'}){hint}")
+
+
+def dump_yaml(config: BaseModel) -> str:
+    """The configuration as YAML that reads back to an equal configuration."""
+    text: str = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return text
+
+
+def dump_explained(config: BaseModel) -> str:
+    """As `dump_yaml`, with the description of every key as a comment; sections without nested sections only."""
+    lines: list[str] = []
+    for name, section in config:
+        summary = (type(section).__doc__ or "").partition("\n")[0].rstrip(".").replace("``", "")
+        lines += [*([""] if lines else []), f"{name}:  # {summary}"]
+        for key, value in section.model_dump(mode="json").items():
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+            lines.append(f"  {key}: {text}  # {type(section).model_fields[key].description}")
+    return "\n".join(lines) + "\n"
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first problem of a validation error as ``key: problem``, for small files that have no overrides."""
+    first = error.errors(include_url=False)[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return f"{place or 'all of it'}: {first['msg'].removeprefix('Value error, ')}"
+
+
+def _read_tree(path: Path) -> dict[str, Any]:
+    try:
+        tree = read_yaml(path)
+    except YamlError as error:
+        raise ConfigError(str(error)) from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path} must hold sections of keys; got {type(tree).__name__} {_shown(tree)}")
+    return tree
+
+
+def _only(section: Any, name: str, known: Collection[str]) -> Any:
+    if not isinstance(section, dict):
+        return section
+    return {key: value for key, value in section.items() if f"{name}.{key}" in known}
+
+
+def _override(tree: dict[str, Any], text: str) -> None:
+    dotted, equals, written = text.partition("=")
+    parts = dotted.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(f"--set needs section.key=value; got '{text}'")
+    try:
+        value = parse_yaml(written)
+    except YamlError as error:
+        raise ConfigError(f"the value of --set {text} is not YAML: {error}") from error
+    for part in parts[:-1]:
+        section = tree.get(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"--set {text}: '{part}' is not a section")
+        tree[part] = dict(section)  # an alias in the file may have made it another section too
+        tree = tree[part]
+    tree[parts[-1]] = value
+
+
+def _one_line(error: ValidationError, model: type[BaseModel], origin: str, overrides: Sequence[str]) -> str:
+    first = error.errors(include_url=False)[0]
+    known = list(_known_keys(model))
+    place = ".".join(str(part) for part in first["loc"])
+    origin = _origin(place, origin, overrides)
+    if first["type"] == "extra_forbidden":
+        return f"unknown key '{place}' in {origin}; {_nearest_key(place, known)}"
+    # pydantic appends the branch of a union, or the place inside a value; keys end where no such key is known
+    key = place
+    while key and key not in known:
+        key = key.rpartition(".")[0]
+    if first["type"] == "model_type":
+        return f"'{key or 'all of it'}' in {origin} is a section of keys; got {_shown(first['input'])}"
+    wanted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if not key:
+        return f"{origin}: {wanted}"
+    return f"'{key}' in {origin} should be {wanted}; got {_shown(first['input'])}"
+
+
+def _origin(place: str, origin: str, overrides: Sequence[str]) -> str:
+    """The last override of a key, of the section it is in, or of what is in it; else where the tree came from."""
+    for text in reversed(overrides):
+        key = text.partition("=")[0].strip()
+        if f"{place}.".startswith(f"{key}.") or f"{key}.".startswith(f"{place}."):
+            return f"--set {text}"
+    return origin
+
+
+def _nearest_key(key: str, known: Sequence[str]) -> str:
+    section, _, last = key.rpartition(".")
+    siblings = {name.rpartition(".")[2]: name for name in known if name.rpartition(".")[0] == section}
+    others = {name.rpartition(".")[2]: name for name in reversed(known)}
+    for names in (siblings, others):
+        nearest = difflib.get_close_matches(last, names, 1)
+        if nearest:
+            return f"did you mean '{names[nearest[0]]}'?"
+    return f"known keys{f' of {section}' if section else ''}: {', '.join(siblings)}"
+
+
+def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    for name, declared in model.model_fields.items():
+        yield prefix + name
+        if isinstance(declared.annotation, type) and issubclass(declared.annotation, BaseModel):
+            yield from _known_keys(declared.annotation, f"{prefix}{name}.")
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys with their values; a section is one where it is empty."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,137 @@
+"""``camera.yaml``: the calibration of a user's own camera."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from erfsfm.common.errors import DataError, ErfsfmError
+from erfsfm.common.readers.pinhole import Pinhole, impossible, require_plausible
+from erfsfm.common.yaml_file import read_yaml
+
+CAMERA_FILE = "camera.yaml"
+logger = logging.getLogger(__name__)
+
+HIGHEST_M = 1000.0
+_USUAL_HEIGHTS_M = (0.1, 10.0)
+_COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
+
+
+class CameraFile(BaseModel):
+    """The keys of ``camera.yaml``; (0, 0) is the centre of the top-left pixel."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    width: int = Field(gt=0, description="image width, pixels")
+    height: int = Field(gt=0, description="image height, pixels")
+    fx: float = Field(gt=0, description="focal length along u, pixels")
+    fy: float = Field(gt=0, description="focal length along v, pixels")
+    cx: float = Field(description="principal point u, pixels")
+    cy: float = Field(description="principal point v, pixels")
+    fps: float = Field(gt=0, description="frames a second")
+    camera_height_m: float | Literal["unknown"] | None = Field(
+        default=None, description="height of the camera above the road, metres, or unknown"
+    )
+    model: Literal["pinhole", "opencv", "fisheye", "fov"] = "pinhole"
+    distortion: tuple[float, ...] = Field(
+        default=(),
+        description="opencv: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; fisheye: k1 k2 k3 k4; fov: the angle",
+    )
+    source: str | None = Field(default=None, description="a note on where the numbers come from")
+
+    @field_validator("width", "height", "fx", "fy", "cx", "cy", "fps", "camera_height_m", mode="before")
+    @classmethod
+    def _refuse_truth(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("wanted a number")
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        height_m = self.camera_height_m
+        if not isinstance(height_m, str | None) and not 0 < height_m <= HIGHEST_M:
+            raise ValueError(f"camera_height_m: must be greater than 0, to {HIGHEST_M:g}, or 'unknown', is {height_m}")
+        problem = impossible(self.pinhole)
+        if problem is not None:
+            raise ValueError(problem)
+        allowed = _COEFFICIENTS.get(self.model)
+        if allowed is None and any(self.distortion):
+            raise ValueError("distortion: needs model opencv, fisheye or fov; a pinhole has none")
+        if allowed is not None and len(self.distortion) not in allowed:
+            counts = " or ".join(map(str, allowed))
+            raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
+        if self.model == "fov" and not 0 < self.distortion[0] < math.pi:
+            raise ValueError(f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}")
+        return self
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The camera matrix as written, before any undistortion."""
+        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether images must be undistorted (a fisheye without coefficients still is)."""
+        return self.model == "fisheye" or any(self.distortion)
+
+    def height_or(self, default: float | None) -> float | None:
+        """The camera's height in metres: None where unknown, ``default`` where the file has none."""
+        if self.camera_height_m is None:
+            return default
+        return None if isinstance(self.camera_height_m, str) else self.camera_height_m
+
+
+def read_camera_file(path: Path) -> CameraFile:
+    """Read and check a ``camera.yaml``; an unlikely camera is logged as a warning.
+
+    Raises:
+        DataError: naming the file and the key that is missing, unknown, written twice or wrong.
+    """
+    try:
+        content = read_yaml(path)
+    except ErfsfmError as error:
+        raise DataError(str(error)) from error
+    if not isinstance(content, dict):
+        keys = ", ".join(name for name, item in CameraFile.model_fields.items() if item.is_required())
+        raise DataError(f"{path} holds no keys: a camera file needs {keys}")
+    return camera_of(content, str(path))
+
+
+def camera_of(keys: dict[str, Any], where: str) -> CameraFile:
+    """The camera of the keys of a camera file, found at ``where``; an unlikely camera is logged as a warning.
+
+    Raises:
+        DataError: naming the key that is missing, unknown or wrong.
+    """
+    try:
+        camera = CameraFile.model_validate(keys)
+    except ValidationError as error:
+        raise DataError(f"{where}: {_complaints(error)}") from error
+    require_plausible(camera.pinhole, where)
+    height_m = camera.height_or(None)
+    if height_m is not None and not _USUAL_HEIGHTS_M[0] <= height_m <= _USUAL_HEIGHTS_M[1]:
+        logger.warning(
+            "%s: camera_height_m is %g: check that it is the height above the road in metres", where, height_m
+        )
+    return camera
+
+
+def _complaints(error: ValidationError) -> str:
+    """Every complaint of a validation, on one line, key first."""
+    lines = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"][:1])
+        if item["type"] == "missing":
+            lines.append(f"key {key} is missing")
+        elif item["type"] == "extra_forbidden":
+            lines.append(f"key {key} is unknown (known: {', '.join(CameraFile.model_fields)})")
+        elif not key:
+            lines.append(str(item["ctx"]["error"]))
+        else:
+            problem = item["msg"].removeprefix("Value error, ")
+            lines.append(f"{key}: {problem[0].lower() + problem[1:]}, is {item['input']!r}")
+    return "; ".join(dict.fromkeys(lines))

@@ -1,0 +1,207 @@
+"""Image files: which a folder holds, read completely or not at all, and the resizing that all parts share."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.common.errors import DataError, OneLineError
+from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
+
+Image = NDArray[np.uint8]
+T = TypeVar("T")
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_SEGMENT = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]", re.DOTALL)  # begins one with a length, or is the end
+_PNG_START, _PNG_END, _PNG_BIT_DEPTH = b"\x89PNG", b"IEND", 24
+_TWELVE_BITS = 4096
+_COMPARED_IMAGES = 3
+_NUMBER = re.compile(r"((?<![A-Za-z\d.])\d+\.\d+(?=\.\w+$)|\d+)")  # a stamp such as 1700000000.5 is one number
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files directly in a folder, in natural order (``2.png`` before ``10.png``).
+
+    Raises:
+        DataError: two files differ in their suffix alone.
+    """
+    if not folder.is_dir():
+        return []
+    paths = [path for path in folder.iterdir() if is_image(path)]
+    doubles = [stem for stem, count in Counter(p.stem for p in paths).items() if count > 1]
+    if doubles:
+        raise DataError(f"{folder} has image {min(doubles)} in two formats: keep one file a frame")
+    return sorted(paths, key=natural_key)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether a folder holds an image file, without listing all of it."""
+    return folder.is_dir() and any(is_image(path) for path in folder.iterdir())
+
+
+def is_image(path: Path) -> bool:
+    """Whether a file is an image by its name, and not hidden."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def natural_key(path: Path) -> list[tuple[Decimal, str]]:
+    """A sort key that compares numbers in names: ``img2`` before ``img10``, the stamp ``7.12.png`` before ``7.5.png``.
+
+    A point belongs to a number that ends the name and stands alone: not in ``cam0.12.png``.
+    """
+    texts_and_numbers = enumerate(_NUMBER.split(path.name))
+    return [(Decimal(part if place % 2 else 0), part) for place, part in texts_and_numbers]
+
+
+def read_image(path: Path) -> Image:
+    """Read an image as ``(H, W, 3)`` uint8 RGB; grey is repeated to three channels.
+
+    16-bit images keep their upper eight bits. Where all their values lie under 4096 they are refused: cameras of 12
+    bits are often stored so, and the upper eight bits of that are nearly black.
+
+    Raises:
+        DataError: missing, empty, truncated, no image, or 12-bit data in 16 bits; one line.
+    """
+    return decode_image(_file_bytes(path), f"image {path}")
+
+
+def decode_image(data: bytes, where: str) -> Image:
+    """As `read_image`, of the bytes of a file; ``where`` they come from is for messages.
+
+    Raises:
+        DataError: empty, truncated, no image, or 12-bit data in 16 bits; one line.
+    """
+    _require_complete(data, where)
+    if data.startswith(_PNG_START) and data[_PNG_BIT_DEPTH] == 16:
+        _require_sixteen_bits(_decode(where, data, cv2.IMREAD_UNCHANGED), where)
+    return np.asarray(cv2.cvtColor(_decode(where, data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def eight_bits(values: NDArray[np.uint16], where: str) -> NDArray[np.uint8]:
+    """The upper eight bits of 16-bit values.
+
+    Raises:
+        DataError: they look like 12-bit data; one line.
+    """
+    _require_sixteen_bits(values, where)
+    return (values >> 8).astype(np.uint8)
+
+
+def read_values(path: Path) -> NDArray[Any]:
+    """An image's values as stored, such as a 16-bit depth map ``(H, W)``.
+
+    Raises:
+        DataError: missing, empty, truncated or no image; one line.
+    """
+    data = _file_bytes(path)
+    _require_complete(data, f"image {path}")
+    return _decode(f"image {path}", data, cv2.IMREAD_UNCHANGED)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Height and width of an image file; raises as `read_image`."""
+    height, width = read_image(path).shape[:2]
+    return height, width
+
+
+def first_usual(places: Sequence[T], read: Callable[[T], Image]) -> tuple[T, Image]:
+    """The first readable image, and its place: of three, one of the size of most.
+
+    Args:
+        places: of images of one size, as a rule: recorders and people put another picture in front.
+        read: one of them, or a one-line error.
+
+    Raises:
+        OneLineError: that of the first one, where none can be read.
+    """
+    found: dict[tuple[int, ...], tuple[T, Image]] = {}
+    for place in places:
+        with suppress(OneLineError):
+            image = read(place)
+            if image.shape in found:
+                return found[image.shape]
+            found[image.shape] = place, image
+            if len(found) == _COMPARED_IMAGES:
+                break
+    return next(iter(found.values())) if found else (places[0], read(places[0]))
+
+
+def first_size(files: Sequence[Path]) -> tuple[int, int]:
+    """Height and width of the first readable image of the usual size; raises as `first_usual`."""
+    height, width = first_usual(files, read_image)[1].shape[:2]
+    return height, width
+
+
+def resize_image(image: Image, height: int, width: int) -> Image:
+    """An image ``(H, W, 3)`` at ``height x width``, without crop; the same in training and in inference."""
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = image.shape[0] >= height and image.shape[1] >= width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width, height), interpolation=method))
+
+
+def _file_bytes(path: Path) -> bytes:
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise DataError(f"cannot read image {path}: it is a pipe or a device")
+    try:
+        return read_bytes(path, MAX_IMAGE_BYTES)
+    except OSError as error:
+        raise DataError(f"cannot read image {path}: {error.strerror}") from error
+
+
+def _require_complete(data: bytes, where: str) -> None:
+    if not data:
+        raise DataError(f"{where} is empty: copy it again")
+    if not _is_complete(data):
+        raise DataError(f"{where} is truncated at {len(data)} bytes: copy it again")
+
+
+def _require_sixteen_bits(values: NDArray[Any], where: str) -> None:
+    most = int(np.atleast_3d(values)[..., :3].max())  # alpha is full where values are dark
+    if 0 < most < _TWELVE_BITS:
+        raise DataError(
+            f"{where} has 16 bits, but no value above {most}: it looks like 12-bit data, nearly black as "
+            f"8 bits; convert the images to 8 bits, or multiply their values by 16"
+        )
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether a JPEG or PNG file reaches its end marker; some decoders fill what is missing with grey."""
+    if data.startswith(_JPEG_START):
+        return _jpeg_is_complete(data)
+    if data.startswith(_PNG_START):
+        return data.rfind(_PNG_END) > 0
+    return True
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether its segments lead to the end marker; phones put a video behind that, with bytes of any value."""
+    place = len(_JPEG_START)
+    while found := _JPEG_SEGMENT.search(data, place):
+        if found[0] == _JPEG_END:
+            return True
+        place = found.end() + int.from_bytes(data[found.end() : found.end() + 2], "big")
+    return False
+
+
+def _decode(where: str, data: bytes, flags: int) -> NDArray[Any]:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        if "MAX_IMAGE_PIXELS" in str(error):
+            raise DataError(f"{where} has more pixels than any camera: resize it, or leave it out") from error
+        raise DataError(f"{where} cannot be decoded: {error.err or error}") from error
+    if image is None:
+        raise DataError(f"{where} cannot be decoded: it is damaged or not an image; copy it again")
+    return np.asarray(image)

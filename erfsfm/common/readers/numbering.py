@@ -1,0 +1,142 @@
+"""Files numbered frame by frame: which number each has, and where numbers are missing.
+
+A missing number is a gap in time, not an error: the frame has no image.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.common.errors import DataError
+
+_NUMBERED = re.compile(r"(?P<prefix>.*?)(?P<number>\d+)")
+
+
+@dataclass(frozen=True)
+class NumberedFiles:
+    """Files in the order of their numbers. Row k stands for number ``first + k``, whether or not it has a file.
+
+    Attributes:
+        paths: the N files that exist, at least one.
+        rows: ``(N,)``, increasing from 0, the row of each.
+        first: number of row 0, by which files beside these are indexed (times, poses, packets).
+        names: of all rows, where a table gives them.
+    """
+
+    paths: tuple[Path, ...]
+    rows: tuple[int, ...]
+    first: int = 0
+    names: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Number of rows, those without a file among them."""
+        return self.rows[-1] + 1
+
+    def gaps(self) -> list[tuple[int, int]]:
+        """Runs of rows without a file, as (first, last)."""
+        return [(a + 1, b - 1) for a, b in zip(self.rows, self.rows[1:]) if b > a + 1]
+
+    def parts(self) -> list[tuple[int, int]]:
+        """Runs of files without a gap between them, as half-open ranges of positions in ``paths``."""
+        cuts = [k for k in range(1, len(self.rows)) if self.rows[k] > self.rows[k - 1] + 1]
+        return list(zip([0, *cuts], [*cuts, len(self.rows)]))
+
+    def file_name(self, row: int) -> str:
+        """The name that the file of a row has or would have."""
+        if self.names:
+            return self.names[row]
+        position = max(int(np.searchsorted(self.rows, row, side="right")) - 1, 0)
+        path = self.paths[position]
+        match = _NUMBERED.fullmatch(path.stem)
+        if match is None or self.rows[position] == row:
+            return path.name
+        number = int(match["number"]) + row - self.rows[position]
+        return f"{match['prefix']}{number:0{len(match['number'])}d}{path.suffix}"
+
+    def rows_of(self, values: int) -> tuple[NDArray[np.intp], int] | None:
+        """Which rows a file beside these describes.
+
+        Args:
+            values: how many it has: one for each number from 0, one for each row, or one for each file.
+
+        Returns:
+            The rows, and how many of its first values belong to none of them; None where the count fits nothing.
+        """
+        if values in (len(self), self.first + len(self)):
+            return np.arange(len(self)), values - len(self)
+        if values == len(self.paths):
+            return np.array(self.rows, dtype=np.intp), 0
+        return None
+
+    def describe_gaps(self) -> str:
+        """How many files are missing, and which first."""
+        gaps = self.gaps()
+        missing = sum(last - first + 1 for first, last in gaps)
+        first, last = gaps[0]
+        where = self.file_name(first) + (f" to {self.file_name(last)}" if last > first else "")
+        return f"{missing} of {len(self)} frames have no image; the first gap is {where}"
+
+
+def by_number(paths: list[Path]) -> NumberedFiles:
+    """Files that KITTI names by their number alone, at least one, in order.
+
+    Raises:
+        DataError: a name is no number, or two files have the same one.
+    """
+    for path in paths:
+        if not path.stem.isdecimal():
+            raise DataError(f"{path} is not named by its number ({0:0{len(paths[0].stem)}d}{path.suffix}): rename it")
+    return _numbered(paths, [int(path.stem) for path in paths])
+
+
+def by_name(paths: list[Path]) -> NumberedFiles:
+    """A user's files, at least one, in order: gaps are detected where names end in numbers that go up one by one.
+
+    Names without a number at their end, stamps and every-n-th-frame numbering have no gaps.
+
+    Raises:
+        DataError: two files have the same number.
+    """
+    matches = [_NUMBERED.fullmatch(path.stem) for path in paths]
+    names = [(match["prefix"], int(match["number"])) for match in matches if match is not None]
+    numbers = [number for _, number in names]
+    if len(names) < len(paths) or len({prefix for prefix, _ in names}) != 1 or _typical_step(numbers) != 1:
+        return in_order(paths)
+    frames = _numbered(paths, numbers)
+    return NumberedFiles(frames.paths, frames.rows)
+
+
+def in_order(paths: list[Path]) -> NumberedFiles:
+    """Files, at least one, one after the other whatever their names are: photos, not a recording."""
+    return NumberedFiles(tuple(paths), tuple(range(len(paths))))
+
+
+def by_table(listed: list[Path], table: Path) -> NumberedFiles:
+    """The files that a table lists in the order of time; those that are not there are gaps.
+
+    Rows before the first file and after the last are left out; ``first`` is the number of those before.
+
+    Raises:
+        DataError: none of them is there.
+    """
+    there = [row for row, path in enumerate(listed) if path.is_file()]
+    if not there:
+        raise DataError(f"none of the {len(listed)} images that {table} names is there: unpack them")
+    names = tuple(path.name for path in listed[there[0] : there[-1] + 1])
+    return NumberedFiles(tuple(listed[row] for row in there), tuple(row - there[0] for row in there), there[0], names)
+
+
+def _numbered(paths: list[Path], numbers: list[int]) -> NumberedFiles:
+    for path, after, number, following in zip(paths, paths[1:], numbers, numbers[1:]):
+        if following <= number:
+            raise DataError(f"{path} and {after.name} have the same number: keep one file a frame")
+    return NumberedFiles(tuple(paths), tuple(number - numbers[0] for number in numbers), numbers[0])
+
+
+def _typical_step(numbers: list[int]) -> float:
+    return float(np.median(np.diff(numbers))) if len(numbers) > 1 else 1.0

@@ -1,0 +1,171 @@
+"""The frames of a video file: decoded in order, with exact access to any of them."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import Image
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
+_COUNTED_FRAMES = 3000
+_CACHED_FRAMES = 32
+_SKIPPED_FRAMES = 30
+_QUIET = "-8"  # AV_LOG_QUIET
+
+
+class VideoFrames:
+    """The frames of a video, in any order.
+
+    A seek in compressed video may land on another frame, so its time is checked against the time recorded
+    for the wanted frame; where they differ, the video is decoded again from its start. The last
+    frames stay in memory. Not for use from several threads.
+
+    One pass over the file tells how many frames there are and when each is shown: it is decoded, or, where it is long,
+    its packets are read by PyAV, an optional extra. Without PyAV a long video has the frames that it announces.
+
+    Attributes:
+        fps: frames a second by their times, else as announced; None where the file does not say.
+    """
+
+    def __init__(self, path: Path, counted_frames: int = _COUNTED_FRAMES) -> None:
+        """Open a video; one that announces more than ``counted_frames`` is long.
+
+        Raises:
+            DataError: it cannot be decoded.
+        """
+        self._path = path
+        self._next = 0
+        self._times_ms: list[float] = []
+        self._capture = _capture(path)
+        announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        shown_s = _packet_times(path) if announced > counted_frames else self._decoded_times()
+        self._frames = announced if shown_s is None else len(shown_s)
+        if self._frames <= 0:
+            raise DataError(f"video {path} has no frame to decode: copy it again, or convert it to mp4 (H.264)")
+        if 0 < announced != self._frames:
+            logger.warning(
+                "video %s announces %d frames and has %d: it may be cut off, or of an uneven rate",
+                path,
+                announced,
+                self._frames,
+            )
+        self._shown_s = None if shown_s is None or (np.diff(shown_s) <= 0).any() else shown_s
+        self.fps = self._rate() or float(self._capture.get(cv2.CAP_PROP_FPS)) or None
+        self._cached = functools.lru_cache(maxsize=_CACHED_FRAMES)(self._decode)
+        self.height, self.width = self._cached(0).shape[:2]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self._frames
+
+    def read(self, index: int) -> Image:
+        """One frame ``(height, width, 3)`` uint8 RGB.
+
+        Raises:
+            DataError: the video breaks off before it.
+        """
+        return self._cached(index).copy()
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """When each frame is shown, seconds ``(N,)``; None, with a warning, where that is not known."""
+        if self._shown_s is None:
+            logger.warning(
+                "video %s has frame times that do not increase, or it is long and PyAV is missing (pip install "
+                "'erfsfm-slam[video]'); its frames are taken as even",
+                self._path,
+            )
+        return self._shown_s
+
+    def _rate(self) -> float | None:
+        """Frames a second by their times."""
+        if self._shown_s is None or len(self._shown_s) < 2:
+            return None
+        return (len(self._shown_s) - 1) / float(self._shown_s[-1] - self._shown_s[0])
+
+    def _decoded_times(self) -> NDArray[np.float64]:
+        while self._grab():
+            pass
+        return np.array(self._times_ms) / 1000
+
+    def _decode(self, index: int) -> Image:
+        ahead = index - self._next
+        unseen = index >= len(self._times_ms)  # so that no seek could be checked
+        if not (ahead >= 0 and (unseen or ahead <= _SKIPPED_FRAMES)) and not self._seek(index):
+            self._rewind()
+        while self._next <= index:
+            if not self._grab():
+                raise DataError(
+                    f"video {self._path} breaks off at frame {self._next} of {self._frames}: use the frames "
+                    f"0:{self._next}, or copy it again"
+                )
+        read, image = self._capture.retrieve()
+        if not read:
+            raise DataError(f"video {self._path} frame {index} cannot be decoded: copy it again")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def _grab(self) -> bool:
+        """Go to the next frame and note its time."""
+        if not self._capture.grab():
+            return False
+        if self._next == len(self._times_ms):
+            self._times_ms.append(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+        self._next += 1
+        return True
+
+    def _seek(self, index: int) -> bool:
+        """Go to just before a frame seen before; False where the seek landed elsewhere."""
+        if not 0 < index < len(self._times_ms):
+            return False
+        self._capture.set(cv2.CAP_PROP_POS_FRAMES, index - 1)
+        if not self._capture.grab() or self._capture.get(cv2.CAP_PROP_POS_MSEC) != self._times_ms[index - 1]:
+            return False
+        self._next = index
+        return True
+
+    def _rewind(self) -> None:
+        self._capture.release()
+        self._capture, self._next = _capture(self._path), 0
+
+
+def _packet_times(path: Path) -> NDArray[np.float64] | None:
+    """Of the frames shown of the first video stream, in the order of time, without decoding; None without PyAV."""
+    try:
+        av = importlib.import_module("av")
+    except ImportError:
+        return None
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            packets = (packet for packet in container.demux(stream) if not packet.is_discard)  # trimmed on a phone
+            shown = sorted(packet.pts for packet in packets if packet.pts is not None)
+            return np.array(shown, dtype=np.float64) * float(stream.time_base)
+    except (av.error.FFmpegError, IndexError, TypeError) as error:
+        raise DataError(f"video {path} cannot be read: {error}; copy it again") from error
+
+
+def list_videos(folder: Path) -> list[Path]:
+    """The video files directly in a folder, without hidden ones."""
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted(path for path in visible if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file())
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)  # errors are reported by DataError alone
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise DataError(
+            f"video {path} cannot be opened: it is damaged or of an unknown format; copy it again, or convert it to "
+            f"mp4 (H.264)"
+        )
+    return capture

@@ -1,0 +1,103 @@
+"""Depth of one image from many neighbours at the poses of the SLAM system, as pseudo-labels without labels.
+
+Lengths are in heights of the camera over the road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.labels.road import impose_road, road_plane
+from erfsfm.mvs.flow import Array, Grey, MeasuredDepth, measure, rays
+
+NEIGHBOURS = (-4, -2, -1, 1, 2, 4)  # frames
+MIN_SNR = 5.0  # inverse depth over its sigma
+LEAST_KNOWN = 500  # pixels
+LEAST_SIGMA = 0.01  # of the inverse depth: no label is surer, for the poses are not
+LEAST_TRAVEL = 0.1  # camera heights between the first and the last neighbour
+SKY_BRIGHTNESS = 0.95  # of the brightest pixels of the upper half
+SKY_GRADIENT = 8.0  # grey levels a pixel, smoothed
+SKY_AHEAD = 0.08  # of the image width, on either side of straight ahead
+BELOW_HORIZON = 0.04  # of the image height: a sky that reaches lower is a wall
+SKY_INVERSE_DEPTH = 1 / 60  # of a camera height: the sky is farther than 100 m
+
+
+def label(
+    target: Grey,
+    neighbours: Sequence[Grey],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+    guess: Array | None = None,
+) -> tuple[Array, Array]:
+    """Least and most inverse depth of each pixel ``(H, W)``, in one over camera heights; 0 and infinite if unknown.
+
+    Pixels without two agreeing neighbours, and dynamic objects that appear to lie under the road, are unknown; the road
+    is filled in where its surroundings lie on one plane; the sky is bounded from above.
+
+    Args:
+        target: grey image ``(H, W)``.
+        neighbours: N images of the same camera, earlier ones first.
+        K: camera matrix of these images.
+        T_neighbour_target: ``(N, 4, 4)``, translations in camera heights.
+        guess: of the inverse depth ``(H, W)``, positive, in any unit.
+    """
+    if guess is not None:
+        guess = _in_camera_heights(guess, measure(target, neighbours, K, T_neighbour_target))
+    measured = measure(target, neighbours, K, T_neighbour_target, fine=True, guess=guess)
+    inverse_depth, sigma = measured.inverse_depth, measured.sigma
+    at_least = np.zeros_like(inverse_depth)
+    reliable = inverse_depth > MIN_SNR * sigma
+    p = rays(target.shape[0], target.shape[1], K)
+    forward = direction_of_travel(T_neighbour_target)
+    plane = None if forward is None else road_plane(inverse_depth, reliable, p, forward)
+    if plane is not None:
+        road = (p @ plane).astype(np.float32)
+        at_least = impose_road(inverse_depth, sigma, reliable, road, ~reliable)
+    sigma = np.maximum(sigma, LEAST_SIGMA * np.abs(inverse_depth))
+    least = np.maximum(np.where(np.isfinite(sigma), inverse_depth - sigma, 0), at_least)
+    most = np.where(np.isfinite(sigma), np.maximum(inverse_depth, 0) + sigma, np.inf)
+    sky = sky_mask(target, (float(K[0, 2]), float(K[1, 2])))
+    least[sky], most[sky] = 0, SKY_INVERSE_DEPTH
+    return least.astype(np.float32), most.astype(np.float32)
+
+
+def _in_camera_heights(guess: Array, measured: MeasuredDepth) -> Array | None:
+    """The guess scaled to what is known without it; None where too little is."""
+    known = measured.inverse_depth > MIN_SNR * measured.sigma
+    if known.sum() < LEAST_KNOWN:
+        return None
+    return guess * np.float32(np.median(measured.inverse_depth[known] / guess[known]))
+
+
+def direction_of_travel(T_neighbour_target: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """From the neighbours before to those after, in the target's frame, ``(3,)``; None where the camera stood."""
+    places = np.linalg.inv(T_neighbour_target)[:, :3, 3]
+    travelled = places[-1] - places[0]
+    length = float(np.linalg.norm(travelled))
+    return travelled / length if length > LEAST_TRAVEL else None
+
+
+def sky_mask(grey: Grey, horizon: tuple[float, float]) -> NDArray[np.bool_]:
+    """Bright pixels without texture that are connected to the image's upper edge, ``(H, W)``.
+
+    The sky of a street is seen over its road; a bright wall stands beside it, and reaches down to the ground and hence
+    below the horizon.
+
+    Args:
+        grey: the image.
+        horizon: column and row of the pixel straight ahead.
+    """
+    height, width = grey.shape
+    smooth = cv2.GaussianBlur(grey, (5, 5), 0).astype(np.float32)
+    slope = cv2.blur(np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)) / 8, (3, 3))
+    bright = SKY_BRIGHTNESS * np.percentile(smooth[: height // 2], 98)
+    plain = (smooth > bright) & (slope < SKY_GRADIENT)
+    _, component = cv2.connectedComponents(plain.astype(np.uint8), connectivity=4)
+    below = np.unique(component[int(np.clip(horizon[1] + BELOW_HORIZON * height, 0, height)) :])
+    ahead = slice(*(int(max(horizon[0] + side * SKY_AHEAD * width, 0)) for side in (-1, 1)))
+    over_road = np.intersect1d(component[0], component[:, ahead])
+    return np.asarray(np.isin(component, np.setdiff1d(over_road, [0, *below])))

@@ -1,0 +1,162 @@
+"""Learned depth as a prior, neighbouring images at known poses as the measurement.
+
+A plane sweep around the prior at half size, smoothed semi-globally, finds each pixel's change of depth; it is brought
+to full size along the edges of the image and sharpened by Gauss-Newton steps on all neighbours at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from erfsfm.mvs.appearance import Appearance, Array
+from erfsfm.mvs.projection import Projection, halved
+from erfsfm.mvs.semi_global import smoothed
+from erfsfm.mvs.sweep import is_inside, lowest, sweep, warped
+
+STEPS = 2
+WINDOW_PX = 5
+RESIDUAL = 0.5  # of normalised grey levels, beyond which a pixel loses weight
+RESIDUAL_FLOOR = 0.02  # least variance of the residuals
+SWEEP_SIGMA = 0.06  # of log inverse depth, before the Gauss-Newton steps
+LARGEST_STEP = 0.08
+INDEPENDENT_PIXELS = 3.0  # of a window: residuals of neighbouring pixels are correlated
+SIGMA_FLOOR = 0.03
+LEAST_FIT = 0.4  # mean weight of the neighbours below which no depth explains them: the guess stays
+LEAST_PRIOR_SIGMA = 0.15
+UNDER_ROAD = 1.25  # depth below the camera over the road's from which on nothing can be static
+
+
+@dataclass(frozen=True)
+class Road:
+    """Points X of the road fulfil ``normal . X = height`` in the camera; the unit of length is that of the depth."""
+
+    normal: NDArray[np.float64]
+    height: float
+
+
+@dataclass(frozen=True)
+class RefinedDepth:
+    """Z-depth ``(H, W)``, its sigma relative to it, and which pixels were measured."""
+
+    depth: Array
+    relative_sigma: Array
+    measured: NDArray[np.bool_]
+
+
+def refine(
+    target: Appearance,
+    depth: Array,
+    neighbours: Sequence[Appearance],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+    road: Road | None = None,
+) -> RefinedDepth:
+    """Refine the depth of an image.
+
+    Args:
+        target: the image, ``(H, W)``.
+        depth: its learned z-depth ``(H, W)``, positive.
+        neighbours: N images of the same camera.
+        K: camera matrix ``(3, 3)`` of these images.
+        T_neighbour_target: ``(N, 4, 4)``; the unit of its translations is that of the depth.
+        road: below which nothing static is seen: what seems to lie there moves with the camera and keeps the prior.
+    """
+    height, width = depth.shape
+    inverse = (1 / depth).astype(np.float32)
+    change = _coarse_change(target, inverse, neighbours, K, T_neighbour_target)
+    change = _enlarged(np.asarray(cv2.medianBlur(change, 5), np.float32), target)
+    views = [(other, Projection(K, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
+    for _ in range(STEPS):
+        step, information, fit = _gauss_newton(target.levels, views, inverse * np.exp(change))
+        change += step
+    unexplained = fit < LEAST_FIT
+    measured = (information > 1 / LEAST_PRIOR_SIGMA**2) & ~unexplained
+    change[unexplained] = 0
+    if road is not None:
+        moving = _under_road(1 / (inverse * np.exp(change)), K, road) & ~_under_road(depth, K, road)
+        moving = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        change[moving], measured[moving] = 0, False
+    prior_sigma = max(LEAST_PRIOR_SIGMA, 1.48 * float(np.median(np.abs(change[measured])))) if measured.any() else 1.0
+    known = np.where(measured, information, 0) + 1 / prior_sigma**2
+    sigma = np.sqrt(1 / known + SIGMA_FLOOR**2)
+    return RefinedDepth((depth * np.exp(-change)).astype(np.float32), sigma.astype(np.float32), measured)
+
+
+def _coarse_change(
+    target: Appearance,
+    inverse: Array,
+    neighbours: Sequence[Appearance],
+    K: NDArray[np.floating],
+    T_neighbour_target: NDArray[np.float64],
+) -> Array:
+    """Change of log inverse depth ``(h, w)`` at half size."""
+    height, width = target.coarse.shape
+    small = np.asarray(cv2.resize(inverse, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    K_half = halved(K)
+    views = [(other.coarse, Projection(K_half, T, height, width)) for other, T in zip(neighbours, T_neighbour_target)]
+    return lowest(smoothed(sweep(target.coarse, views, small), target.coarse_grey))
+
+
+def _enlarged(change: Array, target: Appearance) -> Array:
+    """To full size ``(H, W)``: a pixel takes the change of the one of four at half size with the nearest grey level."""
+    height, width = target.grey.shape
+    changes, greys = (_doubled(part) for part in (change, target.coarse_grey))
+    best, nearest = np.empty_like(target.grey), np.full_like(target.grey, np.inf)
+    for top in (0, 2):
+        for left in (0, 2):
+            at = slice(top, top + height), slice(left, left + width)
+            apart = cv2.absdiff(greys[at], target.grey)
+            closer = apart < nearest
+            np.copyto(best, changes[at], where=closer)
+            np.copyto(nearest, apart, where=closer)
+    return best
+
+
+def _doubled(part: Array) -> Array:
+    """Each pixel ``(h, w)`` four times, with a border of one before and two behind."""
+    twice = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.copyMakeBorder(twice, 1, 2, 1, 2, cv2.BORDER_REPLICATE))
+
+
+def _gauss_newton(
+    levels: Array, views: Sequence[tuple[Appearance, Projection]], inverse_depth: Array
+) -> tuple[Array, Array, Array]:
+    """The next change of log inverse depth ``(H, W)``, the images' information about it, and their mean weight."""
+    squares, products, errors, weights, seen = (np.zeros_like(levels) for _ in range(5))
+    for other, projection in views:
+        u, v, z = projection.pixels(inverse_depth)
+        residual = warped(other.levels, u, v) - levels
+        inside = is_inside(residual)
+        residual *= inside
+        weight = inside / np.square(1 + np.square(residual * np.float32(1 / RESIDUAL)))
+        along_x, along_y = (warped(slope, u, v) for slope in other.slopes)
+        du, dv = projection.motion(u, v, z, inverse_depth)
+        slope = along_x * du + along_y * dv
+        weighted = weight * slope
+        squares += weighted * slope
+        products += weighted * residual
+        errors += weight * residual * residual
+        weights += weight
+        seen += inside
+    window = (WINDOW_PX, WINDOW_PX)
+    squares, products, errors, weights, seen = (
+        cv2.boxFilter(part, -1, window) for part in (squares, products, errors, weights, seen)
+    )
+    variance = errors / np.maximum(weights, 1e-3) + RESIDUAL_FLOOR
+    damping = variance / (INDEPENDENT_PIXELS * SWEEP_SIGMA**2)
+    step = np.clip(-products / (squares + damping), -LARGEST_STEP, LARGEST_STEP)
+    information = INDEPENDENT_PIXELS * squares / variance * np.square(weights / len(views))
+    return step, information, weights / np.maximum(seen, 1e-3)
+
+
+def _under_road(depth: Array, K: NDArray[np.floating], road: Road) -> NDArray[np.bool_]:
+    """Pixels ``(H, W)`` whose depth would put them clearly below the road."""
+    n_u, n_v, n_1 = road.normal @ np.linalg.inv(K)
+    height, width = depth.shape
+    u, v = np.arange(width), np.arange(height)[:, None]
+    return np.asarray((n_u * u + n_v * v + n_1) * depth > UNDER_ROAD * road.height)

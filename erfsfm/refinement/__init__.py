@@ -1,1 +1,0 @@
-"""Learned depth refined by neighbouring images at known poses, without torch."""

@@ -1,1 +1,0 @@
-"""Two-view geometry of the training images, as a teacher without labels."""

@@ -1,0 +1,120 @@
+"""``camera.yaml``: its keys, and the errors of implausible values."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+import pytest
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
+
+
+@pytest.fixture
+def camera_yaml() -> str:
+    return "width: 40\nheight: 24\nfx: 30\nfy: 30\ncx: 20\ncy: 12\nfps: 5\n"
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "line, height", [("", 1.65), ("camera_height_m: unknown", None), ("camera_height_m: 1.2", 1.2)]
+)
+def test_reads(tmp_path: Path, camera_yaml: str, line: str, height: float | None) -> None:
+    camera = read_camera_file(written(tmp_path, camera_yaml + line))
+    assert (camera.pinhole.fx, camera.pinhole.cy, camera.fps) == (30, 12, 5)
+    assert camera.height_or(1.65) == height
+    assert not camera.is_distorted
+
+
+def test_exponent_without_dot_is_a_number(tmp_path: Path, camera_yaml: str) -> None:
+    text = camera_yaml + "model: opencv\ndistortion: [1e-4, 0, 0, 0]\n"
+    assert read_camera_file(written(tmp_path, text)).distortion[0] == 1e-4
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "holds no keys: a camera file needs width"),
+        ("width: [", "is not YAML"),
+        ("width: 40\n", "key height is missing; key fx is missing"),
+        ("{yaml}focal: 3\n", "key focal is unknown"),
+        ("{yaml}camera_height_m: high\n", "camera_height_m"),
+        ("{yaml}camera_height_m: -1\n", "camera_height_m: must be greater than 0, to 1000"),
+        ("{yaml}camera_height_m: yes\n", "camera_height_m: wanted a number, is True"),
+        ("{yaml}model: omni\n", "model: input should be 'pinhole', 'opencv', 'fisheye' or 'fov', is 'omni'"),
+        ("{yaml}distortion: [0.1, 0, 0, 0]\n", "distortion: needs model opencv, fisheye or fov"),
+        (
+            "{yaml}model: opencv\ndistortion: [0.1]\n",
+            "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1",
+        ),
+        ("{yaml}model: fisheye\n", "model fisheye has 4 numbers, not 0"),
+        ("{yaml}model: opencv\ndistortion: [a, 0, 0, 0]\n", "distortion: "),
+    ],
+)
+def test_errors_are_one_line_and_name_the_key(tmp_path: Path, camera_yaml: str, text: str, message: str) -> None:
+    path = written(tmp_path, text.replace("{yaml}", camera_yaml))
+    with pytest.raises(DataError) as caught:
+        read_camera_file(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("fx: 30", "fx: -30", "fx: input should be greater than 0"),
+        ("width: 40", "width: 4.5", "width: "),
+        ("cx: 20", "cx: 60", r"\(60, 12\) lies outside the 40x24 image"),
+        ("fps: 5", "fps: .inf", "fps: input should be a finite number"),
+    ],
+)
+def test_wrong_values(tmp_path: Path, camera_yaml: str, old: str, new: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        read_camera_file(written(tmp_path, camera_yaml.replace(old, new)))
+
+
+def test_is_frozen() -> None:
+    camera = CameraFile(width=8, height=8, fx=8, fy=8, cx=4, cy=4, fps=10)
+    with pytest.raises(ValueError):
+        camera.width = 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("fx: 30", "fx: 3", "fx: 3 is no focal length in pixels of 40x24 images: .* between 4 and 800"),
+        ("fy: 30", "fy: 900", "fy: 900 is no focal length in pixels of 40x24 images"),
+        ("cy: 12", "cy: 24", r"\(20, 24\) lies outside the 40x24 image"),
+        ("fps: 5", "fps: 5\nfx: 31", "duplicate key 'fx'"),
+    ],
+)
+def test_impossible_cameras_are_refused_in_one_line(
+    tmp_path: Path, camera_yaml: str, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        read_camera_file(written(tmp_path, camera_yaml.replace(old, new)))
+    assert "camera.yaml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "warning"),
+    [
+        ("cx: 20", "cx: 31", r"the principal point \(31, 12\) is far from the middle of 40x24 images; check that"),
+        ("fx: 30", "fx: 36", "fx : fy is 1.20, so pixels are not square; check that"),
+        ("fx: 30", "fx: 32", ""),
+    ],
+)
+def test_unlikely_cameras_are_logged_once(
+    tmp_path: Path, camera_yaml: str, caplog: pytest.LogCaptureFixture, old: str, new: str, warning: str
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        read_camera_file(written(tmp_path, camera_yaml.replace(old, new)))
+    assert len(caplog.records) == (1 if warning else 0)
+    assert re.search(warning, caplog.text)

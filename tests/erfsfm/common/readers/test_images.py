@@ -1,0 +1,152 @@
+"""Image files: complete or refused, in natural order, of a known range of values."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.images import has_images, image_size, list_images, read_image, read_values, resize_image
+
+
+def test_reads_rgb_not_bgr(tmp_path: Path) -> None:
+    image = np.zeros((4, 6, 3), np.uint8)
+    image[..., 2] = 200  # red in OpenCV's order
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    read = read_image(tmp_path / "a.png")
+    assert read.shape == (4, 6, 3) and read.dtype == np.uint8 and read.flags.c_contiguous
+    assert read[0, 0].tolist() == [200, 0, 0]
+    assert image_size(tmp_path / "a.png") == (4, 6)
+
+
+@pytest.mark.parametrize("dtype, value", [(np.uint8, 77), (np.uint16, 77 * 256)])
+def test_grey_and_16_bit_images_become_three_channels(tmp_path: Path, dtype: type, value: int) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 6), value, dtype))
+    assert (read_image(tmp_path / "a.png") == 77).all()
+    assert read_image(tmp_path / "a.png").shape == (4, 6, 3)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_twelve_bits_in_sixteen_are_refused(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "a.png"
+    values = np.random.default_rng(0).integers(0, 4000, (24, 32, channels)).astype(np.uint16)
+    values[0, 0] = 3999
+    values[..., 3:] = 65535  # opaque
+    cv2.imwrite(str(path), values)
+    with pytest.raises(DataError, match=r"a\.png has 16 bits, but no value above 3999: it looks like 12-bit") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+    cv2.imwrite(str(path), np.concatenate([16 * values[..., :3], values[..., 3:]], axis=2))
+    assert read_image(path).mean() > 100
+    values[..., :3] = 0
+    cv2.imwrite(str(path), values)
+    assert read_image(path).max() == 0, "a black image is accepted"
+
+
+def test_depth_maps_keep_their_values(tmp_path: Path) -> None:
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
+    cv2.imwrite(str(tmp_path / "d.png"), depth)
+    np.testing.assert_array_equal(read_values(tmp_path / "d.png"), depth)
+
+
+@pytest.mark.parametrize("read", [read_image, read_values, image_size])
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.97])
+def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float, read: Callable[[Path], object]) -> None:
+    path = tmp_path / f"000000{suffix}"
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    cv2.imwrite(str(path), noise)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+    with pytest.raises(DataError, match=rf"000000{suffix} is (empty|truncated)"):
+        read(path)
+
+
+def test_an_interrupted_preallocated_copy(tmp_path: Path) -> None:
+    """A copy that fills the file's length first leaves zeros where the rest should be."""
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
+    with pytest.raises(DataError, match="truncated"):
+        read_image(path)
+
+
+def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
+    """As phones write motion photos; its bytes may look like markers."""
+    path = tmp_path / "a.jpg"
+    cv2.imwrite(str(path), np.full((60, 80, 3), 90, np.uint8))
+    photo, clip = path.read_bytes(), b"....ftypmp42\xff\xd9..\xff\xda.."
+    path.write_bytes(photo + clip)
+    assert abs(int(read_image(path)[30, 40, 0]) - 90) <= 1
+    path.write_bytes(photo[:-20] + clip.replace(b"\xff\xd9", b""))
+    with pytest.raises(DataError, match="truncated"):
+        read_image(path)
+
+
+def test_not_an_image(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("hello")
+    with pytest.raises(DataError, match=r"a\.png cannot be decoded"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(DataError, match=r"cannot read image .*b\.png"):
+        read_image(tmp_path / "b.png")
+
+
+def test_more_pixels_than_can_be_are_not_taken_from_memory(tmp_path: Path) -> None:
+    """The header of a PNG announces 60000 x 60000."""
+    _, content = cv2.imencode(".png", np.zeros((8, 8), np.uint8))
+    header = b"IHDR" + struct.pack(">II", 60_000, 60_000) + content.tobytes()[24:29]
+    (tmp_path / "a.png").write_bytes(
+        content.tobytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + content.tobytes()[33:]
+    )
+    with pytest.raises(DataError, match=r"a\.png has more pixels than any camera"):
+        read_image(tmp_path / "a.png")
+
+
+def test_natural_order_ignores_other_files(tmp_path: Path) -> None:
+    for name in ("img10.png", "img2.png", "img1.PNG", ".hidden.png", "ins.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [p.name for p in list_images(tmp_path)] == ["img1.PNG", "img2.png", "img10.png"]
+    assert list_images(tmp_path / "nowhere") == []
+    assert has_images(tmp_path) and not has_images(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1700000000.001911", "1700000000.1008093", "1700000000.2", "1700000000.3000495", "1700000001.0"],
+        ["left_9.5", "left_10.125", "left_10.5"],
+        ["cam0.2", "cam0.10", "cam1.3"],
+        ["2024.1.2", "2024.1.10"],
+    ],
+)
+def test_a_stamp_is_one_number_in_natural_order(tmp_path: Path, names: list[str]) -> None:
+    for name in names:
+        (tmp_path / f"{name}.png").write_bytes(b"")
+    assert [path.stem for path in list_images(tmp_path)] == names
+
+
+def test_two_formats_of_one_image(tmp_path: Path) -> None:
+    for name in ("0.png", "0.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match="image 0 in two formats"):
+        list_images(tmp_path)
+
+
+def test_resize_up_is_smooth() -> None:
+    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
+    grown = resize_image(ramp, 16, 64)
+    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
+    assert resize_image(ramp, 8, 16) is ramp
+
+
+def test_resize_down_averages() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[::2] = 100
+    assert (resize_image(image, 4, 4) == 50).all()

@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.readers.kitti_calibration import CalibrationFile
+from slam import se3
+from slam.sequences.kitti.calibration import moved_to_camera
+
+
+@pytest.fixture
+def calibration(tmp_path: Path):
+    def write(text: str) -> CalibrationFile:
+        (tmp_path / "calib.txt").write_text(text)
+        return CalibrationFile(tmp_path / "calib.txt")
+
+    return write
+
+
+def test_lever_arm_by_hand(calibration) -> None:
+    """KITTI's own colour camera: P2's column over the focal length is 6 cm, so camera 2 is 6 cm LEFT of 0."""
+    text = "P2: 718.856 0 607.1928 45.38225 0 718.856 185.2157 -0.1130887 0 0 1 0.003779761"
+    file = calibration(text)
+    T_camera_cam0 = file.T_camera_cam0("P2")
+    z = 0.003779761
+    assert T_camera_cam0[:3, 3] == pytest.approx(
+        [(45.38225 - 607.1928 * z) / 718.856, (-0.1130887 - 185.2157 * z) / 718.856, z]
+    )
+    T_cam0_camera = moved_to_camera(np.eye(4)[None], T_camera_cam0)[0]
+    assert T_cam0_camera[0, 3] == pytest.approx(-0.0599, abs=1e-4)
+    # reference is P itself: it projects a point of camera 0 to where K projects the translated point
+    point_cam0 = np.array([1.0, -0.5, 8.0])
+    P = file.matrix("P2", (3, 4))
+    by_P = P @ [*point_cam0, 1.0]
+    by_K = P[:, :3] @ se3.apply(se3.invert(T_cam0_camera), point_cam0[None])[0]
+    assert by_K == pytest.approx(by_P)
+
+
+def test_rotation_of_the_rig_translates_the_side_camera() -> None:
+    T_camera_cam0 = se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))  # the camera is 0.5 m left of camera 0
+    turn_right = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3))
+    T_world_camera = moved_to_camera(np.stack([np.eye(4), turn_right]), T_camera_cam0)
+    assert T_world_camera[:, :3, 3] == pytest.approx(np.array([[-0.5, 0, 0], [0, 0, 0.5]]), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("P0: 1 2 3", "row P2|no row P2 in .*found P0"),
+        ("P2: 1 2 3", "row P2 has 3 numbers: it needs 12"),
+        ("P2: 1 2 x 4 5 6 7 8 9 10 11 12", "row P2: could not convert string to float: 'x'"),
+        ("P2: nan 0 20 0 0 30 12 0 0 0 1 0", "needs 12 finite ones"),
+        ("P2: -30 0 20 0 0 30 12 0 0 0 1 0", "no K \\[I \\| t\\] with positive focal lengths"),
+        ("P2: 30 0 41 0 0 30 12 0 0 0 1 0", "principal point at \\(41, 12\\), outside the 40x24 images"),
+        ("", "found nothing"),
+    ],
+)
+def test_malformed(calibration, text: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        calibration(text).pinhole("P2", 40, 24)

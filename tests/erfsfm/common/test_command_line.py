@@ -1,0 +1,102 @@
+"""What both command lines share: words of no use, errors of every kind as one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from erfsfm.common import command_line
+from erfsfm.common.errors import DataError
+
+Outcome = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def outcome(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Outcome:
+    """Exit code and stderr of a program that does something with its words."""
+
+    def run(does: Callable[[list[str]], object], *words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["program", *words])
+        with pytest.raises(SystemExit) as stopped:
+            command_line.run(lambda args, prog_name: sys.exit(does(args)), "program")
+        return int(stopped.value.code or 0), capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.parametrize("words", [("--output", ""), ("--output=",)])
+def test_an_empty_option_is_refused(outcome: Outcome, words: tuple[str, ...]) -> None:
+    code, err = outcome(lambda args: None, "run", *words)
+    assert code == 2 and err.startswith("program: --output is empty: give a value") and len(err.splitlines()) == 1
+
+
+def test_a_word_that_no_text_file_holds_is_refused(outcome: Outcome) -> None:
+    code, err = outcome(lambda args: None, "run", "--dataset", "b\udcfcro")
+    assert code == 1 and err.startswith("program: 'b\\udcfcro' is not in UTF-8: rename it") and err.count("\n") == 1
+
+
+def test_a_current_folder_that_was_removed_is_one_line(
+    outcome: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "place"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    place.rmdir()
+    code, err = outcome(lambda args: None, "run")
+    assert code == 1 and err == "program: the folder that you are in was removed: change to another one\n"
+
+
+def test_a_full_standard_output_is_one_line(outcome: Outcome) -> None:
+    code, err = outcome(raising(OSError(28, "No space left on device")), "run")
+    assert code == 1 and err.startswith("program: No space left on device: standard output") and err.count("\n") == 1
+
+
+def test_an_empty_argument_is_refused(outcome: Outcome) -> None:
+    assert "one of its words is empty" in outcome(lambda args: None, "evaluate", "")[1]
+
+
+def test_the_home_folder_is_meant_in_quotes_too(outcome: Outcome) -> None:
+    seen: list[str] = []
+    outcome(seen.extend, "--output=~/runs", "~/drive", "a~/b", "--set", "output.root=~", "--hazards", "")
+    home = Path.home()
+    assert seen == [f"--output={home / 'runs'}", str(home / "drive"), "a~/b", "--set", "output.root=~", "--hazards", ""]
+
+
+def raising(error: Exception) -> Callable[[object], object]:
+    def does(_: object) -> object:
+        raise error
+
+    return does
+
+
+@pytest.mark.parametrize(
+    "error, line",
+    [
+        (DataError("two\nlines"), "program: two lines"),
+        (FileNotFoundError(2, "No such file", "a"), "program: a: No such file: check the path"),
+        (MemoryError(), "program: memory ran out"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: not enough memory"), "program: memory ran out"),
+        (RuntimeError("can't start new thread"), "program: memory ran out"),
+        (ZeroDivisionError("by zero"), "program: unexpected ZeroDivisionError: by zero (test_command_line.py:"),
+    ],
+)
+def test_every_error_is_one_line(outcome: Outcome, error: Exception, line: str) -> None:
+    code, err = outcome(raising(error))
+    assert code == 1 and err.startswith(line) and len(err.splitlines()) == 1
+
+
+def test_an_unexpected_error_is_shown_where_that_is_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["program"])
+    monkeypatch.setenv(command_line.SHOW_TRACEBACK, "1")
+    with pytest.raises(ZeroDivisionError):
+        command_line.run(lambda args, prog_name: raising(ZeroDivisionError())(args), "program")
+
+
+def test_an_error_of_a_data_loaders_process_is_its_last_line() -> None:
+    text = "Caught DataError in DataLoader worker process 0.\nOriginal Traceback (most recent call last):\n  File x\n"
+    assert str(DataError(f"{text}erfsfm.common.errors.DataError: image a.png is empty: copy it again\n")) == (
+        "image a.png is empty: copy it again"
+    )

@@ -1,0 +1,48 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from erfsfm.common import files
+from erfsfm.common.files import read_text, write_atomically
+
+
+@pytest.mark.parametrize("through", ["itself", "a link"])
+def test_a_pipe_or_a_device_keeps_its_place(tmp_path: Path, through: str) -> None:
+    """A superuser's rename would put a file there, also in the place of /dev/null."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    (tmp_path / "link").symlink_to(pipe)
+    with pytest.raises(OSError, match="is a device or a pipe: give the name of a file"):
+        write_atomically(pipe if through == "itself" else tmp_path / "link", lambda path: path.write_text("x"))
+    assert pipe.is_fifo() and (tmp_path / "link").is_symlink() and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_disk_that_is_full_names_the_file(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "depth.png"
+
+    def fill(path: Path) -> None:
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match=r"depth\.png: cannot be written \(No space left on device\)$"):
+        write_atomically(target, fill)
+    assert list(target.parent.iterdir()) == []
+
+
+def test_a_pipe_is_read_if_something_is_written_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=lambda: pipe.write_text("a\r\nb"))
+    writer.start()
+    assert read_text(pipe) == "a\nb"
+    writer.join()
+    monkeypatch.setattr(files, "WAIT_FOR_PIPE_S", 0.01)
+    with pytest.raises(OSError, match="a pipe that nothing was written to"):
+        read_text(pipe)

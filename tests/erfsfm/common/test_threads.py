@@ -1,0 +1,32 @@
+"""Libraries compute in the calling thread, and their thread counts are restored."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import cv2
+import pytest
+from threadpoolctl import threadpool_info
+
+from erfsfm.common.threads import limit_library_threads
+
+
+def test_thread_counts_are_limited_and_restored_also_after_an_error() -> None:
+    blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        with pytest.raises(ZeroDivisionError), limit_library_threads():
+            assert cv2.getNumThreads() == 1
+            assert all(pool["num_threads"] == 1 for pool in threadpool_info() if pool["user_api"] == "blas")
+            _ = 1 / 0
+        assert cv2.getNumThreads() == 3
+        assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == blas
+    finally:
+        cv2.setNumThreads(before)
+
+
+def test_they_are_limited_without_torch() -> None:
+    program = "import sys, erfsfm.common.threads; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

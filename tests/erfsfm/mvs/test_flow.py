@@ -1,0 +1,76 @@
+"""Depth from neighbours at known poses, on the simulated street, whose depth is exact."""
+
+import numpy as np
+import pytest
+
+from erfsfm.mvs.flow import combine, guided_flow, measure, rays, triangulate
+from erfsfm.mvs.projection import Projection
+from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedStreet:
+    return SimulatedStreet(SimulationOptions(frames=250, seed=702))
+
+
+def _measured(street, index, neighbours, error=None):
+    T = np.linalg.inv(street.T_world_camera[neighbours]) @ street.T_world_camera[index]
+    if error is not None:
+        T = error @ T
+    grey = [street.render(k).image[..., 1].copy() for k in (index, *neighbours)]
+    return measure(grey[0], grey[1:], street.K, T, fine=True)
+
+
+@pytest.mark.parametrize("index", [40, 120, 200])
+def test_depth_is_metric_and_its_sigma_tells_where_it_is_known(street, index):
+    seen = _measured(street, index, [index + k for k in (-4, -2, -1, 1, 2, 4)])
+    truth = street.render(index).depth
+    known = np.isfinite(seen.sigma) & (truth > 0) & (truth < 80) & (seen.sigma < 0.2 * seen.inverse_depth)
+    assert known.mean() > 0.3
+    error = np.abs(seen.inverse_depth[known] * truth[known] - 1)
+    assert np.median(error) < 0.04
+
+
+@pytest.mark.parametrize("shift", [None, (3.0, -2.0)], ids=["where it is", "beside it"])
+def test_flow_around_predicted_pixels_is_the_flow_itself(street, shift):
+    first, second = (street.render(k).image[..., 1].copy() for k in (120, 124))
+    T = np.linalg.inv(street.T_world_camera[124]) @ street.T_world_camera[120]
+    depth = street.render(120).depth
+    inverse = (1 / np.where(depth > 0, depth, 1e3)).astype(np.float32)
+    exact = np.dstack(Projection(street.K, T, *depth.shape).pixels(inverse)[:2])
+    pixels = exact if shift is None else exact + np.float32(shift)
+    flow, trusted = guided_flow(first, second, True, pixels)
+    v, u = np.mgrid[:128, :416].astype(np.float32)
+    error = np.linalg.norm(flow - (exact - np.stack([u, v], axis=-1)), axis=-1)
+    assert trusted.mean() > 0.3 and np.median(error[trusted & (depth > 0)]) < 0.3
+
+
+def test_wrong_poses_leave_little_that_seems_known(street):
+    turned = np.eye(4)
+    turned[:3, :3] = np.array([[1, 0, 0.0], [0, np.cos(0.02), -np.sin(0.02)], [0, np.sin(0.02), np.cos(0.02)]])
+    neighbours = [120 + k for k in (-4, -2, -1, 1, 2, 4)]
+    right, wrong = _measured(street, 120, neighbours), _measured(street, 120, neighbours, turned)
+    assert np.isfinite(wrong.sigma).mean() < 0.5 * np.isfinite(right.sigma).mean()
+
+
+def test_a_flow_made_from_a_depth_gives_that_depth_back():
+    K = np.array([[240, 0, 208], [0, 240, 60], [0, 0, 1.0]])
+    T = np.eye(4)
+    T[:3, 3] = [0.1, -0.05, -1.0]
+    inverse_depth = np.full((128, 416), 1 / 12, np.float32)
+    p = rays(128, 416, K)
+    moved = p + inverse_depth[..., None] * T[:3, 3].astype(np.float32)
+    flow = np.stack([240 * (moved[..., k] / moved[..., 2] - p[..., k]) for k in range(2)], axis=-1)
+    got, sigma, off_line_px = triangulate(flow.astype(np.float32), T, K)
+    away = np.hypot(p[..., 0] + 0.1, p[..., 1] - 0.05) > 0.1  # from the focus of expansion
+    np.testing.assert_allclose(got[away], 1 / 12, rtol=2e-3)
+    assert off_line_px.max() < 0.02 and sigma[away].max() < sigma.max()
+
+
+def test_a_lone_outlier_is_left_out_and_one_view_alone_is_not_believed():
+    values = np.array([0.1, 0.101, 0.5, 0.1], np.float32).reshape(4, 1, 1) * np.ones((4, 1, 2), np.float32)
+    sigmas = np.full((4, 1, 2), 0.002, np.float32)
+    sigmas[:3, 0, 1] = np.inf
+    seen = combine(values, sigmas)
+    assert seen.inverse_depth[0, 0] == pytest.approx(0.1003, rel=1e-2)
+    assert np.isfinite(seen.sigma[0, 0]) and np.isinf(seen.sigma[0, 1])

@@ -1,0 +1,81 @@
+"""Every shipped training configuration starts: its weights to start from, its data and its first step fit together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from erfsfm.checkpoint import load_model
+from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.snippets import split_recordings
+from erfsfm.model_record import SHIPPED
+from erfsfm.training.run import train
+
+NAMES = sorted(path.stem for path in (Path(__file__).parents[2] / "configs" / "erfsfm").glob("*.yaml"))
+FRAMES = 12
+SEQUENCES = ("00", "02", "05", "06")
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("shared")
+
+
+@pytest.fixture
+def data(shared: Path, write_root: Callable[..., Path]) -> list[Path]:
+    """Tiny drives of every kind that a configuration names."""
+    roots = [shared / name for name in ("world", "held_out", "kitti", "folder")]
+    if not shared.joinpath("world").exists():
+        write_root(roots[0], FRAMES, seed=0)
+        write_root(roots[1], FRAMES, seed=500)
+        write_root(roots[2], FRAMES, SEQUENCES)
+        roots[3].mkdir()
+        for index in range(FRAMES):
+            cv2.imwrite(str(roots[3] / f"{index:06d}.png"), np.full((64, 96, 3), 10 * index, np.uint8))
+        camera = {"width": 96, "height": 64, "fx": 60.0, "fy": 62.0, "cx": 47.0, "cy": 30.0, "fps": 10}
+        (roots[3] / "camera.yaml").write_text(yaml.safe_dump(camera))
+    return roots
+
+
+def measured(config: ExperimentConfig, folder: Path) -> None:
+    """Poses and labels of many views, which the SLAM system would measure for minutes."""
+    size = (config.network.height, config.network.width)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride)
+    for recording in split_recordings(config.data)[0]:
+        drive = teacher.drive(recording)
+        T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
+        T_world_camera[:, 2, 3] = 0.06 * np.arange(len(recording))
+        drive.keep_poses(T_world_camera)
+        for target in drive.targets(config.network.sources):
+            drive.label_file(target).parent.mkdir(exist_ok=True)
+            least = np.full(size, 0.25, np.float16)
+            np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
+
+
+@pytest.mark.parametrize("weights", sorted(path.name for path in SHIPPED.iterdir()))
+def test_weights_have_the_name_of_the_configuration_that_trains_them(weights: str) -> None:
+    assert load_model(weights).record.network == load_experiment(weights).network
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_starts(name: str, data: list[Path], tmp_path: Path) -> None:
+    written = load_experiment(name)
+    small = ["training.batch=2", "training.steps=1", "data.workers=0", "data.validation=[simulated/500]"]
+    small += ["data.validation_snippets=1", "data.cache_mb=50", f"teacher.cache={tmp_path / 'measured'}"]
+    if written.initial_weights is None:  # those fit one size and width
+        small += ["network.height=96", "network.width=160", "network.depth_width=0.0625", "network.pose_width=0.125"]
+        small += [] if written.network.fidelity == "default" else ["network.height=128", "network.width=192"]
+    if "lite0" in written.network.depth:
+        small += ["network.depth_width=1"]
+    config = load_experiment(name, small).with_roots(data)
+    if config.teacher.views == "many":
+        measured(config, tmp_path / "measured")
+    record = load_model(train(config, tmp_path / "run", device="cpu")).record
+    assert record.step == 1
+    assert record.network == config.network

@@ -63,7 +63,7 @@ def run_drive(drive: Drive, output: Path, limits: Limits) -> Outcome:
     if _is_whole(folder, arguments):
         return Outcome(drive, folder, "kept")
     output.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-P", "-m", "slam.batch.process", str(output / f".{drive.name}.lock"), *arguments]
+    command = [sys.executable, "-Pm", "slam.batch.process", str(output / f".{drive.name}.lock"), *arguments]
     log = output / f"{drive.name}.log"
     with log.open("w", encoding="utf-8") as file:
         process = subprocess.Popen(

@@ -180,7 +180,8 @@ def test_many_workers_need_dask(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
     """Its standard input is closed as by the death of the worker."""
     output = tmp_path / "run"
-    command = [sys.executable, "-m", "slam.batch.process", str(tmp_path / "lock"), "run", "--output", str(output)]
+    arguments = [str(tmp_path / "lock"), "run", "--output", str(output)]
+    command = [sys.executable, "-m", "slam.batch.process", *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while not (output / "run.log").exists() and process.poll() is None:
             time.sleep(0.05)

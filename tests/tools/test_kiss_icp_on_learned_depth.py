@@ -61,14 +61,3 @@ def test_a_second_run_reads_the_cache_of_the_first(
         entries.append({path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*") if path.is_file()})
     assert "kiss-icp, one unit" in tables[0] and tables[0] == tables[1]
     assert len(entries[0]) == 8 + 4 and entries[0] == entries[1], "one disparity a frame and one pose entry a snippet"
-
-
-def test_a_cache_that_cannot_be_made_is_one_line(tool: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit, match="no cache can be made in"):
-        tool.main(["--frames", "0:8", "--weights", "sim", "--cache", str(tmp_path / "file" / "cache")])
-
-
-def test_missing_true_depth_is_an_error(tool: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"no depth map 000003\.png"):
-        tool.true_depth(tmp_path, 3)

@@ -2,8 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, UpBlock, crop_like, initialise, scaled
-from erfsfm.networks.deformable import DeformableConv2d
+from erfsfm.networks.blocks import ConvBlock, Encoder, Layer, initialise
 
 
 @pytest.mark.parametrize("kernel", [3, 5, 7])
@@ -19,13 +18,6 @@ def test_paper_maps_shrink_with_dilation():
     assert block(torch.zeros(1, 2, 128, 416)).shape == (1, 4, 61, 205)
 
 
-def test_deformable_block_has_no_bias_on_its_kernel():
-    block = ConvBlock(2, 4, Layer(3, 1, deformable=True))
-    assert isinstance(block[0], DeformableConv2d)
-    assert block[0].kernel.bias is None
-    assert block[0].offset.out_channels == 18 and block[0].modulator.out_channels == 9
-
-
 @pytest.mark.parametrize("deformable", [False, True])
 def test_batch_norm_sits_between_convolution_and_relu(deformable):
     block = ConvBlock(2, 4, Layer(3, 1, deformable=deformable), normalisation="batch")
@@ -33,21 +25,6 @@ def test_batch_norm_sits_between_convolution_and_relu(deformable):
     plain = ConvBlock(2, 4, Layer(3, 1, deformable=deformable))
     difference = sum(p.numel() for p in block.parameters()) - sum(p.numel() for p in plain.parameters())
     assert difference == 8
-
-
-@pytest.mark.parametrize("kernel", [3, 4])
-def test_up_block_doubles(kernel):
-    assert UpBlock(3, 5, kernel)(torch.zeros(1, 3, 4, 7)).shape == (1, 5, 8, 14)
-
-
-def test_crop_keeps_the_top_left():
-    features = torch.arange(12).view(1, 1, 3, 4)
-    assert crop_like(features, torch.zeros(1, 5, 2, 3)).tolist() == [[[[0, 1, 2], [4, 5, 6]]]]
-
-
-@pytest.mark.parametrize("channels, width, wanted", [(32, 1.0, 32), (16, 0.25, 4), (16, 0.1, 4), (64, 0.5, 32)])
-def test_width(channels, width, wanted):
-    assert scaled(channels, width) == wanted
 
 
 def test_encoder_keeps_every_stage():

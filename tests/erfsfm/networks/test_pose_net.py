@@ -25,29 +25,6 @@ def test_shape(variant, fidelity):
     assert PoseNet(variant, fidelity, width=0.1)(target, sources).shape == (2, 4, 6)
 
 
-@pytest.mark.parametrize("count", range(1, 9))
-def test_numbers_of_sources(count):
-    assert PoseNet(width=0.1, sources=count)(*images(count)).shape == (2, count, 6)
-
-
-@pytest.mark.parametrize("count", [0, 9, -1])
-def test_impossible_numbers_of_sources(count):
-    with pytest.raises(ValueError, match=f"sources must be 1 to 8; got {count}"):
-        PoseNet(sources=count)
-
-
-def test_wrong_number_of_sources():
-    target, sources = images(3)
-    with pytest.raises(ValueError, match="takes 4 sources; got 3"):
-        PoseNet(width=0.1)(target, sources)
-
-
-def test_wrong_size_of_a_source():
-    target, sources = images(2)
-    with pytest.raises(ValueError, match="one shape"):
-        PoseNet(width=0.1, sources=2)(target, [sources[0], sources[1][..., :-1]])
-
-
 def test_stack_is_target_first_then_sources_in_order():
     network = PoseNet(width=0.1, sources=2)
     seen = []
@@ -85,11 +62,6 @@ def test_stage_sizes(variant, fidelity, wanted):
     assert stage_sizes(PoseNet(variant, fidelity, width=0.1), (128, 416)) == wanted
 
 
-@pytest.mark.parametrize("size", [(1, 1), (75, 248), (94, 310), (33, 64)])
-def test_default_dilated_keeps_the_plain_sizes(size):
-    assert stage_sizes(PoseNet("dilated", width=0.1), size) == stage_sizes(PoseNet(width=0.1), size)
-
-
 def test_variants_change_their_stages():
     def changed(variant):
         return [i for i, layer in enumerate(PoseNet(variant, width=0.1).encoder_layers()) if layer.deformable]
@@ -119,11 +91,6 @@ def test_paper_dilated_masks_miss_the_pyramid_as_published():
     network = PoseNet("dilated", "paper", width=0.1, sources=1, mask_branch=True)
     _, masks = network.forward_with_masks(*images(1, (128, 416), batch=1))
     assert [tuple(mask.shape[2:]) for mask in masks] == [(96, 384), (48, 192), (24, 96), (12, 48)]
-
-
-def test_masks_need_their_branch():
-    with pytest.raises(ValueError, match="without a mask branch"):
-        PoseNet(width=0.1, sources=1).forward_with_masks(*images(1))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

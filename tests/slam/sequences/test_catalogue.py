@@ -8,11 +8,6 @@ from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds, sequence_names
 
 
-def test_only_sequence_needs_no_name(tmp_path: Path, odometry) -> None:
-    odometry(tmp_path, name="07")
-    assert open_sequence(tmp_path, None, None, None).name == "07"
-
-
 def test_several_sequences_are_listed(tmp_path: Path, odometry) -> None:
     for name in ("02", "10", "00"):
         odometry(tmp_path, name=name, frames=2)
@@ -67,26 +62,6 @@ def test_unknown_folders(tmp_path: Path, content: list[str], message: str) -> No
         (tmp_path / name).write_text("")
     with pytest.raises(SequenceError, match=message):
         open_sequence(tmp_path, None, None, None)
-
-
-def test_unknown_paths(tmp_path: Path, camera_yaml: str) -> None:
-    with pytest.raises(SequenceError, match=r"no data set at .*nowhere: check the path"):
-        open_sequence(tmp_path / "nowhere", None, None, None)
-    (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(SequenceError, match=r"notes\.txt is no video \(mp4, avi, mov, mkv\)"):
-        open_sequence(tmp_path / "notes.txt", None, None, None)
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    with pytest.raises(SequenceError, match="without a data set"):
-        open_sequence(None, None, tmp_path / "camera.yaml", None)
-
-
-def test_name_of_a_folder_inside(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path / "mine", ["0.png", "1.png"])
-    (tmp_path / "mine" / "camera.yaml").write_text(camera_yaml)
-    assert open_sequence(tmp_path, "mine", None, None).name == "mine"
-    assert open_sequence(tmp_path / "mine", "mine", None, None).name == "mine"
-    with pytest.raises(SequenceError, match=r"no sequence yours in .*found mine"):
-        open_sequence(tmp_path / "mine", "yours", None, None)
 
 
 def test_the_door_is_light() -> None:

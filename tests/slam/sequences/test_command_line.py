@@ -82,15 +82,6 @@ def test_a_folder_with_brackets_in_its_name(
         assert code == 0 and metrics(tmp_path / f"leak-{leak}")["provenance"]["leak"] is leak, err
 
 
-def test_half_a_jpeg_is_interpolated_and_named(tmp_path: Path, kitti_root: Path, run: Call) -> None:
-    image = write_folder(tmp_path / "drive", kitti_root, ".jpg") / "000006.jpg"
-    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
-    code, err = run("--dataset", "drive", "--output", "out")
-    assert code == 0, err
-    (bridged,) = metrics(tmp_path / "out")["sequence"]["bridged"]
-    assert (bridged["first"], bridged["last"]) == (6, 6) and "000006.jpg is truncated" in bridged["reason"]
-
-
 def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kitti_root: Path, run: Call) -> None:
     root = write_kitti(tmp_path / "root", "00", kitti_root)
     for number in (6, 7):

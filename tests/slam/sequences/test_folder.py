@@ -23,14 +23,6 @@ def test_layouts(tmp_path: Path, images, camera_yaml: str, inner: str, beside: b
     assert sequence.provenance() == ("folder/drive[0:12]",)
 
 
-def test_inner_folder_has_the_outer_name(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path / "drive" / "images", ["0.png", "1.png"])
-    (tmp_path / "drive" / "camera.yaml").write_text(camera_yaml + "camera_height_m: 1.4\n")
-    sequence = open_sequence(tmp_path / "drive" / "images", None, None, "1:")
-    assert sequence.name == "drive" and sequence.camera_height_m == 1.4
-    assert sequence.provenance() == ("folder/drive[1:2]",)
-
-
 def test_undistorts(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
@@ -56,13 +48,6 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(
         open_sequence(tmp_path, frames="1:4").frame(1)
 
 
-def test_a_gap_under_a_lens(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "3.png", "4.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml + "model: opencv\ndistortion: [-0.2, 0, 0, 0]\n")
-    with pytest.raises(MissingFrameError):
-        open_sequence(tmp_path).frame(2)
-
-
 @pytest.mark.parametrize("fps, last", [(50, 202), (5, 60), (50, 10**15)], ids=["frames", "seconds", "for ever"])
 def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: int, last: int) -> None:
     images(tmp_path, [f"{k}.png" for k in range(5)] + [f"{last}.png"])
@@ -70,15 +55,6 @@ def test_a_long_gap_is_refused(tmp_path: Path, images, camera_yaml: str, fps: in
     with pytest.raises(SequenceError, match=rf"no images 5\.png to {last - 1}\.png .*split the recording") as caught:
         open_sequence(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("step", ["1e8", "1e-9", "nan"])
-def test_stamps_that_cannot_be_seconds_are_refused(tmp_path: Path, images, camera_yaml: str, step: str) -> None:
-    images(tmp_path, [f"{k}.png" for k in range(4)])
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    (tmp_path / "times.txt").write_text("".join(f"{k * float(step):.12f}\n" for k in range(4)))
-    with pytest.raises(SequenceError, match=r"s apart: check its stamps|must be numbers that increase"):
-        open_sequence(tmp_path)
 
 
 def test_unlikely_stamps_and_pauses_are_warned_of(
@@ -90,22 +66,6 @@ def test_unlikely_stamps_and_pauses_are_warned_of(
     open_sequence(tmp_path)
     assert "its frames are 100 s apart" in caplog.text and "pause for 8800 s before frame 3" in caplog.text
     assert "camera_height_m is 100" in caplog.text
-
-
-def test_brackets_in_a_name(tmp_path: Path, images, camera_yaml: str) -> None:
-    folder = tmp_path / "br[ack]ets"
-    images(folder, ["0.png", "1.png"])
-    (folder / "camera.yaml").write_text(camera_yaml)
-    assert open_sequence(folder).provenance() == ("folder/br[ack]ets[0:2]",)
-
-
-def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
-    images(tmp_path, ["0.png", "1.png", "2.png"])
-    (tmp_path / "camera.yaml").write_text(camera_yaml)
-    (tmp_path / "1.png").write_bytes(b"no image")
-    with pytest.raises(SequenceError, match=r"1\.png cannot be decoded") as caught:
-        open_sequence(tmp_path).frame(1)
-    assert not isinstance(caught.value, MissingFrameError)
 
 
 def test_errors(tmp_path: Path, images, camera_yaml: str) -> None:

@@ -5,7 +5,6 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.recording import RecordedSequence
 
@@ -53,28 +52,6 @@ def test_uncovered_images_mean_no_reference(folder: Path, caplog: pytest.LogCapt
     with caplog.at_level(logging.WARNING):
         assert open_sequence(folder, None, None, None).reference is None
     assert "no pose within 0.1 s of image 0" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("# nothing\n", "names no images"),
-        ("100.0 rgb/100.02.png extra\n", "line 1 is not 'stamp file'"),
-        ("soon rgb/100.02.png\n", "line 1 is not 'stamp file'"),
-        ("100.0 rgb/gone.png\n", r"no image .*gone\.png"),
-        ("100.2 rgb/100.02.png\n100.1 rgb/100.05.png\n", "row 2: stamps must be numbers that increase"),
-    ],
-)
-def test_malformed_index(folder: Path, text: str, message: str) -> None:
-    (folder / "rgb.txt").write_text(text)
-    with pytest.raises(SequenceError, match=message):
-        open_sequence(folder, None, None, None)
-
-
-def test_needs_a_camera_file(folder: Path) -> None:
-    (folder / "camera.yaml").unlink()
-    with pytest.raises(SequenceError, match=r"no camera\.yaml for TUM folder"):
-        open_sequence(folder, None, None, None)
 
 
 @pytest.mark.parametrize("rows", [("100.035 near.png", "100.30 far.png"), ("100.30 far.png", "100.035 near.png")])

@@ -47,15 +47,6 @@ def test_reference_of_a_turning_rig(tmp_path: Path, odometry) -> None:
     assert reference[1, :3, 3] == pytest.approx([0.06, 0, 0.06])
 
 
-def test_colour_is_preferred_to_grey(tmp_path: Path, odometry) -> None:
-    odometry(tmp_path, camera=0)
-    odometry(tmp_path, camera=3, suffix=".jpg")
-    sequence = open_sequence(tmp_path, "00", None, None)
-    assert sequence.T_camera_lidar is not None
-    # Tr puts the LiDAR at (0.1, 0.2, 0.3) of camera 0; camera 3 is 0.47 m right of it
-    assert sequence.T_camera_lidar[:3, 3] == pytest.approx([0.1 - 0.47, 0.2, 0.3])
-
-
 def test_scans(tmp_path: Path, odometry) -> None:
     folder = odometry(tmp_path)
     (folder / "velodyne").mkdir()
@@ -104,14 +95,6 @@ def test_simulated_root(tmp_path: Path, odometry, camera_yaml: str) -> None:
     (tmp_path / "simulation.json").write_text("{}")
     with pytest.raises(SequenceError, match="must hold the simulation's seed"):
         open_sequence(tmp_path, None, None, None)
-
-
-def test_given_camera_replaces_calibration(tmp_path: Path, odometry, camera_yaml: str) -> None:
-    odometry(tmp_path)
-    path = tmp_path / "mine.yaml"
-    path.write_text(camera_yaml.replace("fx: 30", "fx: 33") + "camera_height_m: unknown\n")
-    sequence = open_sequence(tmp_path, "00", path, None)
-    assert sequence.intrinsics.fx == 33 and sequence.camera_height_m is None
 
 
 def broken(folder: Path, base: Path, what: str) -> None:
@@ -216,9 +199,3 @@ def test_missing_numbers_are_missing_frames(
     said = [record.getMessage() for record in caplog.records if "no image" in record.getMessage()]
     assert len(said) == 1
     assert "3 of 9 frames have no image; the first gap is 000003.png to 000004.png" in said[0]
-
-
-def test_other_counts_than_any_numbering_has(tmp_path: Path, gap: Path) -> None:
-    kept(gap / "times.txt", [1, 2, 5, 6, 7])
-    with pytest.raises(SequenceError, match=r"times\.txt has 5 rows for 6 images"):
-        open_sequence(tmp_path)

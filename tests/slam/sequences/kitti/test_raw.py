@@ -6,7 +6,6 @@ import pytest
 from slam import se3
 from slam.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_names
-from slam.sequences.kitti.raw import drive_sources
 
 FRAMES = 5
 DATE = "2011_09_26"
@@ -91,13 +90,6 @@ def test_root_with_several_drives(tmp_path: Path) -> None:
     assert open_sequence(tmp_path, f"{DATE}_drive_0014", None, None).name == f"{DATE}_drive_0014"
 
 
-def test_alias_in_the_odometry_benchmark() -> None:
-    labels = [source.label(100) for source in drive_sources("2011_09_30_drive_0033")]
-    assert labels == ["kitti_raw/2011_09_30_drive_0033[0:100]", "kitti_odometry/09[0:100]"]
-    _, alias = drive_sources("2011_09_30_drive_0028")
-    assert alias.shifted(1100).label(4071) == "kitti_odometry/08[0:4071]"
-
-
 def test_optional_parts(tmp_path: Path) -> None:
     drive = write_drive(tmp_path)
     (drive.parent / "calib_imu_to_velo.txt").unlink()
@@ -125,41 +117,3 @@ def test_missing_numbers(tmp_path: Path, packets: str) -> None:
     assert sequence.reference[:, 2, 3] == pytest.approx(np.arange(4), abs=1e-3)
     with pytest.raises(MissingFrameError):
         sequence.frame(1)
-
-
-def test_images_of_another_shape(tmp_path: Path) -> None:
-    drive = write_drive(tmp_path)
-    (tmp_path / DATE / "calib_cam_to_cam.txt").write_text(CAM_TO_CAM.replace("4.8e+01", "4.0e+01"))
-    with pytest.raises(SequenceError, match=r"the images are 40x24, but camera 02 .* is 80x40: .*cropped"):
-        open_sequence(drive)
-
-
-def test_errors(tmp_path: Path) -> None:
-    drive = write_drive(tmp_path)
-    (drive / "image_02/timestamps.txt").write_text("yesterday\n")
-    with pytest.raises(SequenceError, match=r"timestamps\.txt must hold a date and a time a row"):
-        open_sequence(drive, None, None, None)
-    (drive / "image_02/timestamps.txt").write_text(times(0.0)[:29])
-    with pytest.raises(SequenceError, match=r"timestamps\.txt has 1 rows for 5 images"):
-        open_sequence(drive, None, None, None)
-    (drive / "image_02/timestamps.txt").write_text(times(0.0))
-    (drive / "oxts/data/0000000001.txt").write_text("1 2 3")
-    with pytest.raises(SequenceError, match=r"0000000001\.txt has 3 numbers, not 30"):
-        open_sequence(drive, None, None, None)
-    (drive / "oxts/data/0000000001.txt").unlink()
-    with pytest.raises(SequenceError, match="has 4 packets for 5 images"):
-        open_sequence(drive, None, None, None)
-    (drive.parent / "calib_cam_to_cam.txt").unlink()
-    with pytest.raises(SequenceError, match=r"no calib_cam_to_cam\.txt in .*2011_09_26: .*beside the drives"):
-        open_sequence(drive, None, None, None)
-    for path in (drive / "image_02/data").iterdir():
-        path.unlink()
-    with pytest.raises(SequenceError, match="looked for png or jpg in image_02/data"):
-        open_sequence(drive, None, None, None)
-
-
-def test_unrectified_drive(tmp_path: Path) -> None:
-    folder = tmp_path / f"{NAME}_extract"
-    folder.mkdir()
-    with pytest.raises(SequenceError, match="not rectified"):
-        open_sequence(folder, None, None, None)

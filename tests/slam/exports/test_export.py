@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import RunError, TrajectoryError
+from slam.errors import RunError
 from slam.exports.export import export
 from slam.exports.options import R_UP_WORLDS
 from slam.formats.ply import read_ply_points
@@ -63,12 +63,6 @@ def test_trajectory_with_z_up_rotates_the_world_only(make_run: MakeRun, tmp_path
     np.testing.assert_allclose(up.T_world_camera[0, :3, :3], R_UP_WORLD, atol=1e-6)
 
 
-def test_graph_is_copied(make_run: MakeRun, tmp_path: Path) -> None:
-    folder = make_run()
-    written = export(folder, "graph", tmp_path / "g.g2o", "y-down")
-    assert written.read_bytes() == (folder.path / "graph.g2o").read_bytes()
-
-
 def keep_places(folder: RunFolder) -> None:
     camera = Intrinsics(416, 128, 230.0, 230.0, 207.0, 63.0)
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
@@ -87,44 +81,6 @@ def test_colmap_has_camera_poses_and_cloud(make_run: MakeRun, tmp_path: Path, up
     half = np.sqrt(0.5)  # z up: the camera's axes turned by 90 degrees about x
     expected = [1.0, 0, 0, 0, 0, 0, 0] if up == "y-down" else [half, half, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(first, expected, atol=1e-9)
-
-
-def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -> None:
-    folder = make_run()
-    keep_places(folder)
-    (folder.path / "map_cloud.ply").unlink()
-    written = export(folder, "colmap", tmp_path / "model", "y-down")
-    assert len((written / "points3D.txt").read_text().splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("what", "name", "up", "why"),
-    [
-        ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
-        ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap, nerfstudio"),
-        ("mesh", "out.stl", "y-down", r"written as \.ply, \.obj, \.glb, \.gltf; got 'out\.stl'"),
-        ("cloud", "out.obj", "y-down", r"written as \.ply, \.las, \.laz"),
-        ("occupancy", "out.png", "z", r"ends in \.yaml"),
-        ("raster", "file", "z", "is a file: a raster is several files"),
-        ("nerfstudio", "file", "z", "is a file: a scene is several files"),
-        ("raster", "folder", "y-up", "leave --up out or give --up z"),
-        ("mesh", "out.ply", "x", "y-down, z or y-up"),
-        ("graph", "out.g2o", "z", "leave --up out"),
-        ("mesh", "", "y-down", "is a folder"),
-        ("graph", "file/out.g2o", "y-down", "cannot be written"),
-        ("trajectory", "file/out.tum", "y-down", r"target/file/out\.tum: cannot be written"),
-    ],
-)
-def test_errors_are_clear_and_leave_nothing(
-    make_run: MakeRun, tmp_path: Path, what: str, name: str, up: str, why: str
-) -> None:
-    folder = make_run()
-    target = tmp_path / "target"
-    target.mkdir()
-    (target / "file").write_text("in the way")
-    with pytest.raises((RunError, TrajectoryError), match=why):
-        export(folder, what, target / name, up)
-    assert [path.name for path in target.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize(
@@ -165,23 +121,6 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
     with pytest.raises(RunError, match=why):
         export(folder, what, tmp_path / name)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-
-
-@pytest.mark.parametrize(
-    ("what", "missing"),
-    [
-        ("mesh", "map_mesh.ply"),
-        ("trajectory", "trajectory_optimised.tum.txt"),
-        ("colmap", "places.npz"),
-        ("raster", "map_mesh.ply"),
-    ],
-)
-def test_a_part_the_run_lacks_is_named(make_run: MakeRun, tmp_path: Path, what: str, missing: str) -> None:
-    folder = make_run()
-    keep_places(folder)
-    (folder.path / missing).unlink()
-    with pytest.raises(RunError, match=f"has no {missing}"):
-        export(folder, what, tmp_path / "out.ply", "y-down")
 
 
 def cut(path: Path, at: int) -> None:

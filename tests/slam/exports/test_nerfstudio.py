@@ -99,12 +99,6 @@ def test_frames_without_a_usable_image_are_left_out(
     assert "2 of 8 frames have no usable image" in caplog.text
 
 
-def test_interpolated_frames_are_no_images_of_a_colmap_model(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    model = export(make_recorded(bridged=(5,)), "colmap", tmp_path / "model")
-    images = [line.split() for line in (model / "images.txt").read_text().splitlines()[1::2]]
-    assert [(row[0], row[-1]) for row in images] == [(str(k + 1), f"{k:06d}.png") for k in range(8) if k != 5]
-
-
 @pytest.mark.parametrize(
     ("rows", "continued_at", "frames", "numbers", "first_shade"),
     [(11, 3, None, range(3, 11), 0), (7, 3, "2:6", range(3, 7), 20), (8, 3, None, range(8), 0)],
@@ -126,13 +120,6 @@ def test_a_continued_run_has_the_images_of_its_last_part(
     assert names == [f"images/{k:06d}.png" for k in numbers]
     shades = [int(cv2.imread(str(written / name))[0, 0, 0]) for name in names]
     assert shades == [first_shade + 10 * k for k in range(len(numbers))]
-
-
-def test_a_last_part_of_another_length_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    lengthen(folder, 11, 4)
-    with pytest.raises(RunError, match=r"drive has 8 frames, but .* goes on with 7 at frame 4: give the data set"):
-        export(folder, "nerfstudio", tmp_path / "scene")
 
 
 def lengthen(folder: RunFolder, rows: int, continued_at: int, frames: str | None = None) -> None:
@@ -165,13 +152,6 @@ def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path:
     assert shades == [30, 40, 50]
 
 
-def test_without_a_map_there_is_no_cloud(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    (folder.path / "map_cloud.ply").unlink()
-    written = export(folder, "nerfstudio", tmp_path / "scene")
-    assert "ply_file_path" not in scene(written) and not (written / "points.ply").exists()
-
-
 def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     make_recorded: MakeRecorded, tmp_path: Path
 ) -> None:
@@ -183,13 +163,6 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
     moved = ExportOptions(dataset=tmp_path / "elsewhere", voxel=0.5)
     written = export(folder, "nerfstudio", tmp_path / "scene", "z", moved)
     assert len(scene(written)["frames"]) == 8 and len(read_ply(written / "points.ply").vertices) < 100
-
-
-def test_a_run_that_does_not_say_where_its_images_are(make_recorded: MakeRecorded, tmp_path: Path) -> None:
-    folder = make_recorded()
-    folder.write_metrics(folder.metrics() | {"provenance": {}})
-    with pytest.raises(RunError, match="does not record where its images are: give --dataset ROOT"):
-        export(folder, "nerfstudio", tmp_path / "scene")
 
 
 def test_another_recording_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:

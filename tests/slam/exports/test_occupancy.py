@@ -127,12 +127,6 @@ def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[
     }
 
 
-def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None:
-    _, poses = street
-    with pytest.raises(RunError, match="no ground below the cameras"):
-        occupancy_grid(level((-3, 3), (0, 50), 5.0), poses, 0.2, True)
-
-
 def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
     cells = np.full((5, 4), UNKNOWN, np.uint8)
     cells[0, 3], cells[4, 0] = OCCUPIED, FREE

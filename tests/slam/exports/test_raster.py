@@ -18,7 +18,6 @@ from slam.exports.raster import Raster, height_raster, write_raster
 from slam.exports.sampling import Grid, samples
 from slam.formats.ply import Ply, coloured_ply
 from slam.results.folder import RunFolder
-from slam.se3 import FloatArray
 
 GREEN, RED = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
@@ -161,30 +160,3 @@ def test_without_metres_there_is_no_place_on_earth(
         export(folder, "raster", tmp_path / "r", options=ExportOptions(origin=parse_origin("49,8,0")))
     written = export(folder, "raster", tmp_path / "r", options=ExportOptions(resolution=0.5))
     assert yaml.safe_load((written / "raster.yaml").read_text())["unit"] == unit
-
-
-def test_nothing_of_a_raster_before_stays(make_recorded: Callable[..., RunFolder], tmp_path: Path) -> None:
-    folder, output, options = make_recorded(), tmp_path / "raster", ExportOptions(resolution=0.5)
-    export(folder, "raster", output, options=options)
-    names = sorted(path.name for path in output.iterdir())
-    for name in ("height.tif", "colour.tif", "notes.txt"):
-        (output / name).write_text("before")
-    export(folder, "raster", output, options=options)
-    assert sorted(path.name for path in output.iterdir()) == sorted([*names, "notes.txt"])
-    (tmp_path / "drive" / "height.tif").write_text("mine")
-    with pytest.raises(RunError, match=r"height\.tif is none of ours"):
-        export(folder, "raster", tmp_path / "drive", options=options)
-
-
-@pytest.mark.parametrize("text", ["", "49", "49,8", "91,8,0", "49,181,0", "49,8,north", "49,8,inf"])
-def test_origins_that_are_no_places_are_refused(text: str) -> None:
-    with pytest.raises(RunError, match=r"--origin .*LAT,LON,HEADING"):
-        parse_origin(text)
-
-
-def test_cells_and_centres_are_inverse() -> None:
-    points: FloatArray = np.array([[-3.14, -2.7, 0], [5.6, 9.99, 0]])
-    grid = Grid.around(points, 0.3)
-    cells = np.arange(grid.width * grid.height)
-    np.testing.assert_array_equal(grid.cells(grid.centres(cells)), cells)
-    assert grid.x_min <= -3.14 and grid.y_max >= 9.99 and grid.y_min <= -2.7

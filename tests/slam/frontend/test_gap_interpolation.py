@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, InterpolatedGaps, interpolate_gaps, network_steps
 from slam.frontend.network_factors import chain_raw
@@ -135,12 +134,6 @@ def test_repetition_to_the_end_is_standing_still() -> None:
     still = np.tile(np.eye(4), (COUNT, 1, 1))
     found = interpolate_gaps(COUNT, 4, snippets_of(still, set()), StepTable({}), {}, range(1, COUNT))
     assert found.frames == {} and found.interpolated == []
-
-
-def test_without_any_snippet_there_is_one_error() -> None:
-    reasons = dict.fromkeys(range(3, COUNT, 4), "image 3 is truncated")
-    with pytest.raises(SlamError, match="no 5 usable frames in a row among 40: image 3 is truncated"):
-        interpolate_gaps(COUNT, 4, [], StepTable({}), reasons, ())
 
 
 def test_steps_are_the_direct_poses_of_the_target() -> None:

@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from slam.config import LoopsConfig, load_config
+from slam.config import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
-from slam.loops.closure import MOST_REJECTED, close_loops
+from slam.loops.closure import MOST_REJECTED
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.verification import Loop
 from slam.pipeline.batch import SlamPipeline, SlamResult
@@ -69,7 +69,7 @@ def test_a_loop_is_closed_and_cuts_the_error(seed: int) -> None:
 
 
 def test_a_straight_drive_has_no_loop() -> None:
-    result = run(drive("straight", 160, 620), "loops.frame_stride=3")
+    result = run(drive("straight", 80, 620), "loops.frame_stride=3")
     assert result.loops.accepted == () and result.loops.candidates > 0
 
 
@@ -93,9 +93,3 @@ def test_features_are_spread_and_bounded() -> None:
     assert view.pixels[:, 0].std() > 0.15 * SIZE[0]
     blank = extractor.view(Frame(4, 0.4, np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)), depth)
     assert len(blank) == 0
-
-
-def test_no_views_no_loops() -> None:
-    sequence = drive("straight", 20, 621)
-    closures = close_loops([], sequence.reference, sequence.intrinsics, LoopsConfig())
-    assert closures.candidates == 0 and closures.accepted == ()

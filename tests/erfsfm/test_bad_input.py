@@ -85,24 +85,6 @@ def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot
     assert wanted in refusal("evaluate", "pose", "--dataset", root, "--sequence", "00", "--weights", weights)
 
 
-def test_twelve_bits_in_sixteen(refusal: Refusal, tmp_path: Path, weights: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 64, 3), 4095, np.uint16))
-    error = refusal("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth")
-    assert "a.png has 16 bits, but no value above 4095: it looks like 12-bit data" in error
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [("fx: 100", "duplicate key 'fx'"), ("camera_height: 1", "key camera_height is unknown")],
-)
-def test_a_camera_file_with_unknown_or_duplicate_keys(
-    refusal: Refusal, tmp_path: Path, trip: Path, line: str, words: str
-) -> None:
-    camera = trip / "camera.yaml"
-    camera.write_text(f"{camera.read_text()}{line}\n")
-    assert words in refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-
-
 def test_brackets_in_a_name(
     refusal: Refusal,
     monkeypatch: pytest.MonkeyPatch,
@@ -127,37 +109,6 @@ def test_brackets_in_a_name(
     assert "leak: these weights were trained on kitti_odometry/s[0][0:6]" in error
 
 
-def test_intrinsics_of_another_resolution(refusal: Refusal, tmp_path: Path) -> None:
-    drive = tmp_path / "drive"
-    (drive / "images").mkdir(parents=True)
-    for index in range(6):
-        cv2.imwrite(str(drive / f"images/{index}.png"), np.full((48, 96, 3), 10 * index, np.uint8))
-    (drive / "camera.yaml").write_text("width: 192\nheight: 96\nfx: 100\nfy: 100\ncx: 96\ncy: 48\nfps: 10\n")
-    error = refusal(*TRAIN, *SMALL, "--dataset", drive, "--output", tmp_path / "run")
-    assert "is 96 x 48; the camera of folder/drive is 192 x 96" in error
-
-
-def test_calibration_of_another_resolution(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
-    """Raw images may be shrunk, never cropped: their calibration has an image size."""
-    write_raw(tmp_path, stored=(48, 48), speeds=[9] * 6)
-    error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
-    assert "the images are 48x48, but camera 02 in" in error
-    assert "is 96x64: the images were cropped or are of another camera" in error
-
-
-def test_a_raw_drive_shorter_than_a_snippet(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
-    write_raw(tmp_path, speeds=[9, 9, 9, 0, 9, 9])
-    error = refusal(*TRAIN, *SMALL, "--set", "network.sources=4", "--dataset", tmp_path, "--output", tmp_path / "run")
-    assert "a snippet needs 5 consecutive frames; found kitti_raw/2011_09_26_drive_0001 (3 frames)" in error
-
-
-def test_a_raw_drive_held_out_for_tests(refusal: Refusal, tmp_path: Path, write_raw: Callable[..., Path]) -> None:
-    write_raw(tmp_path, drive="2011_09_26_drive_0013")
-    error = refusal(*TRAIN, *SMALL, "--dataset", tmp_path, "--output", tmp_path / "run")
-    assert "nothing left to train on: every recording found (kitti_raw/2011_09_26_drive_0013) is excluded" in error
-    assert "data.leave_out" in error
-
-
 @pytest.fixture
 def trip(tmp_path: Path) -> Path:
     """A folder with a video of 96 x 64 and its camera."""
@@ -168,26 +119,6 @@ def trip(tmp_path: Path) -> Path:
     writer.release()
     (tmp_path / "trip/camera.yaml").write_text("width: 96\nheight: 64\nfx: 60\nfy: 60\ncx: 48\ncy: 32\nfps: 10\n")
     return tmp_path / "trip"
-
-
-def test_a_damaged_video(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
-    path = trip / "drive.mp4"
-    path.write_bytes(path.read_bytes()[:600])
-    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "drive.mp4 cannot be opened: it is damaged or of an unknown format; copy it again" in error
-
-
-def test_a_video_of_another_resolution(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
-    camera = trip / "camera.yaml"
-    camera.write_text(camera.read_text().replace("width: 96", "width: 192"))
-    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "drive.mp4 is 96 x 64; the camera of folder/trip is 192 x 64" in error
-
-
-def test_a_video_without_camera(refusal: Refusal, tmp_path: Path, trip: Path) -> None:
-    (trip / "camera.yaml").unlink()
-    error = refusal(*TRAIN, *SMALL, "--dataset", trip, "--output", tmp_path / "run")
-    assert "images or a video with camera.yaml, or a pack (pack.yaml); found drive.mp4" in error
 
 
 def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
@@ -211,12 +142,6 @@ def test_initial_weights_of_another_architecture(
     assert f"initial_weights '{weights}' are of another network" in error
 
 
-def test_an_unknown_split(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
-    root = write_root(tmp_path / "root", frames=5)
-    error = refusal(*TRAIN, "--set", "data.split=eigne", "--dataset", root, "--output", tmp_path / "run")
-    assert "no split 'eigne': neither a file nor one of eigen, odometry" in error
-
-
 @pytest.mark.parametrize("verb", ["predict", "export", "receptive-field"])
 def test_weights_cut_in_half(refusal: Refusal, tmp_path: Path, weights: Path, verb: str) -> None:
     path = weights / "depth.safetensors"
@@ -228,37 +153,6 @@ def test_weights_cut_in_half(refusal: Refusal, tmp_path: Path, weights: Path, ve
     assert "depth.safetensors is damaged" in error
     assert "copy it again or train again" in error
     assert not (tmp_path / output).exists()
-
-
-def test_weights_of_another_architecture(refusal: Refusal, tmp_path: Path, weights: Path) -> None:
-    record = weights / "model.yaml"
-    record.write_text(record.read_text().replace("pose: posenet", "pose: erf-posenet-dfc"))
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
-    error = refusal("predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth")
-    assert "pose.safetensors is of another architecture than model.yaml says" in error
-
-
-@pytest.mark.parametrize("key", ["depth", "pose"])
-def test_an_unknown_preset(refusal: Refusal, tmp_path: Path, write_root: WriteRoot, key: str) -> None:
-    root = write_root(tmp_path / "root", frames=5)
-    error = refusal(*TRAIN, "--set", f"network.{key}=posnet", "--dataset", root, "--output", tmp_path / "run")
-    assert "unknown network 'posnet' (did you mean 'posenet'?); known: depthnet" in error
-
-
-@pytest.mark.parametrize(("key", "name", "known"), [("depth", "posenet", "depthnet"), ("pose", "depthnet", "posenet")])
-def test_a_preset_of_the_other_kind(
-    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, key: str, name: str, known: str
-) -> None:
-    root = write_root(tmp_path / "root", frames=5)
-    error = refusal(*TRAIN, "--set", f"network.{key}={name}", "--dataset", root, "--output", tmp_path / "run")
-    assert f"network.{key} must be a {key} network ({known}, " in error
-    assert f"got '{name}'" in error
-
-
-def test_a_misspelt_key(refusal: Refusal, tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("network:\n  hieght: 128\n")
-    error = refusal("train", "--config", tmp_path / "mine.yaml", "--dataset", tmp_path)
-    assert f"unknown key 'network.hieght' in {tmp_path}/mine.yaml; did you mean 'network.height'?" in error
 
 
 def insert_non_finite(path: Path, value: float) -> None:
@@ -335,11 +229,6 @@ def test_an_output_with_other_peoples_files(
     error = refusal(*TRAIN, *SMALL, "--dataset", missing, "--output", output)
     assert f"{output} holds files that 'erfsfm train' did not write" in error
     assert {str(path.relative_to(output)): path.read_text() for path in output.rglob("*") if path.is_file()} == files
-
-
-def test_an_output_that_is_a_file(refusal: Refusal, tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("mine")
-    assert "is a file, not a folder" in refusal(*TRAIN, "--dataset", tmp_path, "--output", tmp_path / "mine")
 
 
 def test_a_checkpoint_of_another_project(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:

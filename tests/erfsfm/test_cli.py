@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-import erfsfm
 from erfsfm.checkpoint import Model, build_networks, save_model
 from erfsfm.cli import main
 from erfsfm.config import NetworkConfig
@@ -190,13 +188,6 @@ def test_networks_json(run: Run) -> None:
     assert "paper fidelity" in reasons[0]
 
 
-def test_networks_table(run: Run) -> None:
-    code, out, _ = run("networks", "--width", "0.25", "--sources", "2")
-    assert code == 0
-    assert all(name in out for name in PRESETS)
-    assert "263 px" in out
-
-
 def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Callable[..., Path]) -> None:
     images = write_root(tmp_path / "root", frames=6) / "sequences/00/image_2"
     picture = tmp_path / "new/field.png"
@@ -210,14 +201,6 @@ def test_receptive_field(run: Run, tmp_path: Path, weights: Path, write_root: Ca
     rows = json.loads(out)
     assert [row["theoretical_px"] for row in rows] == [263, 339, 301]
     assert {row["weights"] for row in rows} == {"untrained"}
-
-
-@pytest.mark.slow
-def test_receptive_fields_of_the_papers_networks(run: Run, tmp_path: Path) -> None:
-    options = ["--fidelity", "paper", "--height", "48", "--width", "64", "--json"]
-    code, out, _ = run("receptive-field", *options, "--output", tmp_path / "field.png")
-    names = [row["name"] for row in json.loads(out)]
-    assert code == 0 and len(names) == 8 and not any("lite0" in name for name in names)
 
 
 def test_convert(run: Run, tmp_path: Path) -> None:
@@ -278,12 +261,6 @@ def test_predict_leaves_out_what_it_cannot_read(
         shutil.copy(depth / f"a{suffix}", depth / f"b{suffix}")
     code, _, err = run(*given)
     assert code == 1 and "b.png is truncated" in err and "b.npy is of an earlier image: remove it" in err
-
-
-def test_predict_of_nothing_readable(run: Run, tmp_path: Path, weights: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"no image")
-    code, _, err = run("predict", tmp_path, "--weights", weights, "--output", tmp_path / "depth")
-    assert code == 1 and "a.png" in err and not (tmp_path / "depth").exists()
 
 
 def test_predict_does_not_overwrite_the_images(run: Run, tmp_path: Path, weights: Path) -> None:
@@ -377,43 +354,3 @@ def test_train_and_resume(run: Run, tmp_path: Path, write_root: Callable[..., Pa
     record = (tmp_path / "run" / "model.yaml").read_text()
     assert "step: 3" in record
     assert "command: erfsfm train --config tiny" in record.replace("\n  ", " ")
-
-
-def test_version(run: Run) -> None:
-    assert run("--version") == (0, f"erfsfm {erfsfm.__version__}\n", "")
-
-
-@pytest.mark.parametrize(
-    ("words", "offered"),
-    [("erfsfm ev", {"evaluate"}), ("erfsfm evaluate ", {"depth", "pose"}), ("erfsfm tr", {"train"})],
-)
-def test_shell_completion(words: str, offered: set[str]) -> None:
-    program = "import sys; sys.argv = ['erfsfm']; from erfsfm.cli import main; main()"
-    asked = {"_ERFSFM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
-    finished = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=os.environ | asked
-    )
-    assert (finished.returncode, set(finished.stdout.split())) == (0, offered), finished.stderr
-
-
-@pytest.mark.parametrize(
-    ("verb", "seeded"),
-    [
-        ("train", True),
-        ("receptive-field", True),
-        ("export", True),
-        ("predict", False),
-        ("calibrate-noise", False),
-        ("evaluate depth", False),
-        ("evaluate pose", False),
-    ],
-)
-def test_seed_is_listed_where_numbers_are_random(run: Run, verb: str, seeded: bool) -> None:
-    _, out, _ = run(*verb.split(), "--help")
-    assert ("--seed" in out) == seeded
-
-
-def test_seed_is_still_accepted_where_nothing_is_random(run: Run, weights: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 64, 3), np.uint8))
-    given = ["predict", tmp_path / "a.png", "--weights", weights, "--output", tmp_path / "depth", "--seed", 3]
-    assert run(*given)[0] == 0

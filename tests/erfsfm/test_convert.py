@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import load_model
 from erfsfm.common.errors import CheckpointError
-from erfsfm.convert import convert, read_old
+from erfsfm.convert import convert
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.networks.deformable import deform_conv2d
 
@@ -201,15 +201,6 @@ def test_pose(
                 torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
 
 
-def test_names_of_deformable_parts_do_not_matter(tmp_path: Path) -> None:
-    state = OldPose(frozenset({3, 4, 5, 6, 7})).state_dict()
-    words = {"offset_conv": "p", "modulator_conv": "m", "regular_conv": "a"}
-    for word, other in words.items():
-        state = {name.replace(word, other): value for name, value in state.items()}
-    torch.save(state, tmp_path / "bare.pth.tar")
-    assert read_old(tmp_path / "bare.pth.tar").preset == "erf-posenet-dfc"
-
-
 @pytest.mark.parametrize("legacy", [False, True])
 def test_old_files_and_parallel_training(tmp_path: Path, pose_file: Path, legacy: bool) -> None:
     path = save(OldDisp(), tmp_path / "disp.pth.tar", legacy=legacy, prefix="module.")
@@ -266,15 +257,6 @@ def test_nothing_is_executed(tmp_path: Path, form: str) -> None:
     assert trace.exists(), "the payload runs where code is allowed"
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("keep", [0, 3, 0.01, 0.5, 0.999])
-def test_half_copied(tmp_path: Path, keep: float, legacy: bool) -> None:
-    path = save(OldDisp(), tmp_path / "disp.pth.tar", legacy=legacy)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * keep) if isinstance(keep, float) else keep])
-    assert "damaged" in refusal(path)
-
-
 @pytest.mark.parametrize("content", [{"state_dict": 3}, {"state_dict": {"a": 1}}, [1, 2], {}])
 def test_files_without_a_checkpoint(tmp_path: Path, content: object) -> None:
     torch.save(content, tmp_path / "x.pth.tar")
@@ -300,19 +282,6 @@ def test_other_networks(tmp_path: Path, depth_file: Path, pose_file: Path) -> No
     assert "both hold a depth network" in refusal(depth_file, depth_file)
     assert "1 tensors missing" in refusal(_edited(depth_file, iconv3__0__weight=None))
     assert "which DispNetS and PoseExpNet do not have" in refusal(_edited(pose_file, conv8__0__weight=torch.zeros(2)))
-
-
-def test_other_shapes(depth_file: Path, pose_file: Path) -> None:
-    assert "must have shape" in refusal(_edited(depth_file, iconv3__0__bias=torch.zeros(5)))
-    assert "sources 3" in refusal(_edited(pose_file, pose_pred__weight=torch.zeros(18, 64, 1, 1)))
-
-
-def test_unknown_deformable_layers(tmp_path: Path) -> None:
-    """The reference's first commits had conv5 to conv7: no network of the paper."""
-    path = save(OldPose(frozenset({5, 6, 7})), tmp_path / "pose.pth.tar")
-    assert "deformable layers in conv (5, 6, 7)" in refusal(path)
-    path = save(OldPose(frozenset({3, 4, 5, 6, 7})), path)
-    assert "offsets, modulator and kernel" in refusal(_edited(path, conv3__0__modulator_conv__bias=None))
 
 
 def test_refusals(tmp_path: Path, depth_file: Path) -> None:

@@ -27,6 +27,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+import typer
 import yaml
 from onnx import TensorProto, helper
 
@@ -67,7 +68,8 @@ SHORTER: tuple[tuple[str, str], ...] = (
 )
 
 SLOW = (
-    r"^erfsfm export .*--format onnx",  # the README has it without the default format
+    r"^erfsfm-slam run(?! --dataset my_drive.mp4 --camera)",  # a whole run each; test_every_command_is_understood
+    r"^erfsfm export ",  # tests/erfsfm/test_export.py exports smaller networks
     r"^python tools/",  # several whole runs each
     r"^erfsfm receptive-field --(output|weights default)",  # docs/receptive-fields.md has it with smaller weights
     r"^erfsfm train --config table1",  # networks of the paper's size
@@ -329,6 +331,34 @@ def test_every_command_runs(block: Block, at_work: Path) -> None:
     except BaseException as error:
         error.add_note(f"{block}: '{block.text}', run as '{command}', failed; {ADVICE}")
         raise
+
+
+UsageError = typer.BadParameter.__bases__[0]  # typer has its own click
+
+
+def understood(command: str) -> None:
+    """Read the words of a command line as its program does, and do nothing."""
+    name, *words = shlex.split(command)
+    reader: Any = typer.main.get_command({"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.cli.app}[name])
+    while hasattr(reader, "commands"):
+        name, *words = words
+        reader = reader.commands[name]
+    reader.make_context(name, words)
+
+
+@pytest.mark.parametrize("program", ["erfsfm", "erfsfm-slam"])
+def test_every_command_is_understood(program: str) -> None:
+    """Also where it is not run or is slow: its options exist, and their values are of the right kind."""
+    found = [block for block in commands() if shlex.split(bare(block.text))[0] == program]
+    for block in found:
+        if "--install-completion" in block.text:  # acts when it is read
+            continue
+        try:
+            understood(bare(block.text))
+        except UsageError as error:
+            raise AssertionError(f"{block}: {error.format_message()}") from error
+    with pytest.raises(UsageError):
+        understood(f"{bare(found[0].text)} --no-such-option")
 
 
 def test_what_is_not_run_exists() -> None:

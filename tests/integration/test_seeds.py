@@ -32,6 +32,7 @@ def check_seeds(folder: Path, dataset: Path | None, sequence: str | None, frames
         assert each.metrics()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] < 2 * ate_m
 
 
+@pytest.mark.slow
 def test_seeds_on_the_simulated_street(tmp_path: Path) -> None:
     check_seeds(tmp_path, None, None, "20:45", 0.034)
 

@@ -5,6 +5,7 @@ Errors may be twice what was measured; the measured figure is the other factor o
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulatedFrame, SimulationOptions, write_kitti_root
+from slam.sequences.simulation.street import SimulationOptions, write_kitti_root
 from slam.trajectory import Trajectory, read_trajectory
 
 FACTOR = 0.2  # unscaled lengths per metre
@@ -33,19 +34,19 @@ NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_relative_sigma": 0.05, 
 
 
 class Rendered(SimulatedSequence):
-    """The street with every frame rendered once, its depth beside it."""
+    """The street with each frame rendered once, when it is first asked for, its depth beside it."""
 
     def __init__(self, options: SimulationOptions) -> None:
         super().__init__(options)
-        self._frames: list[SimulatedFrame] = [self.street.render(k) for k in range(options.frames)]
+        self._rendered = functools.cache(self.street.render)
 
     def frame(self, index: int) -> Frame:
         """A rendered frame."""
-        return Frame(index, float(self.stamps[index]), self._frames[index].image)
+        return Frame(index, float(self.stamps[index]), self._rendered(index).image)
 
     def depth(self, index: int) -> FloatArray:
         """True z-depth, the sky at 200 m."""
-        depth = self._frames[index].depth.astype(np.float64)
+        depth = self._rendered(index).depth.astype(np.float64)
         return np.where(depth > 0, depth, 200.0)
 
 
@@ -111,6 +112,7 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
     assert np.median(street.street.distance_to_surface(points)) < 0.03
 
 
+@pytest.mark.slow
 def test_the_graph_alone_reduces_the_error(street: Rendered) -> None:
     part = Excerpt(street, 0, 100)
     options = ("geometry.enabled=false", "mapping.enabled=false")
@@ -145,6 +147,7 @@ def test_rotations_of_the_shipped_networks_follow_the_road(
     assert (network[:, 2, 3] > 0).mean() > 0.95  # forward
 
 
+@pytest.mark.slow
 def test_the_system_is_better_than_its_networks(learned: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     metrics = check_run(learned)
     errors = {name: metrics["trajectories"][name]["align"] for name in ("network", "odometry", "optimised")}

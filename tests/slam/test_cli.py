@@ -17,11 +17,9 @@ import numpy as np
 import pytest
 import typer
 
-import erfsfm
 import slam
 import slam.run
 from slam.cli import app, main
-from slam.config import load_config
 from slam.errors import SlamError
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.results.folder import RunFolder
@@ -76,45 +74,6 @@ def test_help_of_every_verb_is_light() -> None:
 
 def verbs() -> dict[str, Any]:
     return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("verb", sorted(verbs()))
-def test_help_shows_every_word_and_bracket(call: Call, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A markup would swallow ``<stamp>`` or ``[extra]``."""
-    monkeypatch.setenv("COLUMNS", "300")
-    shown = " ".join(call(verb, "--help")[1].split())
-    command = verbs()[verb]
-    texts = [command.help, *(getattr(each, "help", None) for each in command.params if not getattr(each, "hidden", 0))]
-    for text in filter(None, texts):
-        assert " ".join(text.split()) in shown
-
-
-def test_the_version(call: Call) -> None:
-    assert call("--version") == (0, f"erfsfm-slam {erfsfm.__version__}\n", "")
-
-
-def test_seed_and_device_are_offered_only_where_they_do_something(call: Call) -> None:
-    offered = {}
-    for verb in verbs():
-        text = call(verb, "--help")[1]
-        offered[verb] = {option for option in ("--seed", "--device") if option in text}
-    assert {verb: options for verb, options in offered.items() if options} == {
-        "run": {"--seed", "--device"},
-        "batch": {"--seed", "--device"},
-        "live": {"--seed", "--device"},
-        "simulate": {"--seed"},
-    }
-
-
-def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run: MakeRun) -> None:
-    old = ("--seed", 3, "--device", "cpu")
-    run = make_run()
-    assert call("evaluate", *files_of(run), *old)[0] == 0
-    assert call("export", run.path, "--what", "cloud", "--output", "map.ply", *old)[0] == 0
-    assert call("plot", run.path, *old)[0] == 0
-    assert "no such" in call("localize", "nowhere.png", "--map", run.path, *old)[2]
-    size = ("--width", 104, "--height", 32, "--frames", 5, "--route", "straight")
-    assert call("simulate", "world", *size, *old)[0] == 0
 
 
 @pytest.mark.parametrize(("typed", "wanted"), [("erfsfm-slam ev", "evaluate"), ("erfsfm-slam run --wei", "--weights")])
@@ -215,12 +174,6 @@ def test_a_known_error_is_one_line_and_exits_with_1(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_output_that_cannot_be_made_is_one_line(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
-    Path("file").write_text("")
-    code, _, err = call("run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "file/run")
-    assert code == 1 and err.count("\n") == 1 and "file/run" in err
-
-
 def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
     arguments = ["run", "--dataset", kitti_root, "-s", "sim", "--weights", tiny_weights, "--frames", "0:6", *QUICK]
     code, out, err = call(*arguments, "--output", "my run", "--set", "scale.mode=none", "--seed", 5)
@@ -314,14 +267,6 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
     assert call("evaluate", *files, "--fail-over", "beauty=1")[0] == 1
 
 
-def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
-    first, second = make_run("morning"), make_run("evening")
-    code, out, _ = call("evaluate", first.path, second.path)
-    assert code == 0 and "morning" in out and "evening" in out and "optimised" in out
-    code, out, _ = call("evaluate", first.path, second.path, "--json")
-    assert [entry["run"] for entry in json.loads(out)] == [str(first.path), str(second.path)]
-
-
 @pytest.mark.parametrize(
     ("what", "output", "start"),
     [
@@ -372,19 +317,6 @@ def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weigh
     reference = Path("run/reference.tum.txt").read_bytes()
     code, _, err = call("localize", images, "--map", "run", "--output", "run/reference.tum.txt")
     assert code == 1 and "is a file of a run" in err and Path("run/reference.tum.txt").read_bytes() == reference
-
-
-def test_plot(call: Call, make_run: MakeRun) -> None:
-    code, out, _ = call("plot", make_run().path, "--what", "trajectory, errors", "--output", "figure.png")
-    assert code == 0 and "figure.png" in out
-    image = cv2.imread("figure.png")
-    assert image is not None and image.std() > 5
-
-
-def test_config_reads_back(call: Call, tmp_path: Path) -> None:
-    code, out, _ = call("config")
-    (tmp_path / "mine.yaml").write_text(out)
-    assert code == 0 and load_config(tmp_path / "mine.yaml") == load_config()
 
 
 def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> None:

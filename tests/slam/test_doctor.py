@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,25 +51,8 @@ def test_a_data_set_sequence_by_sequence(kitti_root: Path, by_variable: bool, mo
     assert line.startswith("ok") and "14 frames of 208x64, true poses, camera 1.54 m high" in line
 
 
-def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("KITTI_ODOMETRY", "")
-    assert "set $KITTI_ODOMETRY" in finding(examine(None), "KITTI_ODOMETRY")
-
-
 def test_a_sequence_that_cannot_be_opened_says_why(copy_of_kitti_root: Callable[[], Path]) -> None:
     root = copy_of_kitti_root()
     (root / "sequences" / "sim" / "calib.txt").unlink()
     line = finding(examine(root), "sequence sim")
     assert line.startswith("missing") and "calib.txt" in line
-
-
-def test_a_camera_may_be_given(kitti_root: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(kitti_root / "sequences" / "sim" / "image_2", tmp_path / "walk" / "images").parent
-    assert "--camera fov=70" in finding(examine(folder), "sequence walk")
-    assert finding(examine(folder, Path("fov=70")), "sequence walk").startswith("ok")
-
-
-@pytest.mark.parametrize("path", ["nowhere", "."])
-def test_what_is_no_data_set_is_missing(tmp_path: Path, path: str) -> None:
-    lines = examine(tmp_path / path)
-    assert lines[-1].startswith("missing") and str(tmp_path) in lines[-1]

@@ -145,13 +145,6 @@ def test_g2o_round_trip_through_gtsam(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_g2o_of_a_single_pose(tmp_path):
-    graph = PoseGraph(PoseGraphConfig())
-    graph.optimise(np.eye(4)[None])
-    graph.write_g2o(tmp_path / "one.g2o")
-    assert (tmp_path / "one.g2o").read_text().startswith("VERTEX_SE3:QUAT 0 ")
-
-
 def test_wrong_input_is_refused_with_its_name():
     truth = circle(5)
     good = edge(truth, 0, 1)
@@ -206,9 +199,3 @@ def test_a_loop_contradicted_by_the_rest_is_dropped():
     assert graph.drop_contradicted_loops() == (false,) == graph.dropped
     graph.optimise(initial)
     assert graph.drop_contradicted_loops() == () and len(graph.relative_poses) == len(odometry + skips + loops)
-
-
-def apart(T_world_camera, T_other) -> float:
-    """Largest distance of two trajectories over the length of the path."""
-    path = np.linalg.norm(np.diff(T_other[:, :3, 3], axis=0), axis=1).sum()
-    return float(np.linalg.norm(T_world_camera[:, :3, 3] - T_other[:, :3, 3], axis=1).max() / path)

@@ -18,7 +18,7 @@ import slam.results.metrics
 import slam.run
 from erfsfm.common.signals import Terminated
 from slam import run_slam
-from slam.config import PoseGraphConfig, load_config
+from slam.config import PoseGraphConfig
 from slam.errors import RunError, SlamError
 from slam.pipeline.batch import SlamPipeline
 from slam.pose_graph import PoseGraph
@@ -67,10 +67,6 @@ def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> Non
         assert metrics["trajectories"][name]["snippet5"]["count"] == 10
         assert metrics["trajectories"][name]["evo"]["difference"] < 1e-6
         assert "100 m" in metrics["trajectories"][name]["align"]["7dof"]["t_rel_percent_reason"]
-
-
-def test_the_configuration_reads_back(run: RunFolder) -> None:
-    assert load_config(run.path / "config.yaml") == load_config()
 
 
 def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
@@ -128,12 +124,6 @@ def test_without_map_and_truth_the_reasons_are_written(
     assert "no true poses" in metrics["sequence"]["length_m_reason"]
     assert metrics["graph"]["coverage"] is None
     assert metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m_reason"]
-
-
-def test_the_report_can_be_left_out(quick: dict[str, Any]) -> None:
-    assert NO_REPORT in quick["overrides"]
-    folder = run_slam(**quick)
-    assert not (folder.path / "report.html").exists() and folder.metrics()["status"] == "ok"
 
 
 def test_a_run_that_fails_says_why_and_keeps_what_it_has(
@@ -221,12 +211,6 @@ def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -
     assert not (tmp_path / "none").exists()
 
 
-def test_progress_is_reported(quick: dict[str, Any]) -> None:
-    calls: list[tuple[str, int, int]] = []
-    run_slam(**quick, progress=lambda *words: calls.append(words))
-    assert calls == [("frames", k, 6) for k in range(1, 7)]
-
-
 def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     assert slam.run.commit() == ""
@@ -244,6 +228,7 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
 
 
+@pytest.mark.slow
 def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
     kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

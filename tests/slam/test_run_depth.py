@@ -148,6 +148,7 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
     assert metrics["scale"]["spread"] < 0.15
 
 
+@pytest.mark.slow
 def test_a_drive_is_continued_with_the_same_source_alone(world: Path, arrays: Path, tmp_path: Path) -> None:
     first = run(world, tmp_path / "first", f"npy:{arrays}", frames="0:12")
     whole = run(world, tmp_path / "whole", f"npy:{arrays}")

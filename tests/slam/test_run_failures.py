@@ -83,11 +83,6 @@ def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dic
     assert not (tmp_path / "run").exists()
 
 
-def test_paths_may_be_text(quick: dict[str, Any], tmp_path: Path) -> None:
-    run = run_slam(**quick | {"dataset": str(quick["dataset"]), "output": str(tmp_path / "run")})
-    assert RunFolder.open(str(tmp_path / "run")).metrics() == run.metrics()
-
-
 def test_a_link_to_nothing_is_no_place_for_a_run(quick: dict[str, Any], tmp_path: Path) -> None:
     (tmp_path / "run").symlink_to(tmp_path / "unmounted")
     with pytest.raises(RunError, match=r"run is a link to .*unmounted, which is not there"):
@@ -224,6 +219,7 @@ run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overri
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
     quick: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slam.config import SlamConfig, load_config
 from slam.results.folder import RunFolder
 from slam.se3 import from_rotation_vector, invert
 from slam.trajectory import Trajectory
@@ -122,46 +121,12 @@ def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache
     assert all(job.arguments[-2:] == ["--set", "loops.min_inliers=25"] for job in jobs)
 
 
-def test_every_part_can_be_turned_off(plan: ModuleType) -> None:
-    default = load_config(None, plan.EVERYTHING.overrides)
-    for configuration in plan.ABLATION[1:]:
-        changed = load_config(None, configuration.overrides)
-        sections = [name for name in SlamConfig.model_fields if getattr(changed, name) != getattr(default, name)]
-        assert len(sections) == 1, configuration.name
-
-
-def test_excerpts_share_one_world(plan: ModuleType, tmp_path: Path) -> None:
-    (grid,) = plan.worlds(tmp_path, ["grid"], [610], 50)
-    first, second = plan.excerpts(grid, [20, 50])
-    assert first.root == second.root == grid.root
-    assert [first.frames, second.frames] == ["0:20", "0:50"]
-    assert grid.simulate == ("--route", "grid", "--seed", "610", "--frames", "50")
-
-
 def test_hazards_are_all_at_once_and_name_their_clean_drive(plan: ModuleType, tmp_path: Path) -> None:
     clean, hard = plan.worlds(tmp_path, ["loop"], [620], 800, ["clean", "hazards"])
     assert clean.root.name == "loop-620-800-v1"
     assert hard.root.name == "loop-620-800-hazards-v1"
     assert (hard.clean, hard.kind) == (clean.name, "loop, hazards")
     assert hard.simulate == (*clean.simulate, "--hazards", "moving-cars,exposure,blur,stop,rain")
-
-
-def test_recordings_are_all_sequences_or_those_named(
-    plan: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("slam.sequences.catalogue.sequence_names", lambda root: ["00", "09"])
-    assert [d.name for d in plan.recordings(tmp_path, [], None)] == ["KITTI 00", "KITTI 09"]
-    (only,) = plan.recordings(tmp_path, ["09"], "0:60")
-    assert (only.sequence, only.frames) == ("09", "0:60")
-
-
-def test_rows_hold_numbers_stages_and_reasons(metric_definitions: ModuleType, work: ModuleType, job: Any) -> None:
-    ok = work.JobResult(job, metrics(0.25, graph=2.0), "abc")
-    failed = work.JobResult(replace(job, seed=1), {}, "abc", "no such weights")
-    first, second = metric_definitions.rows([ok, failed])
-    assert (first["status"], first["ate_7dof_optimised_m"], first["seconds_graph"]) == ("ok", 0.25, 2.0)
-    assert (second["status"], second["reason"], second["ate_7dof_optimised_m"]) == ("failed", "no such weights", None)
-    assert list(first) == list(second)
 
 
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
@@ -210,29 +175,6 @@ def test_true_and_false_loops(
         assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
 
 
-def test_summary_counts_drives_and_pairs_hazards_with_clean_drives(
-    summary: ModuleType, plan: ModuleType, work: ModuleType, job: Any, tmp_path: Path
-) -> None:
-    drives = plan.worlds(tmp_path, ["loop"], [620, 621], 800, ["clean", "hazards"])
-    ates, true_loops = (1.0, 2.0, 1.5, 5.0), (4, 0, 2, 1)
-    results = []
-    for drive, ate, loops in zip(drives, ates, true_loops):
-        derived = {"optimised_percent": ate, "network_percent": 8.0, "of_network": ate / 8}
-        derived |= {"true_loops": loops, "false_loops": 1}
-        results.append(work.JobResult(replace(job, drive=drive), metrics(ate) | {"derived": derived}, "abc"))
-    results.append(work.JobResult(replace(job, drive=drives[3], seed=1), {}, "abc", "killed"))
-    head, clean, hard = cells(summary.summary_table(results))
-    for row, drive, runs, failed, ate, over_clean, found, false in (
-        (clean, "loop", "2", "0", "1.50 (2.00)", "–", "1 of 2", "2"),
-        (hard, "loop, hazards", "3", "1", "3.25 (5.00)", "2.00 (2.50)", "2 of 3", "2"),
-    ):
-        assert row[:4] == [drive, "sim", runs, failed]
-        assert row[head.index("ATE, % of path: median (worst)")] == ate
-        assert row[head.index("over the clean drive's")] == over_clean
-        assert row[head.index("drives with a true loop")] == found
-        assert row[head.index("false loops")] == false
-
-
 def test_a_leak_is_reported(page: ModuleType, work: ModuleType, job: Any) -> None:
     assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
     leaky = metrics() | {"provenance": {"leak": True}}
@@ -248,13 +190,6 @@ def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType
     assert "– map triangles, loop 610: no map." in text
 
 
-def test_ablation_without_everything_on_has_no_ratio(
-    page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
-) -> None:
-    table = cells(page.ablation_tables(results_of(plan, work, job, {"no loops": [4.0]})))
-    assert table[1][:2] == ["no loops", "–"]
-
-
 def test_speed_ratios_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
     asked = replace(job, configuration=plan.SPEED[0])
     grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
@@ -268,24 +203,6 @@ def test_speed_ratios_and_growth(page: ModuleType, plan: ModuleType, work: Modul
     assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
     assert (table[-2][-2:], table[-1][-2:]) == (["loops", "read"], ["10.00", "40.00"])
     assert table[-1][table[-2].index("loops closed")] == "3"
-
-
-def test_a_section_replaces_its_older_version(page: ModuleType) -> None:
-    text = page.with_section("", "## Speed\n\nsuperseded\n")
-    text = page.with_section(text, "## Accuracy\n\nnumbers\n")
-    text = page.with_section(text, "## Speed\n\nnew\n")
-    assert text.startswith(page.PAGE)
-    assert text.index("numbers") < text.index("new")
-    assert "superseded" not in text
-    assert text.count("## Speed") == 1
-
-
-def test_a_section_names_commit_and_seeds(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
-    results = results_of(plan, work, job, {"default": [1.0, 3.0]})
-    results.append(work.JobResult(replace(job, seed=7), {}, "def", "why"))
-    text = page.section("accuracy", "the command", results, "1")
-    assert "Commit abc, def; seeds 0, 1, 7; 3 runs, 1 failed" in text
-    assert "    the command\n" in text
 
 
 def test_a_missing_cache_is_refused(
@@ -351,20 +268,6 @@ def test_dask_runs_every_job_once(work: ModuleType, tmp_path: Path) -> None:
     with work.workers(2, None) as spread:
         assert sorted(spread(Path.mkdir, places)) == [(n, None) for n in range(4)]  # a second time would raise
     assert all(place.is_dir() for place in places)
-
-
-def test_nothing_to_measure_is_an_error(benchmark: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="nothing to measure"):
-        benchmark.main(["accuracy", "--routes", "--output", str(tmp_path)])
-
-
-def test_the_command_has_all_options_but_no_paths_and_hosts(benchmark: ModuleType) -> None:
-    words = ["accuracy", "--routes", "--kitti", "/data/k", "--excerpt", "0:9", "--scheduler", "tcp://host:1"]
-    command = benchmark._command(benchmark._parser().parse_args(words))
-    assert command.startswith(
-        "python tools/benchmark.py accuracy --kitti KITTI --weights default sim --routes --worlds"
-    )
-    assert command.endswith("--conditions clean --excerpt 0:9 --seeds 0 1 2 --device cpu")
 
 
 @pytest.mark.slow

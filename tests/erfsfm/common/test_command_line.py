@@ -33,11 +33,6 @@ def test_an_empty_option_is_refused(outcome: Outcome, words: tuple[str, ...]) ->
     assert code == 2 and err.startswith("program: --output is empty: give a value") and len(err.splitlines()) == 1
 
 
-def test_a_word_that_no_text_file_holds_is_refused(outcome: Outcome) -> None:
-    code, err = outcome(lambda args: None, "run", "--dataset", "b\udcfcro")
-    assert code == 1 and err.startswith("program: 'b\\udcfcro' is not in UTF-8: rename it") and err.count("\n") == 1
-
-
 def test_a_current_folder_that_was_removed_is_one_line(
     outcome: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,10 +47,6 @@ def test_a_current_folder_that_was_removed_is_one_line(
 def test_a_full_standard_output_is_one_line(outcome: Outcome) -> None:
     code, err = outcome(raising(OSError(28, "No space left on device")), "run")
     assert code == 1 and err.startswith("program: No space left on device: standard output") and err.count("\n") == 1
-
-
-def test_an_empty_argument_is_refused(outcome: Outcome) -> None:
-    assert "one of its words is empty" in outcome(lambda args: None, "evaluate", "")[1]
 
 
 def test_the_home_folder_is_meant_in_quotes_too(outcome: Outcome) -> None:

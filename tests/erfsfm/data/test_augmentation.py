@@ -86,16 +86,6 @@ def test_all_frames_get_the_same_colour_change(seed: int) -> None:
     assert first.dtype == np.uint8
 
 
-def test_weak_colour_changes_are_weak() -> None:
-    image = np.random.default_rng(9).integers(0, 256, (96, 160, 3), dtype=np.uint8)
-    config = DataConfig(flip=0, zoom=1, colour_jitter=1e-9)
-    for seed in range(4):
-        (varied,), _, _, _ = augment([image], [], CAMERA, config, "default", np.random.default_rng(seed))
-        if (varied[..., 0] == varied[..., 1]).all():
-            continue  # turned grey
-        assert (varied == image).all()
-
-
 def test_the_generator_is_the_only_source_of_randomness() -> None:
     images = [blob(project(CAMERA, point)) for point in POINTS]
     config = DataConfig(colour_jitter=0.2)
@@ -105,10 +95,3 @@ def test_the_generator_is_the_only_source_of_randomness() -> None:
     assert camera == same_camera != other_camera
     assert all((a == b).all() for a, b in zip(first, again))
     assert any((a != b).any() for a, b in zip(first, other))
-
-
-def test_inputs_are_not_modified() -> None:
-    images = [blob(project(CAMERA, point)) for point in POINTS]
-    before = [image.copy() for image in images]
-    augment(images, [], CAMERA, DataConfig(flip=1, colour_jitter=0.5), "default", np.random.default_rng(1))
-    assert all((a == b).all() for a, b in zip(images, before))

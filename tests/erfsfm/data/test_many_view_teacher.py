@@ -26,10 +26,10 @@ def recording(tmp_path_factory) -> Recording:
 
 @pytest.fixture(scope="module")
 def teacher(recording, tmp_path_factory) -> ManyViewTeacher:
-    teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=6)
+    teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=12)
     told = []
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
-    assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 6, 6)
+    assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 3, 3)
     return teacher
 
 
@@ -44,7 +44,7 @@ def test_motion_is_in_camera_heights(recording, teacher):
 
 def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
     drive = teacher.drive(recording)
-    assert list(drive.targets(4)) == [6, 12, 18, 24, 30, 36]
+    assert list(drive.targets(4)) == [12, 24, 36]
     seen = teacher.structure(recording, first=10, sources=4)
     assert seen.least.shape == seen.most.shape == SIZE
     true = recording.true_poses()
@@ -58,7 +58,7 @@ def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
 
 def test_what_was_measured_is_kept_and_what_was_lost_is_measured_again(recording, teacher):
     drive = teacher.drive(recording)
-    kept, lost = drive.label_file(6), drive.label_file(12)
+    kept, lost = drive.label_file(24), drive.label_file(12)
     before, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
     told = []
@@ -112,12 +112,12 @@ def test_poses_by_other_weights_are_refused(recording, teacher):
 
 
 def test_a_damaged_label_is_one_line(recording, teacher):
-    path = teacher.drive(recording).label_file(18)
+    path = teacher.drive(recording).label_file(36)
     whole = path.read_bytes()
     path.write_bytes(whole[:100])
     try:
-        with pytest.raises(TrainingError, match=r"000018\.npz is damaged or missing: delete it and start again"):
-            teacher.drive(recording).label(18)
+        with pytest.raises(TrainingError, match=r"000036\.npz is damaged or missing: delete it and start again"):
+            teacher.drive(recording).label(36)
     finally:
         path.write_bytes(whole)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from torch.utils.data import DataLoader
 from erfsfm.common.errors import DataError
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.samples import as_tensors
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.data.splits import overlapping
 from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
@@ -64,13 +62,6 @@ def test_a_partly_absent_validation_is_logged(
     _, validation = split_recordings(DataConfig(roots=[coded / "a", coded / "b"], validation=names))
     assert [recording.name for recording in validation] == ["folder/b"]
     assert [record.message for record in caplog.records] == messages
-
-
-def test_only_the_default_validation_may_match_no_recording(coded: Path) -> None:
-    assert split_recordings(DataConfig(roots=[coded / "a"]))[1] == []
-    assert split_recordings(DataConfig(roots=[coded / "a"], validation=[]))[1] == []
-    with pytest.raises(DataError, match=r"nothing to validate on: .* name folder/c; found folder/a; name one"):
-        split_recordings(DataConfig(roots=[coded / "a"], validation=["folder/c"]))
 
 
 def test_snippets_with_a_broken_image_are_passed_over_and_others_stay(
@@ -201,11 +192,6 @@ def test_devices_share_the_draws_of_one_with_a_larger_batch(coded: Path, workers
         assert equal(batch, {key: torch.cat([part[key] for part in batches]) for key in batch})
 
 
-def test_a_last_batch_may_be_smaller(coded: Path) -> None:
-    assert [len(b["target"]) for b in batches(coded, 0, draws=5)] == [2, 2, 1]
-    assert batches(coded, 0, first=5, draws=5) == []
-
-
 def test_camera_of_a_draw_is_the_resized_one(coded: Path) -> None:
     config = ExperimentConfig.model_validate(
         {"network": {"height": 64, "width": 96, "sources": 2}, "data": {"flip": 0, "zoom": 1}}
@@ -213,13 +199,6 @@ def test_camera_of_a_draw_is_the_resized_one(coded: Path) -> None:
     K = SnippetDraws(discover(coded), config, 1).draw(0)["K"]
     expected = discover(coded)[0].camera.resized(96, 64).K
     np.testing.assert_array_equal(K.numpy(), expected)
-
-
-def test_by_default_recordings_count_by_their_windows(coded: Path) -> None:
-    long, short = discover(coded)
-    draws = SnippetDraws([long, short.part(0, 4)], experiment(), 400)
-    counts = Counter(folder_of(draws.draw(number)) for number in range(400))
-    assert counts["b"] / 400 == pytest.approx(2 / 9, abs=0.06)
 
 
 def test_weights_set_the_probabilities(coded: Path) -> None:
@@ -248,11 +227,6 @@ def test_weights_mix_kinds_of_data(
     assert chances == {name: pytest.approx(weight / 4) for name, weight in weights.items()}
 
 
-def test_recordings_without_a_weight_are_refused(coded: Path) -> None:
-    with pytest.raises(DataError, match=r"data\.weights gives 'folder/b' no weight: name it there"):
-        SnippetDraws(discover(coded), experiment(weights={"folder/a": 1}), 1)
-
-
 def test_weights_that_match_no_recording_are_refused(coded: Path) -> None:
     with pytest.raises(DataError, match="kitti"):
         SnippetDraws(discover(coded), experiment(weights={"kitti": 1}), 1)
@@ -268,20 +242,6 @@ def test_too_short_recordings_are_left_out(coded: Path) -> None:
         usable([], 5)
 
 
-def test_errors_name_a_few_of_many(coded: Path) -> None:
-    """A raw root falls into hundreds of stretches."""
-    first, _ = discover(coded)
-    with pytest.raises(DataError, match=r"found f/0 \(2 frames\), .*f/7 \(2 frames\) and 12 more$"):
-        usable([replace(first.part(0, 2), name=f"f/{k}") for k in range(20)], 5)
-
-
-def test_as_tensors_separates_the_target() -> None:
-    images = [np.full((2, 2, 3), 51 * k, np.uint8) for k in range(5)]
-    sample = as_tensors(images, np.eye(3, dtype=np.float32))
-    assert float(sample["target"].mean()) == pytest.approx(0.4)
-    assert sample["sources"].mean(dim=(1, 2, 3)).tolist() == pytest.approx([0, 0.2, 0.6, 0.8])
-
-
 # validation
 
 
@@ -291,10 +251,6 @@ def test_validation_is_even_and_always_the_same(coded: Path) -> None:
     assert [frames_of(snippets[k]) for k in range(len(snippets))] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
     assert equal(snippets[1], ValidationSnippets(discover(coded)[:1], config)[1])
     assert set(snippets[0]) == {"target", "sources", "K"}
-
-
-def test_validation_of_a_few_windows_takes_all(coded: Path) -> None:
-    assert len(ValidationSnippets(discover(coded)[:1], experiment(sources=4))) == FRAMES - 4
 
 
 def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> None:
@@ -308,13 +264,6 @@ def test_validation_truth(tmp_path: Path, write_root: Callable[..., Path]) -> No
     steps = torch.tensor([2, 1, -1, -2]).double()  # target minus source
     torch.testing.assert_close(T_source_target[:, 0, 3], 0.05 * steps)
     torch.testing.assert_close(T_source_target[:, 2, 3], 0.1 * steps)
-
-
-def test_validation_truth_of_a_part(tmp_path: Path, write_root: Callable[..., Path]) -> None:
-    write_root(tmp_path, frames=8, depth=True, step=(0.0, 0.0, 0.1))
-    (recording,) = discover(tmp_path)
-    sample = ValidationSnippets([recording.part(3, 6)], experiment())[0]
-    assert float(sample["depth"][3, 3]) == pytest.approx(6 - 0.4, abs=1 / 256)
 
 
 # the split of recordings
@@ -341,29 +290,9 @@ def test_ranges(kitti: Path) -> None:
     assert len(training) == 4
 
 
-@pytest.mark.parametrize("span", [":", "0:", ":1000"])
-def test_open_ranges(kitti: Path, span: str) -> None:
-    assert names(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": span}))[0] == ["kitti_odometry/00[0:6]"]
-
-
-def test_ranges_may_name_the_raw_drive(kitti: Path) -> None:
-    config = DataConfig(roots=[kitti], ranges={"kitti_raw/2011_10_03_drive_0027_sync": "2:5"})
-    assert names(config)[0] == ["kitti_odometry/00[2:5]"]
-
-
 def test_misspelt_ranges_are_refused(kitti: Path) -> None:
     with pytest.raises(DataError, match="kitti_odometry/0'"):
         split_recordings(DataConfig(roots=[kitti], ranges={"kitti_odometry/0": "0:3"}))
-
-
-def test_ranges_beyond_the_end_are_refused(kitti: Path) -> None:
-    with pytest.raises(DataError, match="after the 6 frames"):
-        split_recordings(DataConfig(roots=[kitti], ranges={"kitti_odometry/00": "6:"}))
-
-
-def test_exclude_by_raw_drive(kitti: Path) -> None:
-    config = DataConfig(roots=[kitti], exclude=["kitti_raw/2011_10_03_drive_0027_sync", "kitti_odometry/09"])
-    assert names(config)[0] == ["kitti_odometry/03[0:6]", "kitti_odometry/10[0:6]"]
 
 
 def test_exclude_a_part(kitti: Path) -> None:
@@ -429,16 +358,6 @@ def test_static_frames_are_left_out(raw: Path, caplog: pytest.LogCaptureFixture)
     assert names(kept)[0][0] == "kitti_raw/2011_09_26_drive_0001[0:6]"
 
 
-def test_a_car_that_never_moves(tmp_path: Path, write_raw: Callable[..., Path]) -> None:
-    write_raw(tmp_path, speeds=[0, 0, 0, 0])
-    with pytest.raises(DataError, match=r"stands still in every frame found: data\.static_frames=keep"):
-        split_recordings(DataConfig(roots=[tmp_path]))
-
-
-def test_a_split_lists_training_validation_and_test_recordings(raw: Path) -> None:
-    assert drives(DataConfig(roots=[raw], split="eigen", exclude=[])) == ({"drive_0001", "drive_0033"}, {"drive_0005"})
-
-
 def test_the_odometry_split(tmp_path: Path, write_root: Callable[..., Path]) -> None:
     root = write_root(tmp_path, frames=3, sequences=("00", "03", "06", "09", "10", "11"), size=(8, 8))
     training, validation = names(DataConfig(roots=[root], split="odometry", validation=[], exclude=[]))
@@ -460,16 +379,6 @@ def test_eigens_scenes_exclude_their_odometry_sequences_by_split_alone(tmp_path:
     (tmp_path / "test.yaml").write_text("test: ['kitti_raw/2011_10_03_drive_0027[0:3]']\n")
     with pytest.raises(DataError, match="nothing left to train on"):
         split_recordings(DataConfig(roots=[kitti], split=str(tmp_path / "test.yaml")))
-
-
-def test_several_roots_add_up(kitti: Path, coded: Path) -> None:
-    training, _ = names(DataConfig(roots=[coded / "a", kitti]))
-    assert training == ["folder/a[0:9]", "kitti_odometry/00[0:6]"]
-
-
-def test_no_root() -> None:
-    with pytest.raises(DataError, match="--dataset"):
-        split_recordings(DataConfig())
 
 
 def test_a_mirrored_sample_has_mirrored_structure(tmp_path: Path) -> None:

@@ -37,14 +37,6 @@ def test_runs(runs: str, frames: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["kitti_raw/a", "kitti_raw/a[]", "kitti_raw/a[:]", "a[1:]", "a[0:9:0]", "a[1,,2]", "a[x]"]
-)
-def test_malformed_runs(name: str) -> None:
-    with pytest.raises(DataError, match="names no single frames"):
-        Split(test=[name]).test_frames()
-
-
-@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("tests: [a]", "is no split, a file of the lists train, validation and test: tests: Extra inputs"),

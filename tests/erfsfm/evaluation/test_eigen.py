@@ -15,7 +15,6 @@ from erfsfm.config import NetworkConfig
 from erfsfm.data.splits import overlapping
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
-from erfsfm.evaluation.protocols import depth_protocol
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import ModelRecord
 
@@ -104,12 +103,6 @@ def test_leaks_are_refused_by_frame(tmp_path: Path, write_drive: Write, split: s
     eigen_protocol(Oracle(seen=[f"kitti_raw/{DRIVE}[5:8]"]), root, split, "default", allow_leak=False)
 
 
-@pytest.mark.parametrize("place", ["", "2011_09_26", f"2011_09_26/{DRIVE}_sync"])
-def test_root_may_be_a_date_or_a_drive(tmp_path: Path, write_drive: Write, split: str, place: str) -> None:
-    root = write_drive(tmp_path / "raw")
-    assert read_split(split, root / place)[0].root == root.resolve()
-
-
 def test_the_eigen_list(tmp_path: Path) -> None:
     """697 frames of 28 drives; of the four that are odometry sequences, one frame lies beyond its sequence's end."""
     frames = read_split("eigen", tmp_path)
@@ -148,26 +141,6 @@ def test_a_yaml_split_of_the_user(tmp_path: Path, write_drive: Write) -> None:
         read_split(str(path), root)
     with pytest.raises(DataError, match="'kitti_odometry/09' names no single frames"):
         read_split("odometry", root)
-
-
-def test_raw_drives_need_a_split(tmp_path: Path, write_drive: Write) -> None:
-    with pytest.raises(DataError, match="name their frames with --split"):
-        depth_protocol(Oracle(), write_drive(tmp_path / "raw"), allow_leak=False)
-
-
-def test_malformed_splits(tmp_path: Path, write_drive: Write) -> None:
-    root = write_drive(tmp_path / "raw")
-    (tmp_path / "empty.txt").write_text("\n")
-    (tmp_path / "words.txt").write_text("one two\n")
-    for name, words in [
-        ("empty.txt", "names no frames"),
-        ("words.txt", "'one two' names no frame"),
-        ("no", "no split '.*no': neither a file nor one of eigen, odometry"),
-    ]:
-        with pytest.raises(DataError, match=words):
-            read_split(str(tmp_path / name), root)
-    with pytest.raises(DataError, match="no data set at"):
-        read_split("eigen", tmp_path / "nowhere")
 
 
 def test_a_scan_without_points_in_the_crop(tmp_path: Path, write_drive: Write, split: str) -> None:

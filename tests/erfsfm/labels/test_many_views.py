@@ -66,11 +66,6 @@ def test_a_white_wall_that_reaches_the_ground_is_no_sky():
     assert not sky[:, :86].any() and sky[:36, 94:].all()
 
 
-def test_a_picture_without_sky_has_none():
-    trees = np.random.default_rng(0).integers(40, 220, (100, 200), dtype=np.uint8)
-    assert sky_mask(trees, (100, 50)).mean() < 0.02
-
-
 def test_direction_of_travel_is_forward_and_unknown_at_rest():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[0, 2, 3], T[1, 2, 3] = 1.0, -1.0  # a point ahead is farther from the camera before

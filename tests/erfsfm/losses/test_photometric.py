@@ -32,13 +32,6 @@ def test_box_mean_gradcheck() -> None:
     assert torch.autograd.gradgradcheck(box_mean, (x,))
 
 
-def test_box_mean_does_not_modify_its_argument() -> None:
-    x = torch.randn(4, 5)
-    before = x.clone()
-    box_mean(x)
-    assert torch.equal(x, before)
-
-
 def naive_dissimilarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """(1 - SSIM) / 2 of two ``(H, W)`` images, pixel by pixel, float64."""
     a, b = np.pad(first, 1, mode="reflect"), np.pad(second, 1, mode="reflect")
@@ -76,11 +69,6 @@ def test_dissimilarity_is_symmetric_and_bounded() -> None:
     torch.testing.assert_close(there, back)
     assert float(there.min()) >= 0
     assert float(there.max()) <= 1
-
-
-def test_a_negative_is_more_than_half_dissimilar() -> None:
-    image = torch.rand(1, 1, 9, 9)
-    assert float(dissimilarity(image, 1 - image).mean()) > 0.5
 
 
 def test_l1_by_hand() -> None:

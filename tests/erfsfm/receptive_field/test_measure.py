@@ -1,8 +1,6 @@
-import numpy as np
 import pytest
 
 from erfsfm.checkpoint import Model, build_networks
-from erfsfm.common.errors import ConfigError
 from erfsfm.config import NetworkConfig
 from erfsfm.model_record import ModelRecord
 from erfsfm.receptive_field.measure import measure_fields
@@ -58,22 +56,3 @@ def test_learned_weights_are_used_for_their_own_preset_alone(sources):
         parameter.data.mul_(0.9).add_(0.01)
     after = by_name(["erf-posenet-dfc"], learned=("mine", model))["erf-posenet-dfc", "default"].weighed.gradient
     assert not before.equal(after)
-
-
-def test_learned_weights_of_another_fidelity_are_not_used():
-    config = NetworkConfig(depth_width=0.1, pose_width=0.1)
-    model = Model(ModelRecord(network=config, trained_on=[]), *build_networks(config))
-    assert by_name(["posenet"], fidelity="paper", learned=("mine", model))["posenet", "paper"].weights == "untrained"
-
-
-def test_refusals():
-    with pytest.raises(ConfigError, match="5 consecutive images; got 3"):
-        measure_fields(["posenet"], "default", SNIPPET[:3])
-    with pytest.raises(ConfigError, match="did you mean 'posenet'"):
-        measure_fields(["pose-net"], "default", SNIPPET)
-
-
-def test_other_sizes():
-    snippet = [np.ascontiguousarray(image[:94, :310]) for image in SNIPPET]
-    (row,) = measure_fields(["posenet"], "default", snippet)
-    assert row.seen.gradient.shape == (94, 310)

@@ -475,15 +475,6 @@ def test_learning_rate_factor(schedule: str, factors: tuple[float, ...]) -> None
         assert learning_rate_factor(schedule, progress) == pytest.approx(factor, abs=1e-5)
 
 
-def test_pictures_are_logged(small: Small, world: Path, tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    output = train(configure(small, [world], training={"steps": 1}), tmp_path / "run", device="cpu")
-    events = EventAccumulator(str(output / "logs" / "tensorboard")).Reload()
-    assert set(events.Tags()["images"]) == {"target", "source warped", "disparity"}
-    assert "loss" in events.Tags()["scalars"]
-
-
 @pytest.mark.parametrize(
     ("metrics", "measure"),
     [
@@ -661,32 +652,11 @@ def test_weights_are_not_overwritten(small: Small, world: Path, tmp_path: Path) 
         train(config, tmp_path / "run", device="cpu")
 
 
-def test_a_start_that_failed_may_be_repeated(small: Small, world: Path, tmp_path: Path) -> None:
-    """What it left is the complete configuration, and folders of ours."""
-    config = configure(small, [world], training={"steps": 1})
-    (tmp_path / "run" / "logs").mkdir(parents=True)
-    (tmp_path / "run" / "config.yaml").write_text(dump_yaml(config))
-    assert load_model(train(config, tmp_path / "run", device="cpu")).record.step == 1
-
-
-def test_missing_validation_is_logged_once(
-    small: Small, world: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    train(configure(small, [world], training={"steps": 1}), tmp_path / "run", device="cpu")
-    messages = [record.message for record in caplog.records if "validation" in record.message]
-    assert messages == ["training runs without validation: no recording of data.validation is among the data"]
-
-
 def test_a_failed_start_leaves_nothing(small: Small, world: Path, tmp_path: Path) -> None:
     config = configure(small, [world]).model_copy(update={"initial_weights": "nowhere"})
     with pytest.raises(CheckpointError):
         train(config, tmp_path / "run", device="cpu")
     assert not (tmp_path / "run").exists()
-
-
-def test_nothing_to_resume(small: Small, world: Path, tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="start without --resume"):
-        train(configure(small, [world]), tmp_path / "run", resume=True, device="cpu")
 
 
 def test_resume_with_other_networks(cut: tuple[ExperimentConfig, Path]) -> None:
@@ -755,12 +725,6 @@ def test_a_half_written_checkpoint(cut: tuple[ExperimentConfig, Path], keep: flo
     refused_checkpoint(cut)
 
 
-@pytest.mark.parametrize("content", [{}, {"global_step": 2}, [1, 2], torch.zeros(3)])
-def test_a_foreign_checkpoint(cut: tuple[ExperimentConfig, Path], content: Any) -> None:
-    torch.save(content, cut[1] / "checkpoints" / "last.ckpt")
-    refused_checkpoint(cut)
-
-
 def test_a_checkpoint_without_its_configuration(cut: tuple[ExperimentConfig, Path]) -> None:
     config, output = cut
     (output / "config.yaml").unlink()
@@ -778,13 +742,6 @@ def test_a_broken_image_is_one_line(
     with pytest.raises(DataError, match=r"00000[12]\.png cannot be decoded") as caught:
         train(configure(small, [root], data={"workers": workers}), tmp_path / "run", device="cpu")
     assert "\n" not in str(caught.value)
-
-
-def test_workers_change_nothing(small: Small, world: Path, tmp_path: Path) -> None:
-    for workers in (0, 1):
-        config = configure(small, [world], data={"workers": workers}, training={"steps": 2})
-        train(config, tmp_path / str(workers), device="cpu")
-    assert same(tmp_path / "0", tmp_path / "1")
 
 
 def test_workers_start_where_opencv_has_threads(small: Small, world: Path, tmp_path: Path) -> None:
@@ -853,14 +810,6 @@ def test_half_precision_on_a_cpu_is_announced(
     assert [r.message for r in caplog.records if "precision" in r.message] == [
         "training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU"
     ]
-
-
-@pytest.mark.parametrize("precision", ["16-mixed", "bf16-mixed"])
-def test_half_precision_of_tiny_images_on_a_cpu_is_refused(
-    small: Small, world: Path, tmp_path: Path, precision: str
-) -> None:
-    with pytest.raises(ConfigError, match="images of more than 64 pixels in one direction; got 32x64"):
-        train(configure(small, [world], training={"precision": precision, "steps": 1}), tmp_path / "run", device="cpu")
 
 
 @pytest.mark.slow  # each process imports torch and Lightning

@@ -95,18 +95,6 @@ def test_among_the_images_the_picture_is_none_of_them(make_studio, make_views, w
     assert (folder / "settings.yaml").read_text() == "mapping: {enabled: false}"
 
 
-def test_a_picture_of_another_origin_is_not_replaced(
-    tmp_path: Path, make_studio, make_views, write_views, calibrate: Call
-) -> None:
-    folder, photo = write_views(make_studio(), make_views(1, 40)), tmp_path / "camera.png"
-    photo.write_bytes(b"what the camera looks like")
-    for own in ("", "width: 480\nheight: 360\nfx: 400\nfy: 400\ncx: 240\ncy: 180\nfps: 10\n"):
-        (tmp_path / "camera.yaml").write_text(own)
-        code, _, err = calibrate(folder, "--board", "9x6")
-        assert code == 1 and "camera.png exists and is of no earlier calibration" in err
-        assert photo.read_bytes() == b"what the camera looks like" and (tmp_path / "camera.yaml").read_text() == own
-
-
 def test_a_video_gives_its_rate(tmp_path: Path, make_studio, make_views, calibrate: Call) -> None:
     studio = make_studio(distortion=(0.0,) * 5)
     path = tmp_path / "board.avi"
@@ -154,8 +142,3 @@ def test_what_does_not_determine_the_camera_is_refused(
     assert len(err.splitlines()) == 1
     assert re.search(message, err), err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board"]
-
-
-def test_paths(tmp_path: Path, calibrate: Call) -> None:
-    assert "no video or folder at" in calibrate(tmp_path / "nowhere", "--board", "9x6")[2]
-    assert "no images in" in calibrate(tmp_path, "--board", "9x6")[2]

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import slam.evaluation.coverage as evaluation_of_coverage
 from slam import se3
 from slam.errors import SlamError
 from slam.evaluation.coverage import coverage, squared_bound
@@ -85,15 +84,3 @@ def test_each_factor_has_the_bound_of_its_own_distribution() -> None:
     covered = coverage(normal + heavy, truth(), 1.0)
     for level, ratio in covered.overall.items():
         assert ratio == pytest.approx(np.mean([kind[level] for kind in covered.by_source.values()]))
-
-
-def test_each_factor_is_whitened_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    whiten, counts = evaluation_of_coverage.whitened_squared, []
-
-    def counting(relative_poses: list[RelativePose], T_world_camera: FloatArray) -> FloatArray:
-        counts.append(len(relative_poses))
-        return whiten(relative_poses, T_world_camera)
-
-    monkeypatch.setattr(evaluation_of_coverage, "whitened_squared", counting)
-    coverage(factors(math.inf), truth(), 1.0)
-    assert counts == [COUNT - 1]

@@ -21,7 +21,6 @@ import pytest
 
 from erfsfm.cli import main as erfsfm_main
 from slam.cli import main as slam_main
-from slam.errors import RunError
 from slam.pipeline import batch
 from slam.results.folder import RunFolder
 
@@ -321,8 +320,3 @@ def test_a_limit_on_memory_from_the_start_is_one_line(kitti_root: Path, whole: P
     )
     assert ended.returncode == 1 and ended.stderr.startswith("erfsfm-slam: memory ran out"), ended.stderr
     assert len(ended.stderr.splitlines()) == 1
-
-
-def test_a_run_folder_that_vanished_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no such folder"):
-        RunFolder.open(tmp_path / "gone")

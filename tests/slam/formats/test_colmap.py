@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from slam.errors import RunError
 from slam.formats.colmap import write_colmap
 from slam.frames import Intrinsics
 from slam.se3 import FloatArray, apply, chain, from_rotation_vector, invert
@@ -64,9 +62,3 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
 def test_without_points_the_model_is_whole(tmp_path: Path) -> None:
     write_colmap(tmp_path, CAMERA, drive(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert rows(tmp_path / "points3D.txt") == [] and len(rows(tmp_path / "images.txt")) == 10
-
-
-def test_a_place_that_cannot_be_written_is_one_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="cannot be written"):
-        write_colmap(tmp_path / "file" / "model", CAMERA, drive(), POINTS, COLOURS)

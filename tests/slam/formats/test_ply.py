@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slam.errors import RunError
-from slam.formats.ply import coloured_ply, read_ply, read_ply_points, rotated, write_ply
+from slam.formats.ply import coloured_ply, read_ply, read_ply_points, write_ply
 from slam.runtime.imports import import_open3d
 
 POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])
@@ -86,30 +86,6 @@ def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles
     else:
         np.testing.assert_array_equal(ply.triangles, triangles)
         np.testing.assert_array_equal(np.asarray(o3d.io.read_triangle_mesh(str(path)).triangles), triangles)
-
-
-def test_rotation_applies_to_points_and_normals_alone() -> None:
-    R = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    ply = coloured_ply(POINTS, NORMALS, COLOURS / 255, TRIANGLES)
-    result = rotated(ply, R)
-    np.testing.assert_allclose(result.columns(("x", "y", "z")), POINTS @ R.T)
-    np.testing.assert_allclose(result.columns(("nx", "ny", "nz")), NORMALS @ R.T)
-    assert result.triangles is TRIANGLES and (result.vertices["green"] == ply.vertices["green"]).all()
-    np.testing.assert_array_equal(ply.columns(("x", "y", "z")), POINTS)
-
-
-@pytest.mark.parametrize("triangles", [None, TRIANGLES])
-def test_no_shorter_and_no_longer_file_is_whole(tmp_path: Path, triangles: np.ndarray | None) -> None:
-    path = tmp_path / "c.ply"
-    write_ply(path, coloured_ply(POINTS, NORMALS, COLOURS / 255, triangles))
-    whole = path.read_bytes()
-    for length in range(len(whole)):
-        path.write_bytes(whole[:length])
-        with pytest.raises(RunError, match="no PLY that can be read"):
-            read_ply(path)
-    path.write_bytes(whole + b"1")
-    with pytest.raises(RunError, match="longer than its header states"):
-        read_ply(path)
 
 
 @pytest.mark.parametrize("triangles", [[[0, 1, 2]], [[0, -1, 1]]])

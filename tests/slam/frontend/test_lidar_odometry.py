@@ -50,11 +50,6 @@ def test_the_path_of_simulated_scans_is_the_camera_s(street, tmp_path):
     assert error < 0.03 * travelled
 
 
-def test_without_scans_there_is_no_path(street):
-    assert lidar_path(Scanned(street.T_camera_lidar)) is None
-    assert lidar_path(Scanned(None)) is None
-
-
 def test_steps_are_those_between_neighbouring_scanned_frames():
     T_world_camera = np.tile(np.eye(4), (4, 1, 1))
     T_world_camera[:, 2, 3] = [0.0, 1.0, 4.0, 5.5]

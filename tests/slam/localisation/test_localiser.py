@@ -17,7 +17,7 @@ from erfsfm.common.readers.camera_file import CameraFile
 from slam.config import LoopsConfig, dump_yaml, load_config
 from slam.errors import RunError, SequenceError
 from slam.frames import Frame, Image, Intrinsics
-from slam.localisation.accuracy import MapTruth, summary, summary_line, true_poses
+from slam.localisation.accuracy import MapTruth, summary_line, true_poses
 from slam.localisation.localiser import Localiser, image_numbers, localise
 from slam.localisation.tables import localisation_json, localisation_table, write_localisations
 from slam.loops.descriptors import FeatureExtractor
@@ -237,72 +237,3 @@ def test_where_the_truth_is_known_errors_and_success_are_said(
     assert whole["images"][1]["error_m"] == pytest.approx(3.0, abs=0.5) and whole["images"][3]["error_m"] is None
     assert "50% of 4 images within 0.5 m and 2 deg" in summary_line(numbers_of)
     assert len(localisation_table(found, errors).columns) == 9
-
-
-def test_every_second_image_keeps_its_number(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    numbers = image_numbers(album, "0:4", 2)
-    found = list(localise(album, run, numbers=numbers))
-    assert [each.image for each in found] == ["10.png", "40.png"]
-    write_localisations(tmp_path / "found.tum", found, numbers)
-    np.testing.assert_array_equal(read_trajectory(tmp_path / "found.tum").stamps, [0.0, 2.0])
-    with pytest.raises(SequenceError, match="reaches outside"):
-        image_numbers(album, "0:6")
-
-
-def test_photos_are_no_recording_whose_numbers_have_gaps(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for name, photo in {"10": "0010", "25": "0011", "40": "0012", "50": "0250"}.items():
-        (album / f"{name}.png").rename(photos / f"IMG_{photo}.png")
-    half_width = places().intrinsics.width / 2 / places().intrinsics.fx
-    camera = Path(f"fov={2 * np.rad2deg(np.arctan(half_width))}")
-    assert [each.T_world_camera is not None for each in localise(photos, run, camera)] == [True, True, True, False]
-
-
-def test_a_truth_that_cannot_be_used_is_refused(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
-    with pytest.raises(RunError, match=r"has 4 poses and .* 5 images: give each image a row"):
-        true_poses(tmp_path / "truth.txt", album, range(2))
-    for path in run.path.glob("reference.*"):
-        path.unlink()
-    with pytest.raises(RunError, match="has no reference, so that no error can be computed"):
-        MapTruth.of(run)
-
-
-def test_the_run_of_an_earlier_release_serves_still(run: RunFolder, album: Path) -> None:
-    stored = (
-        (run.path / "config.yaml")
-        .read_text()
-        .replace("  memory_mb: 1000", "  max_blocks: 12000")
-        .replace("  min_inliers: 20  # least number of inliers of a loop", "  min_inliers: 20\n  peak_frames: 10")
-    )
-    assert "max_blocks" in stored and "peak_frames" in stored
-    run.write_text("config.yaml", stored)
-    with np.load(run.path / PLACES) as content:
-        np.savez(run.path / PLACES, **{name: content[name] for name in content.files if name != "undistorted"})
-    (found,) = localise(album, run, numbers=range(1, 2))
-    assert found.T_world_camera is not None
-
-
-def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    found = list(localise(album / "50.png", run))
-    with pytest.raises(RunError, match="none of 1 images was found"):
-        write_localisations(tmp_path / "found.tum", found)
-    assert not (tmp_path / "found.tum").exists()
-    numbers = summary([None])
-    assert (
-        numbers["success_rate"] == 0.0
-        and numbers["median_error_m"] is None
-        and "none was found" in summary_line(numbers)
-    )
-
-
-def test_missing_parts_are_named(run: RunFolder, album: Path, tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match="nowhere: no such file or folder"):
-        list(localise(tmp_path / "nowhere", run))
-    run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
-    with pytest.raises(RunError, match=r"has no places: it ran with loops\.enabled=false"):
-        list(localise(album, run))
-    (run.path / PLACES).unlink()
-    with pytest.raises(RunError, match=r"has no places\.npz"):
-        list(localise(album, run))

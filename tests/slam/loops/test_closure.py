@@ -82,7 +82,7 @@ def test_loops_of_a_drive_without_metres_are_those_of_one_with() -> None:
     def ends(scale: float, is_metric: bool) -> set[tuple[int, int]]:
         T_world_camera = result.odometry.T_world_camera.copy()
         T_world_camera[:, :3, 3] *= scale
-        views = [view.scaled(scale * float(per_frame[view.index])) for view in result.observations.views]
+        views = [view.scaled(scale * float(per_frame[view.index])) for view in result.drive.views]
         found = close_loops(views, T_world_camera, sequence.intrinsics, LoopsConfig(), is_metric)
         return {loop.ends for loop in found.accepted}
 

@@ -54,7 +54,3 @@ def test_loops_of_one_image_do_not_support_each_other() -> None:
     same = [loop(k, 220, ring()) for k in range(12, 30, 2)]
     kept, refused = agreeing(same, ring(), THRESHOLDS)
     assert kept == [] and len(refused) == len(same)
-
-
-def test_no_loops_are_no_loops() -> None:
-    assert agreeing([], ring(), THRESHOLDS) == ([], [])

@@ -151,8 +151,3 @@ def test_directions_that_disagree_are_refused() -> None:
     verdict = verify(earlier, later.scaled(1.6))
     assert isinstance(verdict, RejectedLoop) and "both directions differ" in verdict.reason
     assert verdict.T_from_to is not None and verdict.inliers > 100
-
-
-def test_empty_views_are_refused() -> None:
-    nothing = View(3, np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), np.zeros((0, 3), np.float32))
-    assert isinstance(verify(nothing, Scene().views()[1]), RejectedLoop)

@@ -151,13 +151,6 @@ def test_flying_pixels_and_far_depth_are_left_out():
     assert fuse(max_depth_step=0.12)[:, 2].max() < 26
 
 
-def test_standing_still_adds_nothing():
-    tsdf_map = TsdfMap(MappingConfig(), CAMERA)
-    for _ in range(20):
-        tsdf_map.integrate(street(np.zeros(3)), GREY, pose(0.0, 0.0, 0.0))
-    assert tsdf_map.statistics().frames_fused == 1
-
-
 def test_files_are_written_whole_and_read_back(tmp_path):
     tsdf_map = street_map()
     tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
@@ -206,11 +199,6 @@ def test_empty_maps_say_so_and_do_not_crash(tmp_path):
             tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
         assert tsdf_map.statistics().triangles == 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_wrong_sizes_are_refused():
-    with pytest.raises(ValueError, match=r"\(64, 208\)"):
-        TsdfMap(MappingConfig(), CAMERA).integrate(np.ones((3, 4), np.float32), GREY, np.eye(4))
 
 
 @pytest.mark.parametrize(("first", "size", "fused"), [(4, 5, 0), (4, 6, 1), (59, 6, 0)])

@@ -66,9 +66,3 @@ def test_a_damaged_submap_is_one_line(street_map, tmp_path):
         Submap.read(path)
     with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
         MapSurface([path], MappingConfig())
-
-
-def test_progress_counts_tiles(street_map):
-    calls = []
-    street_map().surface(lambda stage, done, total: calls.append((stage, done, total)))
-    assert calls[-1] == ("mesh", len(calls), len(calls))

@@ -99,6 +99,7 @@ def test_the_seed_and_the_gps_track_of_the_run_hold(kitti_root: Path, tmp_path: 
         run(kitti_root, tmp_path / "none", "8:", overrides=(), continues=before)
 
 
+@pytest.mark.slow
 def test_frames_that_follow_have_their_true_depth(tmp_path: Path) -> None:
     street = SimulatedStreet(SimulationOptions(route="straight", frames=16, seed=1003, width=208, height=64))
     root = tmp_path / "root"
@@ -116,6 +117,7 @@ def test_frames_that_follow_have_their_true_depth(tmp_path: Path) -> None:
     assert all(reason in metrics[part][f"{name}_reason"] for part, name in (("map", "truth"), ("depth", "network")))
 
 
+@pytest.mark.slow
 def test_three_runs_in_a_row_give_the_graph_of_one(whole: RunFolder, kitti_root: Path, tmp_path: Path) -> None:
     """One of them is of a single frame."""
     settings = ["output.report=false", "mapping.enabled=false"]
@@ -199,6 +201,7 @@ def test_other_weights(go_on: Callable[..., RunFolder]) -> None:
         go_on(weights="default")
 
 
+@pytest.mark.slow
 def test_the_noise_of_the_poses_is_named_and_another_one_is_said(
     kitti_root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

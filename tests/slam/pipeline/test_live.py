@@ -56,6 +56,7 @@ def feed(slam: Slam, first: int, stop: int) -> None:
         slam.add_frame(frame.image, frame.stamp)
 
 
+@pytest.mark.slow
 def test_the_last_frames_are_measured_again_and_at_the_end_the_drive_as_in_one_run() -> None:
     config = load_config(None, SETTINGS)
     slam = started(config, update_frames=25, sweep_frames=120)

@@ -91,6 +91,7 @@ def test_maps_before_and_after_a_loss_are_joined_where_the_camera_is_rolled_and_
 
 
 @pytest.mark.filterwarnings("ignore:Mean of empty slice", "ignore:invalid value")  # it has no corners
+@pytest.mark.slow
 def test_maps_are_joined_where_a_loop_within_one_of_them_has_more_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop within the first map is added by hand, for in this small room the window finds such places itself."""
 
@@ -180,6 +181,7 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
         assert ratio == pytest.approx(3.0 * np.median(units), rel=0.1)
 
 
+@pytest.mark.slow
 def test_another_scene_is_no_loop() -> None:
     walked = there_and_back(110)
     after = closed(tracked(np.concatenate([walked[:45], walked[:45]]), [0] * 45 + [7] * 45))
@@ -189,6 +191,7 @@ def test_another_scene_is_no_loop() -> None:
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     recording = data_root / "handheld_kitchen"
     sequence = open_sequence(recording / "images")

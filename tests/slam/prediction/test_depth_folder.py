@@ -46,11 +46,6 @@ def test_files_belong_to_frames_in_the_order_of_their_numbers(tmp_path: Path, fi
     assert [metres(source, k) for k in range(12)] == pytest.approx(range(1, 13))
 
 
-def test_other_names_are_taken_in_sorted_order(tmp_path: Path) -> None:
-    source = opened(folder_of(tmp_path, ["a.npy", "b.npy", "c.npy"]), FrameNumbers(3, 0, 3))
-    assert [metres(source, k) for k in range(3)] == pytest.approx([1, 2, 3])
-
-
 def test_a_range_of_frames_takes_its_own_files_of_the_whole_sequence(tmp_path: Path) -> None:
     folder = folder_of(tmp_path, [f"{k:06d}.npy" for k in range(10)])
     assert metres(opened(folder, FrameNumbers(4, 5, 10)), 0) == pytest.approx(6)
@@ -141,24 +136,3 @@ def test_files_that_are_no_depth_are_found_before_the_run(tmp_path: Path, name: 
     with pytest.raises(SlamError, match=message) as caught:
         opened(tmp_path, FrameNumbers(3, 0, 3), kind)
     assert f"1.{kind}" in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_truncated_and_transposed_depth_is_refused(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path / "cut", ["0.npy"])
-    (folder / "0.npy").write_bytes((folder / "0.npy").read_bytes()[:-100])
-    with pytest.raises(SlamError, match="truncated"):
-        opened(folder, FrameNumbers(1, 0, 1))
-    (tmp_path / "turned").mkdir()
-    np.save(tmp_path / "turned" / "0.npy", np.ones((WIDTH, HEIGHT), np.float32))
-    with pytest.raises(SlamError, match=r"is 12x40 .* images are 40x12: write rows as rows"):
-        opened(tmp_path / "turned", FrameNumbers(1, 0, 1))
-
-
-def test_counts_and_folders_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path / "depth", ["0.npy", "1.npy", "2.npy"])
-    with pytest.raises(SlamError, match=r"has 3 frames .* 10 for the whole sequence, or 4, the frames of this run"):
-        opened(folder, FrameNumbers(4, 0, 10))
-    with pytest.raises(SlamError, match="no depth folder"):
-        opened(tmp_path / "nowhere", FrameNumbers(3, 0, 3))
-    with pytest.raises(SlamError, match=r"holds no \.png file"):
-        opened(folder, FrameNumbers(3, 0, 3), "png")

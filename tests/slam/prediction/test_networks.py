@@ -13,7 +13,6 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.inference import DepthPosePredictor, PreparedImage
-from slam.errors import SlamError
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.prediction.networks import NetworkPredictor
 from slam.storage.cache import CacheNamespace, DiskCache
@@ -47,11 +46,6 @@ def test_outputs_by_frame_are_those_of_the_networks_by_image(direct: DepthPosePr
     np.testing.assert_array_equal(poses.T_source_target, direct.poses([frame.image for frame in snippet]))
 
 
-def test_a_snippet_of_another_length_is_refused(direct: DepthPosePredictor) -> None:
-    with pytest.raises(ValueError, match="5 images; got 3"):
-        NetworkPredictor(direct, CAMERA).snippet(frames(0, 3))
-
-
 def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredictor) -> None:
     asked: list[object] = []
     prepared: list[Image] = []
@@ -74,12 +68,6 @@ def test_depth_and_preparation_are_computed_once_a_frame(direct: DepthPosePredic
     poses = predictor.snippet(snippet)
     assert len(asked) == 5 and len(prepared) == 5
     assert poses.residuals is not None and poses.residuals.shape == (4,) and (poses.residuals > 0).all()
-
-
-def test_two_predictors_have_separate_outputs_cached_in_a_frame() -> None:
-    one, other = (NetworkPredictor(Counting(gain), CAMERA) for gain in (1, 2))
-    (frame,) = frames(0, 1)
-    np.testing.assert_allclose(one.depth(frame), 2 * other.depth(frame), rtol=1e-6)
 
 
 def test_the_executor_is_one_thread_that_ends_with_its_user(direct: DepthPosePredictor) -> None:
@@ -185,12 +173,6 @@ def test_a_new_image_in_the_memory_of_an_old_one_is_another_image(tmp_path: Path
         (frame,) = frames(seed, 1)
         np.testing.assert_array_equal(predictor.depth(frame), 1 / ((frame.image[..., 0].astype(np.float32) + 1) / 7))
         del frame
-
-
-def test_a_folder_that_cannot_be_made_is_one_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SlamError, match=r"no cache can be made in .*file/cache"):
-        cached(Counting(), tmp_path / "file" / "cache")
 
 
 def test_a_full_disk_ends_the_caching_and_not_the_run(

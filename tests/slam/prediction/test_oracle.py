@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from slam import se3
-from slam.errors import SlamError
 from slam.frames import Frame, Predictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 
@@ -75,8 +74,3 @@ def test_scale_drift_is_common_to_depth_and_motion():
         for k in range(10)
     ]
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-5)
-
-
-def test_wrong_snippet_is_refused():
-    with pytest.raises(SlamError, match="5 frames"):
-        OraclePredictor(truth(), depth_of).snippet(frames(0, 3))

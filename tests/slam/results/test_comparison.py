@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 from rich.console import Console
 
-from slam.errors import RunError
-from slam.results.comparison import comparison_json, comparison_table, lookup, run_names, written
+from slam.results.comparison import comparison_table
 from slam.results.folder import RunFolder
 
 MakeRun = Callable[..., RunFolder]
@@ -53,39 +51,3 @@ def test_numbers_of_a_run_that_did_not_end_are_shown_with_its_reason(
 ) -> None:
     text = printed([make_run("early", make_metrics() | {"status": status, "reason": "no space left"})])
     assert "0.870" in text and word in text and f"early {word}: no space left" in text
-
-
-def test_json_holds_the_objects_of_metrics_json(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
-    metrics = make_metrics()
-    run = make_run("one", metrics)
-    (entry,) = json.loads(json.dumps(comparison_json([run])))
-    assert entry["run"] == str(run.path)
-    assert entry["status"] == "ok"
-    assert entry["trajectories"] == metrics["trajectories"]
-
-
-def test_no_run_is_an_error() -> None:
-    with pytest.raises(RunError, match="no run was given"):
-        comparison_table([])
-
-
-def test_runs_of_one_name_are_distinguished_by_their_paths(make_run: MakeRun) -> None:
-    runs = [make_run("a/run"), make_run("b/run"), make_run("c")]
-    assert run_names(runs) == [str(runs[0].path), str(runs[1].path), "c"]
-
-
-def test_lookup_finds_the_reason_where_the_path_breaks() -> None:
-    tree = {"a": {"b": None, "b_reason": "because"}, "c": 1.0}
-    assert lookup(tree, "c") == (1.0, "")
-    assert lookup(tree, "a", "b") == (None, "because")
-    assert lookup(tree, "a", "b", "deeper") == (None, "because")
-    assert lookup(tree, "c", "d") == (None, "not recorded")
-    assert lookup(None, "c") == (None, "not recorded")
-
-
-@pytest.mark.parametrize(
-    ("value", "decimals", "text"),
-    [(None, 2, "–"), (3, 2, "3"), (0.0, 2, "0.00"), (1.236, 2, "1.24"), (3.1e-12, 1, "3.1e-12"), ("x", 1, "x")],
-)
-def test_numbers_are_written_with_their_decimals(value: Any, decimals: int, text: str) -> None:
-    assert written(value, decimals) == text

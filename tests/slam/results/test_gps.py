@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from slam import run_slam
-from slam.errors import SlamError
 from slam.formats.geographic import write_geojson, write_kml
 
 DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0013_sync"
@@ -29,15 +28,6 @@ def test_paths_on_the_earth(tmp_path: Path) -> None:
     kml = ElementTree.parse(tmp_path / "a.kml").getroot()
     words = [node.text for node in kml.iter() if node.tag.endswith(("}name", "}coordinates"))]
     assert words == ["a <drive>", "8.4,49.0,115.0 8.40002,49.00001,115.5"]
-
-
-def test_a_run_without_a_track_says_so(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
-    settings = ["mapping.enabled=false", "geometry.enabled=false", "output.report=false"]
-    arguments = {"weights": tiny_weights, "overrides": settings, "frames": "0:6", "output": tmp_path / "run"}
-    metrics = run_slam(kitti_root, "sim", **arguments).metrics()
-    assert (metrics["gps"], metrics["gps_reason"]) == (None, "no GPS track was given")
-    with pytest.raises(SlamError, match="cannot be read as a GPS track"):
-        run_slam(kitti_root, "sim", **arguments, gps=tmp_path / "none.csv")
 
 
 @pytest.mark.data

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import slam.results.map_mesh
-from slam.errors import RunError
 from slam.formats.ply import Ply, write_ply
 from slam.results.map_mesh import MapMesh, MapMeshFile
 
@@ -23,14 +22,6 @@ def file(plain: Ply, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> MapMesh
 def area(mesh: MapMesh) -> float:
     a, b, c = (mesh.points[mesh.triangles[:, k]] for k in range(3))
     return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
-def test_a_small_map_stays_as_it_is(file: MapMeshFile, plain: Ply) -> None:
-    mesh = file.reduced(100_000)
-    assert plain.triangles is not None and plain.colours is not None
-    assert np.array_equal(mesh.points, plain.points)
-    assert np.array_equal(mesh.colours, plain.colours)
-    assert np.array_equal(mesh.triangles, plain.triangles)
 
 
 def test_a_large_map_keeps_its_surface_and_colours(file: MapMeshFile) -> None:
@@ -53,13 +44,3 @@ def test_near_a_point_are_all_whole_triangles(file: MapMeshFile) -> None:
     mesh = file.near(np.array([0.0, 1.65, 0.0]), 20.0)
     assert np.linalg.norm(mesh.points - [0.0, 1.65, 0.0], axis=1).max() < 20.0
     assert area(mesh) == pytest.approx(np.pi * 20.0**2, rel=0.25)
-
-
-@pytest.mark.parametrize("damage", [lambda whole: whole[:-5], lambda whole: b"ply\n", lambda whole: b"<html>"])
-def test_a_damaged_file_is_one_clear_line(plain: Ply, tmp_path: Path, damage: object) -> None:
-    path = tmp_path / "map_mesh.ply"
-    write_ply(path, plain)
-    assert callable(damage)
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(RunError, match="is no mesh that can be read"):
-        MapMeshFile(path)

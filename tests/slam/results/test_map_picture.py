@@ -49,8 +49,3 @@ def test_from_the_seat_the_ground_is_below_the_wall_ahead_and_the_sky_above(scen
     assert picture[HEIGHT_PX // 2 - 40, WIDTH_PX // 2, 0] > 150 > 2 * picture[HEIGHT_PX // 2 - 40, WIDTH_PX // 2, 1]
     assert tuple(picture[-1, WIDTH_PX // 2 + 600]) == (204, 204, 178)  # 3.2 m ahead, 2.8 m to the right
     assert tuple(picture[-1, WIDTH_PX // 2 - 600]) == (51, 76, 51)
-
-
-def test_the_best_seat_looks_at_the_map(scene: MapScene) -> None:
-    away = [facing(180.0, -100.0)] * 60  # out of the map
-    assert scene.best_seat(np.stack([*away, *[facing(0.0)] * 10, *away])) == 64

@@ -13,16 +13,13 @@ import pytest
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from erfsfm.common.errors import ConfigError
 from slam.errors import RunError
 from slam.evaluation.drift import aligned, segment_drifts
 from slam.results.folder import RunFolder
-from slam.results.map_picture import AerialView
 from slam.results.plots import (
     depth_figure,
     drift_figure,
     errors_figure,
-    map_figure,
     plot_runs,
     trajectories_of,
     trajectory_figure,
@@ -31,7 +28,6 @@ from slam.se3 import Similarity, from_rotation_vector
 from slam.trajectory import Trajectory
 
 MakeRun = Callable[..., RunFolder]
-MakeMetrics = Callable[..., dict[str, Any]]
 
 
 def drawn(figure: Any) -> NDArray[np.floating]:
@@ -60,14 +56,6 @@ def test_figures_of_a_run_are_not_blank_and_change_no_global_state(
     figure = figure_of(trajectories_of(make_run()), "sim")
     assert not is_blank(drawn(figure))
     assert dict(mpl.rcParams) == before
-
-
-def test_trajectory_figure_names_the_alignment_and_keeps_proportions(make_run: MakeRun) -> None:
-    (axes,) = trajectory_figure(trajectories_of(make_run())).axes
-    assert axes.get_aspect() == 1.0
-    assert "7 dof" in axes.get_legend().get_title().get_text()
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["Ground truth", "Network, chained", "Odometry", "Optimised", "Start"]
 
 
 def test_without_a_reference_nothing_is_aligned_and_the_unit_is_shown(make_run: MakeRun) -> None:
@@ -111,14 +99,6 @@ def test_errors_need_a_reference(make_run: MakeRun, tmp_path: Path) -> None:
     plot_runs([run], ["trajectory"], tmp_path / "a.png")
 
 
-def test_a_path_too_short_for_segments_is_noted() -> None:
-    stamps = np.arange(5.0)
-    still = Trajectory(stamps, np.tile(np.eye(4), (5, 1, 1)))
-    figure = drift_figure({"reference": still, "optimised": still})
-    assert "shorter" in figure.axes[0].texts[0].get_text()
-    assert not is_blank(drawn(trajectory_figure({"reference": still, "optimised": still})))
-
-
 @pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("PDF", b"%PDF"), ("svg", b"<?xml")])
 def test_figures_are_written_in_every_format(make_run: MakeRun, tmp_path: Path, suffix: str, start: bytes) -> None:
     output = tmp_path / "out" / f"figure.{suffix}"
@@ -134,29 +114,6 @@ def test_figures_are_written_in_every_format(make_run: MakeRun, tmp_path: Path, 
         assert not is_blank(picture)
 
 
-@pytest.mark.parametrize(
-    ("what", "name", "why"),
-    [
-        (["speed"], "a.png", "'speed' is unknown.*trajectory, errors, drift"),
-        ([], "a.png", "nothing to plot"),
-        (["trajectory"], "a.gif", r"\.png, \.pdf, \.svg; got 'a.gif'"),
-        (["trajectory"], "run/metrics.json/a.png", "cannot be written"),
-    ],
-)
-def test_errors_are_one_clear_line(make_run: MakeRun, tmp_path: Path, what: list[str], name: str, why: str) -> None:
-    with pytest.raises((RunError, ConfigError), match=why) as caught:
-        plot_runs([make_run()], what, tmp_path / name)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_run_without_trajectories_is_an_error(make_run: MakeRun, tmp_path: Path) -> None:
-    run = make_run()
-    for path in [*run.path.glob("trajectory_*"), *run.path.glob("reference*")]:
-        path.unlink()
-    with pytest.raises(RunError, match="holds no trajectory"):
-        plot_runs([run], ["trajectory"], tmp_path / "a.png")
-
-
 def test_depth_figure_shows_near_bright_and_unknown_grey() -> None:
     image = np.full((40, 120, 3), 128, dtype=np.uint8)
     depth = np.full((40, 120), 50.0, dtype=np.float32)
@@ -166,19 +123,4 @@ def test_depth_figure_shows_near_bright_and_unknown_grey() -> None:
     near, far, unknown = (shown.to_rgba(shown.get_array())[20, column, :3] for column in (10, 60, 110))
     assert near.mean() > far.mean() + 0.3
     assert np.ptp(unknown) < 0.1
-    assert not is_blank(drawn(figure))
-
-
-def test_depth_without_a_single_value_still_draws() -> None:
-    image, depth = np.zeros((20, 30, 3), dtype=np.uint8), np.zeros((20, 30), dtype=np.float32)
-    drawn(depth_figure([image], [depth], ["frame 0"]))
-
-
-def test_map_figure_shows_the_picture_at_its_place_with_the_drive_over_it(make_run: MakeRun) -> None:
-    image = np.zeros((30, 40, 4), dtype=np.uint8)
-    image[:15] = [255, 0, 0, 255]
-    figure = map_figure(AerialView(image, (-60.0, 140.0), (-20.0, 130.0)), make_run().trajectory("optimised"))
-    (axes,) = figure.axes
-    assert axes.get_xlim() == (-60.0, 140.0) and axes.get_ylim() == (-20.0, 130.0)
-    assert axes.lines[-1].get_zorder() > axes.images[0].get_zorder()
     assert not is_blank(drawn(figure))

@@ -6,7 +6,6 @@ import base64
 import io
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from html.parser import HTMLParser
 from typing import Any
 
@@ -109,49 +108,6 @@ def test_it_shows_the_inputs_of_the_run_escaped(full: RunFolder) -> None:
     assert "LEAK" not in html
 
 
-def test_its_table_marks_the_best_and_explains_what_is_missing(full: RunFolder) -> None:
-    html, balance = parsed(full)
-    assert '<td class="best">0.870</td>' in html
-    assert "0.0123 ± 0.0060" in html
-    missing = [attrs for tag, attrs in balance.tags if tag == "td" and attrs.get("class") == "missing"]
-    assert missing
-    assert all(attrs.get("title") for attrs in missing)
-    assert "t_rel, % (7 dof) of odometry: no segment of 100 m was left" in html
-    assert "lidar trajectory: the sequence has no LiDAR scans" in html
-
-
-def test_the_error_of_the_map_has_its_truth_and_a_curve(full: RunFolder) -> None:
-    html, balance = parsed(full)
-    words = " ".join(balance.words)
-    for said in ("where the scanner looked", "with one scale", "10 to 15 m", "LiDAR scans accumulated at true poses"):
-        assert said in words
-    assert "0.081" in words and "0.729" in words and "the true surface is not known" in html
-
-
-def test_without_a_truth_the_reason_is_given(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
-    metrics = make_metrics()
-    metrics["map"] = {"triangles": 5, "points": 7, "blocks": 1, "truth": None, "truth_reason": "no true poses"}
-    folder = make_run(metrics=metrics)
-    write_report(folder, examples(), None)
-    html, _ = parsed(folder)
-    assert "error of the map: no true poses" in html and "Map error over distance" not in html
-
-
-def test_loops_are_listed_with_their_verdict(full: RunFolder) -> None:
-    _, balance = parsed(full)
-    words = " ".join(balance.words)
-    assert "12 candidates, 3 verified, 1 accepted" in words
-    assert words.index("295") < words.index("parallax <b>too small</b>")
-
-
-def test_without_the_viewer_the_pictures_stay_and_no_script(make_run: MakeRun, map_views: MapViews) -> None:
-    folder = make_run()
-    write_report(folder, [], replace(map_views, viewer=None))
-    html, balance = parsed(folder)
-    assert "<script" not in html
-    assert "Map from the driver's seat" in [attrs["alt"] for tag, attrs in balance.tags if tag == "img"]
-
-
 def test_a_leak_is_stamped(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
     folder = make_run(metrics=make_metrics(leak=True))
     write_report(folder, [], None)
@@ -192,18 +148,6 @@ def test_a_damaged_loops_file_leaves_the_rest_of_the_report(make_run: MakeRun) -
     folder.write_text("loops.json", "{")
     write_report(folder, [], None)
     assert "12 candidates" in parsed(folder)[0]
-
-
-def test_loops_and_time_add_up(make_run: MakeRun, make_metrics: MakeMetrics) -> None:
-    metrics = make_metrics()
-    metrics["loops"]["rejected"] = [{"from": k, "to": 300, "reason": "few inliers"} for k in range(200)]
-    metrics["timing"] |= {"seconds_total": 64.0, "stages": {"geometry": 40.0, "journal": 7.0}}
-    folder = make_run(metrics=metrics)
-    folder.write_text("loops.json", '{"accepted": [], "rejected": [], "rejected_left_out": 39}')
-    write_report(folder, [], None)
-    words = " ".join(parsed(folder)[1].words)
-    assert "160 more in loops.json, without 39 rejected ones of fewest inliers." in words
-    assert "everything else 17.0 s" in words and "journal, from which run --continue goes on 7.0 s" in words
 
 
 def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_run: MakeRun) -> None:

@@ -36,11 +36,3 @@ def test_a_full_disk_loses_lines_and_nothing_else(capsys: pytest.CaptureFixture[
         log.begin(Path("/dev/full"))
         LOGGER.info("lost")
     assert capsys.readouterr() == ("", "")
-
-
-def test_without_a_folder_nothing_is_written_and_the_level_is_as_before(tmp_path: Path) -> None:
-    package = logging.getLogger("slam")
-    level, handlers = package.level, list(package.handlers)
-    with run_log():
-        LOGGER.info("checked")
-    assert package.level == level and package.handlers == handlers

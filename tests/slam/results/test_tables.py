@@ -53,8 +53,3 @@ def test_missing_numbers_are_dashes_with_one_reason_each() -> None:
     assert "– network, odometry: no segment" in text
     assert "– lidar: not recorded." in text
     assert next(each for each in text.splitlines() if "lidar" in each).split() == ["lidar", *["–"] * 11]
-
-
-def test_no_reference() -> None:
-    text = shown({"network": metrics(50, reference=False)}, "x")
-    assert text.count("– network: there is no reference trajectory.") == 1

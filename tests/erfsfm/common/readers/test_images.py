@@ -68,16 +68,6 @@ def test_truncated_image_is_named(tmp_path: Path, suffix: str, keep: float, read
         read(path)
 
 
-def test_an_interrupted_preallocated_copy(tmp_path: Path) -> None:
-    """A copy that fills the file's length first leaves zeros where the rest should be."""
-    path = tmp_path / "a.jpg"
-    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8))
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
-    with pytest.raises(DataError, match="truncated"):
-        read_image(path)
-
-
 def test_a_video_behind_a_photo_is_left_out(tmp_path: Path) -> None:
     """As phones write motion photos; its bytes may look like markers."""
     path = tmp_path / "a.jpg"
@@ -130,20 +120,6 @@ def test_a_stamp_is_one_number_in_natural_order(tmp_path: Path, names: list[str]
     for name in names:
         (tmp_path / f"{name}.png").write_bytes(b"")
     assert [path.stem for path in list_images(tmp_path)] == names
-
-
-def test_two_formats_of_one_image(tmp_path: Path) -> None:
-    for name in ("0.png", "0.jpg"):
-        (tmp_path / name).write_bytes(b"")
-    with pytest.raises(DataError, match="image 0 in two formats"):
-        list_images(tmp_path)
-
-
-def test_resize_up_is_smooth() -> None:
-    ramp = np.repeat(np.arange(0, 160, 10, dtype=np.uint8)[None, :, None], 8, axis=0).repeat(3, axis=2)
-    grown = resize_image(ramp, 16, 64)
-    assert np.abs(np.diff(grown[0, :, 0].astype(int))).max() <= 4, "no steps of whole pixels"
-    assert resize_image(ramp, 8, 16) is ramp
 
 
 def test_resize_down_averages() -> None:

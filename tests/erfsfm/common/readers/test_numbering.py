@@ -23,11 +23,6 @@ def test_gaps_and_parts() -> None:
     assert files.describe_gaps() == "3 of 8 frames have no image; the first gap is 000019.png to 000020.png"
 
 
-def test_no_gap() -> None:
-    files = by_number(named("000000", "000001", "000002"))
-    assert (len(files), files.first, files.gaps(), files.parts()) == (3, 0, [], [(0, 3)])
-
-
 @pytest.mark.parametrize(
     ("values", "rows", "skipped"),
     [(5, [0, 1, 2, 3, 4], 0), (22, [0, 1, 2, 3, 4], 17), (4, [0, 1, 3, 4], 0), (6, None, None), (3, None, None)],
@@ -66,12 +61,6 @@ def test_names_without_numbers(stems: tuple[str, ...], message: str) -> None:
 def test_folders_without_gaps(stems: list[str]) -> None:
     files = by_name(named(*stems))
     assert (len(files), files.first, files.gaps()) == (len(stems), 0, [])
-
-
-def test_a_gap_in_a_folder() -> None:
-    files = by_name(named("frame_07", "frame_08", "frame_09", "frame_11", "frame_12"))
-    assert (len(files), files.first, files.gaps()) == (6, 0, [(3, 3)])
-    assert files.file_name(3) == "frame_10.png"
 
 
 def test_a_huge_gap_takes_no_memory() -> None:

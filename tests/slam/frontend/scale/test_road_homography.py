@@ -128,12 +128,6 @@ def test_what_is_no_road_is_refused_with_a_reason(texture, monkeypatch):
     assert isinstance(failure, MeasurementFailure) and "tilted" in failure.reason
 
 
-def test_the_answer_is_the_same_every_time(texture):
-    step = se3.from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    one, other = measure(texture, step), measure(texture, step)
-    assert one.length_heights == other.length_heights
-
-
 def test_directions_of_motion_are_kept_by_a_state(texture):
     """A camera that looks down by 3 degrees learns its pitch, and its state keeps it."""
     T_body_camera = pitched(-3.0)

@@ -22,11 +22,6 @@ def mask_with_car(steps: int, sharpness: float = 4.0) -> tuple[DynamicMask, np.n
     return dynamic_mask, static
 
 
-def test_an_empty_mask_weights_all_corners_fully() -> None:
-    weights = DynamicMask.empty(416, 128, 4.0).weights(RNG.uniform(0.0, 100.0, (5, 2)))
-    np.testing.assert_array_equal(weights, np.ones(5))
-
-
 def test_corners_on_a_moving_car_are_weighted_down() -> None:
     dynamic_mask, static = mask_with_car(8)
     assert dynamic_mask.weights(CAR[None]) < 0.05
@@ -40,11 +35,6 @@ def test_outliers_decay_after_the_car_has_left() -> None:
         pixels = np.concatenate([static, np.tile(CAR, (3, 1))])
         dynamic_mask = dynamic_mask.updated(pixels, np.ones(153, dtype=bool))
     assert dynamic_mask.weights(CAR[None]) > 0.8
-
-
-def test_without_sharpness_all_weights_are_equal() -> None:
-    dynamic_mask, static = mask_with_car(8, sharpness=0.0)
-    np.testing.assert_array_equal(dynamic_mask.weights(np.concatenate([static, CAR[None]])), np.ones(151))
 
 
 def test_corners_beyond_the_edge_belong_to_the_nearest_cell() -> None:

@@ -9,7 +9,6 @@ from slam import se3
 from slam.frames import Intrinsics
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
-    cross,
     depth_in_current,
     parallax_px,
     rotation_between,
@@ -104,9 +103,3 @@ def test_a_pure_rotation_is_found_with_a_fifth_of_outliers() -> None:
     rotated[:24, :2] += 0.05
     found = rotation_between(previous, rotated)
     assert np.rad2deg(se3.rotation_angle(found.T @ UNIT_POSE.R_current_previous)) < 1e-6
-
-
-def test_cross_is_that_of_numpy() -> None:
-    a, b = np.random.default_rng(0).normal(size=(2, 3, 9))
-    np.testing.assert_allclose(cross(a, b), np.cross(a, b, axis=0))
-    np.testing.assert_allclose(cross(a, b[:, 0]), np.cross(a, b[:, :1], axis=0))

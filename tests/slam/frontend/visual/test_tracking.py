@@ -46,18 +46,6 @@ def test_new_corners_are_detected_in_what_slides_into_view(frames):
     assert len(tracks.track_ids) <= CONFIG.max_corners
 
 
-def test_an_empty_image_gives_no_tracks(frames):
-    black = Frame(9, 0.9, np.zeros_like(frames[0].image))
-    assert len(CornerTracker(CONFIG).track(black, frames[0]).track_ids) == 0
-    assert len(CornerTracker(CONFIG).track(frames[0], black).track_ids) == 0
-
-
-def test_two_trackers_agree(frames):
-    one, other = (CornerTracker(CONFIG).track(frames[0], frames[2]) for _ in range(2))
-    np.testing.assert_array_equal(one.current, other.current)
-    np.testing.assert_array_equal(one.track_ids, other.track_ids)
-
-
 def test_few_corners_are_tracked_again_with_equal_exposure(frames):
     dark = Frame(1, 0.1, (0.35 * frames[1].image.astype(np.float32)).astype(np.uint8))
     once = CornerTracker(CONFIG.model_copy(update={"few_corners": 0})).track(frames[0], dark)

@@ -16,7 +16,7 @@ def __getattr__(name: str) -> Any:
 
         return Slam
     if name == "run_slam":
-        from slam.run import run_slam
+        from slam.commands.run.run import run_slam
 
         return run_slam
     raise AttributeError(f"module 'slam' has no attribute '{name}'")

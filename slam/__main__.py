@@ -1,6 +1,6 @@
 """Run the command line as ``python -m slam``."""
 
-from slam.cli import main
+from slam.commands.cli import main
 
 if __name__ == "__main__":
     main()

@@ -15,7 +15,7 @@ import erfsfm
 import slam
 from erfsfm.config import load_experiment
 from erfsfm.data.split_file import read_split_file
-from slam.config import load_config
+from slam.config.sections import load_config
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("erfsfm", "slam")
@@ -121,11 +121,11 @@ def test_only_command_lines_and_tools_print() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     }
-    assert calls <= {"erfsfm/cli.py", "slam/cli.py"}
+    assert calls <= {"erfsfm/cli.py", "slam/commands/cli.py"}
 
 
 def test_each_heavy_library_has_one_home() -> None:
-    assert uses("gtsam") == {"slam/pose_graph.py", "slam/similarity_graph.py"}
+    assert uses("gtsam") == {"slam/graph/pose_graph.py", "slam/graph/similarity_graph.py"}
     assert uses("evo") == {"slam/evaluation/trajectory.py"}
     assert uses("open3d") == set()  # through the door of slam/runtime/imports.py
     assert all(name.startswith("erfsfm/training/") for name in uses("lightning"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from erfsfm.config import ExperimentConfig
-from slam.config import SlamConfig
+from slam.config.sections import SlamConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -39,8 +39,8 @@ from benchmarking.plan import (
 from benchmarking.summary import summary_table
 from benchmarking.work import ROOT, measured, workers
 
-from slam.errors import SlamError
-from slam.storage.files import write_atomically
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.files import write_atomically
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam import run_slam
-from slam.errors import SlamError
-from slam.se3 import FloatArray, umeyama
-from slam.sequences.simulation.kitti_layout import write_calibration, write_image, write_lines, write_poses
-from slam.sequences.simulation.sequence import FPS, SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions
+from slam.geometry.se3 import FloatArray, umeyama
+from slam.runtime.errors import SlamError
+from slam.sequences.simulated import FPS, SimulatedSequence
+from slam.simulation.kitti_layout import write_calibration, write_image, write_lines, write_poses
+from slam.simulation.street import SimulationOptions
 
 Image = NDArray[np.uint8]
 FRAMES, SEED, OTHER_SEED = 300, 1400, 1401

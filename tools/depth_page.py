@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, save_image
-from slam.config import load_config
-from slam.errors import SlamError
+from slam.config.sections import load_config
 from slam.frames import DepthMap, Image
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.prediction.networks import NetworkPredictor
 from slam.results.depth import true_depth
+from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 
 EDGES_M = (1, 5, 10, 20, 40, 80)

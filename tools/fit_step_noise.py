@@ -22,8 +22,7 @@ from scipy.optimize import minimize
 
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
-from slam.config import FrontendConfig, GeometryConfig, load_config
-from slam.errors import SlamError
+from slam.config.sections import FrontendConfig, GeometryConfig, load_config
 from slam.evaluation.coverage import LEVELS, squared_bound
 from slam.frames import RelativePose
 from slam.frontend.drive import Drive
@@ -31,11 +30,12 @@ from slam.frontend.factors import make_factors
 from slam.frontend.network_factors import STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable
+from slam.geometry.se3 import FloatArray, invert, umeyama
 from slam.pipeline.batch import SlamPipeline
 from slam.prediction.networks import NetworkPredictor
-from slam.se3 import FloatArray, invert, umeyama
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.cache import CacheNamespace, DiskCache, without_cache
 from slam.sequences.catalogue import open_sequence
-from slam.storage.cache import CacheNamespace, DiskCache, without_cache
 
 QUIET = ("mapping.enabled=false", "loops.enabled=false")
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from erfsfm.inference import DepthPosePredictor
 from slam.frames import Sequence
 from slam.results.folder import RunFolder
-from slam.results.map_mesh import MapMeshFile
-from slam.results.map_picture import MapScene
-from slam.results.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
+from slam.results.report.map_mesh import MapMeshFile
+from slam.results.report.map_picture import MapScene
+from slam.results.report.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600

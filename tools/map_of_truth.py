@@ -11,12 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam.config import load_config
-from slam.errors import SlamError
+from slam.config.sections import load_config
 from slam.evaluation.map import compare, statistics
 from slam.mapping.map import TsdfMap
 from slam.results.map_error import HasTrueDepth
 from slam.results.map_error import find_truth as surface_of
+from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 
 

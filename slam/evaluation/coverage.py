@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-from slam.errors import SlamError
 from slam.frames import RelativePose
-from slam.pose_graph import whitened_squared
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import whitened_squared
+from slam.runtime.errors import SlamError
 
 LEVELS = (50, 90, 95)
 

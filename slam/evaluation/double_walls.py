@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import FloatArray
 from slam.runtime.imports import import_open3d
-from slam.se3 import FloatArray
 
 NEAR_M, FAR_M = 0.3, 2.0  # of the second surface in front of the first
 _PARALLEL = 0.7  # least cosine of the two normals

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam import se3
-from slam.se3 import FloatArray
-from slam.trajectory import Trajectory, associate
+from slam.formats.trajectory import Trajectory, associate
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 REFERENCE = "reference"
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

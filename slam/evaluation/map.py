@@ -29,7 +29,7 @@ from slam.evaluation.surface import (
     stretches,
     thinned,
 )
-from slam.se3 import FloatArray, Similarity, nearest_rotation
+from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3

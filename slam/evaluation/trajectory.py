@@ -17,11 +17,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
-from slam import se3
-from slam.errors import ConfigError, TrajectoryError
 from slam.evaluation.drift import KITTI_LENGTHS_M, path_distance, relative_errors, segment_errors
-from slam.se3 import FloatArray
-from slam.trajectory import Trajectory, matching_tolerance_s, read_trajectory
+from slam.formats.trajectory import Trajectory, matching_tolerance_s, read_trajectory
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import ConfigError, TrajectoryError
 
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
@@ -62,7 +62,7 @@ def trajectory_metrics(
 
     Args:
         estimate: the trajectory to evaluate.
-        reference: the truth of the same frames, row k beside row k (see `slam.trajectory.associate`).
+        reference: the truth of the same frames, row k beside row k (see `slam.formats.trajectory.associate`).
         snippet5: the paper's protocol where it was measured directly; by default cut from the estimate.
 
     Raises:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.errors import RunError
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray, invert
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray, invert
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 MODEL_FILES = ("cameras.txt", "images.txt", "points3D.txt")
 _HEADER = "# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.files import read_text
-from slam.errors import RunError
 from slam.frames import RelativePose
-from slam.se3 import FloatArray
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 _UPPER = np.triu_indices(6)

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
-from slam.errors import RunError
-from slam.se3 import FloatArray
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 _KML = "http://www.opengis.net/kml/2.2"
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import RunError
+from slam.runtime.errors import RunError
 from slam.runtime.imports import import_rasterio
-from slam.storage.files import write_atomically
+from slam.runtime.storage.files import write_atomically
 
 
 def local_projection(latitude_deg: float, longitude_deg: float) -> str:

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import RunError
 from slam.formats.ply import Ply
-from slam.storage.files import write_atomically
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 _FLOAT, _UNSIGNED_INT, _UNSIGNED_SHORT = 5126, 5125, 5123
 _VERTICES, _INDICES = 34962, 34963

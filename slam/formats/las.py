@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.errors import RunError
 from slam.formats.ply import Ply
+from slam.runtime.errors import RunError
 from slam.runtime.imports import import_laspy
-from slam.storage.files import write_atomically
+from slam.runtime.storage.files import write_atomically
 
 _STEP = 1e-4  # coordinates are integers of this unit: 214 km to either side
 _RGB_POINTS = 2  # the point format with colours and without time

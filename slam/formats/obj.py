@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from slam.errors import RunError
 from slam.formats.ply import Ply
-from slam.storage.files import write_atomically
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 _CHUNK = 100_000
 

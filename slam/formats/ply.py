@@ -14,9 +14,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import RunError
-from slam.se3 import FloatArray
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},

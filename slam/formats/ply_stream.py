@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import RunError
 from slam.formats.ply import TRIANGLE, ply_header
-from slam.storage.files import write_atomically
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 
 def write_ply_pieces(

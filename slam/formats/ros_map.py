@@ -9,8 +9,8 @@ import yaml
 from numpy.typing import NDArray
 
 from erfsfm.common.files import read_text
-from slam.errors import RunError
-from slam.storage.files import write_atomically
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196

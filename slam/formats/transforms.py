@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import RunError
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
 
 TRANSFORMS = "transforms.json"
 T_CAMERA_OPENGL: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -10,9 +10,8 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
-from slam.config import MappingConfig
-from slam.depth_sampling import resized_depth
-from slam.frames import DepthMap, Ends, Frame, Image, RelativePose, SnippetPoses, TrackingEvent, View
+from slam.config.sections import MappingConfig
+from slam.frames import DepthMap, Ends, Frame, Image, RelativePose, SnippetPoses, TrackingEvent, View, resized_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
@@ -22,7 +21,7 @@ from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.window.odometry import Segment as MapSegment
 from slam.frontend.window.relative_poses import WindowPoses
-from slam.storage.spill import SpilledArray, SpillFile
+from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
 

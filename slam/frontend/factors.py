@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import FrontendConfig, GeometryConfig
+from slam.config.sections import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
@@ -25,7 +25,7 @@ from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
 from slam.frontend.window.gaps import led_through
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
-from slam.se3 import FloatArray, invert, nearest_rotation
+from slam.geometry.se3 import FloatArray, invert, nearest_rotation
 
 
 def make_factors(

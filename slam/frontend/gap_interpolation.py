@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive
 from slam.frontend.rotation_smoothing import smooth_rotations
@@ -17,7 +16,8 @@ from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.window.odometry import Segment as MapSegment
 from slam.frontend.window.relative_poses import WindowPoses
-from slam.se3 import FloatArray, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.runtime.errors import SlamError
 
 INTERPOLATED_SOURCE = "interpolated"
 _STEPS_OF_A_MOTION = 3

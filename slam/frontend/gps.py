@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam import se3
-from slam.config import GpsConfig
+from slam.config.sections import GpsConfig
+from slam.formats.trajectory import nearest_stamps
 from slam.frames import MeasuredPosition
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate
-from slam.geodesy import GpsTrack, LocalFrame
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray
-from slam.trajectory import nearest_stamps
+from slam.geometry import se3
+from slam.geometry.geodesy import GpsTrack, LocalFrame
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import ErfsfmError
-from slam.errors import SlamError
 from slam.frames import RelativePose, Sequence
 from slam.frontend.failure import MeasurementFailure
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
+from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 

@@ -25,11 +25,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.pose_noise import PairPose, PoseNoise, difference, pair_poses
-from slam.errors import SlamError
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.step_table import path_between, shortest_by_start
-from slam.robust import mad_sigma, mad_sigmas
-from slam.se3 import FloatArray, invert, nearest_rotation
+from slam.geometry.robust import mad_sigma, mad_sigmas
+from slam.geometry.se3 import FloatArray, invert, nearest_rotation
+from slam.runtime.errors import SlamError
 
 NETWORK_SOURCE = "network"
 STUDENT_T_DOF = 12.0  # of the errors of measured steps and pairs: degrees of freedom of Student's t

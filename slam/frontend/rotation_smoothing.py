@@ -18,7 +18,7 @@ from slam.frames import Ends
 from slam.frontend.step_table import StepTable, path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
 
 # sigmas of single steps are widened by this: the errors of neighbouring steps are correlated
 _STEP_WIDENING = 3.0

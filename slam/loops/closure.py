@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from slam.config import LoopsConfig
+from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
+from slam.geometry.se3 import FloatArray
 from slam.loops.consistency import agreeing
 from slam.loops.retrieval import find_candidates, least_path
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop
 from slam.runtime.threads import side_by_side
-from slam.se3 import FloatArray
 
 logger = logging.getLogger(__name__)
 

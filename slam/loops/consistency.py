@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, RejectedLoop
-from slam.se3 import FloatArray, invert, rotation_angle
 
 _SUPPORT_SIGMAS = 3.0  # largest difference of supporting loops, sigmas
 _SUPPORT_DRIFT_RATIO = 0.1  # drift of the odometry between supporting loops over the path between them

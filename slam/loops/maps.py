@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, RelativeSimilarity, View
+from slam.geometry.se3 import FloatArray, apply, invert, rotation_angle
 from slam.loops.consistency import agreeing
 from slam.loops.retrieval import similar_views
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import Loop, LoopVerifier, RejectedLoop, Sighting, matches
 from slam.runtime.threads import side_by_side
-from slam.se3 import FloatArray, apply, invert, rotation_angle
 
 logger = logging.getLogger(__name__)
 

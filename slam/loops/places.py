@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.readers.pinhole import Pinhole, impossible
-from slam.errors import RunError
 from slam.frames import Intrinsics, View
-from slam.se3 import FloatArray, is_se3
-from slam.storage.archive import opened_archive, read_array
+from slam.geometry.se3 import FloatArray, is_se3
+from slam.runtime.errors import RunError
+from slam.runtime.storage.archive import opened_archive, read_array
 
 PLACES = "places.npz"
 _FORMAT = 1

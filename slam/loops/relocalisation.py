@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics, View
+from slam.geometry.se3 import FloatArray, apply
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.thresholds import OF_KEYFRAMES
 from slam.loops.verification import LoopVerifier, Sighting, matches
-from slam.se3 import FloatArray, apply
 
 _PLACES_TRIED = 6
 # a single image has no points of its own that would confirm the pose, so it takes twice those of a loop

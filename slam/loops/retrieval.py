@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from slam.frames import Descriptors, View
+from slam.geometry.se3 import FloatArray
 from slam.loops.descriptors import hamming
 from slam.runtime.threads import side_by_side
-from slam.se3 import FloatArray
 
 _TRAINING_DESCRIPTORS = 15_000
 _ROUNDS = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from slam.config import LoopsConfig
+from slam.config.sections import LoopsConfig
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import LOOP_SOURCE, Intrinsics, RelativePose, View
+from slam.geometry.resection import Resection, consensus, refine
+from slam.geometry.se3 import FloatArray, invert, make, rotation_angle
 from slam.loops.descriptors import hamming
 from slam.loops.thresholds import LoopThresholds
-from slam.resection import Resection, consensus, refine
-from slam.se3 import FloatArray, invert, make, rotation_angle
 
 _RATIO = 0.85  # largest ratio of nearest to second nearest descriptor distance
 _RANSAC_ITERATIONS = 200  # RANSAC iterations of PnP

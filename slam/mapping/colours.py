@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
+from slam.geometry.se3 import FloatArray, apply, invert
 from slam.mapping.store import SubmapStore
-from slam.se3 import FloatArray, apply, invert
 
 _GREY = 128
 _NEARNESS = 4  # power of the distance that a view's weight falls with

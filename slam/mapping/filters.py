@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import MappingConfig
+from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
 
 Mask = NDArray[np.bool_]
 _OUTSIDE = -9.0  # a column left of every image

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Intrinsics
+from slam.geometry.se3 import FloatArray, invert
 from slam.mapping.submap import BLOCK_SIDE, BLOCK_VOXELS
 from slam.runtime.imports import import_open3d
-from slam.se3 import FloatArray, invert
 
 SEED_STRIDE = 4  # Open3D activates blocks at these pixels only, and raises where none of them has depth
 _CAPACITY = 1000  # blocks of 32 KiB; growing takes Open3D a moment

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import MappingConfig
-from slam.errors import EmptyMapError
+from slam.config.sections import MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
 from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
 from slam.mapping.views import ViewChooser
-from slam.se3 import FloatArray, invert, rotation_angle
+from slam.runtime.errors import EmptyMapError
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20

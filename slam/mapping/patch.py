@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import FloatArray
 from slam.mapping.fusion import new_grid
 from slam.mapping.store import TILE_BLOCKS, Blocks, SubmapStore
 from slam.mapping.submap import BLOCK_SIDE
 from slam.runtime.imports import import_open3d
-from slam.se3 import FloatArray
 
 Triangles = NDArray[np.int64]
 Mask = NDArray[np.bool_]

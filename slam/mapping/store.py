@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.geometry.se3 import FloatArray
 from slam.mapping.submap import BLOCK_VOXELS, Submap
-from slam.se3 import FloatArray
-from slam.storage.archive import reading_archive
+from slam.runtime.storage.archive import reading_archive
 
 TILE_BLOCKS = 16
 _REMEMBERED = 4  # submaps; neighbouring tiles need the same ones

@@ -14,10 +14,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import RunError
-from slam.se3 import FloatArray
-from slam.storage.archive import reading_archive
-from slam.storage.files import write_atomically
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import RunError
+from slam.runtime.storage.archive import reading_archive
+from slam.runtime.storage.files import write_atomically
 
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.config import MappingConfig
-from slam.errors import EmptyMapError
+from slam.config.sections import MappingConfig
 from slam.formats.ply_stream import write_ply_pieces
+from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter
 from slam.mapping.holes import with_holes_closed
 from slam.mapping.patch import Mask, Patch, Triangles, extract_patch
 from slam.mapping.store import TILE_BLOCKS, SubmapStore
 from slam.mapping.submap import BLOCK_SIDE
-from slam.se3 import FloatArray
-from slam.storage.spill import SpilledArray, SpillFile
+from slam.runtime.errors import EmptyMapError
+from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 Progress = Callable[[str, int, int], None]
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from slam.frames import DepthMap, Image, Intrinsics
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, DepthView, sampled
-from slam.se3 import FloatArray, invert, rotation_angle
 
 _STEP = 0.1  # of the largest fused depth
 _STEP_DEG = 10.0

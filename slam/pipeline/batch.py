@@ -10,7 +10,8 @@ from functools import cached_property, partial
 from pathlib import Path
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import SlamConfig
+from slam.config.sections import SlamConfig
+from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Predictor, RelativePose
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import Drive, Examples
@@ -25,7 +26,9 @@ from slam.frontend.scale.scale_estimate import (
     scale_from_distance,
     scale_from_reference,
 )
-from slam.geodesy import GpsTrack
+from slam.geometry.geodesy import GpsTrack
+from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
@@ -38,14 +41,11 @@ from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
-from slam.pose_graph import PoseGraph
 from slam.runtime.imports import import_open3d_beside
+from slam.runtime.storage.cache import GetOrCompute, without_cache
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
-from slam.se3 import FloatArray
 from slam.sequences.continued import Continued
-from slam.storage.cache import GetOrCompute, without_cache
-from slam.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from typing import Self
 
 import numpy as np
 
-from slam.errors import RunError, SlamError
 from slam.frames import Frame, Intrinsics, RelativePose, SnippetPoses, TrackingEvent, View
 from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import Drive, Keyframe
@@ -36,13 +35,14 @@ from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
 from slam.frontend.window.relative_poses import WindowPoses
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.observer import FrontEndState, RecentFrame
-from slam.se3 import FloatArray
+from slam.runtime.errors import RunError, SlamError
+from slam.runtime.storage.archive import opened_archive, read_array
+from slam.runtime.storage.files import KEYFRAMES_PART, remove, write_atomically
+from slam.runtime.storage.serialisation import Serialiser
+from slam.runtime.storage.spill import SpillFile
 from slam.sequences.continued import Continued
-from slam.storage.archive import opened_archive, read_array
-from slam.storage.files import KEYFRAMES_PART, remove, write_atomically
-from slam.storage.serialisation import Serialiser
-from slam.storage.spill import SpillFile
 
 DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
 EVERY_FRAMES = 100

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from slam.formats.trajectory import Trajectory
 from slam.frames import RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.frontend.scale.metric_scale import Scale
+from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
 from slam.mapping.map import TsdfMap
 from slam.pipeline.observer import FrontEndState
 from slam.pipeline.positioning import Location
-from slam.pose_graph import PoseGraph
 from slam.runtime.timing import Stopwatch
-from slam.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam.errors import SlamError
 from slam.frames import Frame, Intrinsics
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SlamError
 
 
 @dataclass

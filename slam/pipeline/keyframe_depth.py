@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from erfsfm.mvs.refine import RefinedDepth, Road
-from slam.config import DepthConfig, MappingConfig
-from slam.depth_refinement import DepthRefiner
+from slam.config.sections import DepthConfig, MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.mapping.depth_refinement import DepthRefiner
 
 _SOME = 20
 _STREET_DEPTH_M = 15.0  # median depth of a street

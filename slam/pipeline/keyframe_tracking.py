@@ -7,16 +7,16 @@ from itertools import islice
 
 import numpy as np
 
-from slam.config import LoopsConfig, SlamConfig, WindowConfig
+from slam.config.sections import LoopsConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.window.descriptors import describe
 from slam.frontend.window.local_map import LocalMap, corners_of
 from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
+from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
-from slam.se3 import FloatArray, invert
 
 # a lost camera is looked for at every third frame
 _RELOCALISED_FRAMES = 3

@@ -14,8 +14,8 @@ from erfsfm.common.readers.camera_file import HIGHEST_M
 from erfsfm.common.readers.pinhole import impossible
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
-from slam.config import SlamConfig
-from slam.errors import SlamError
+from slam.config.sections import SlamConfig
+from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
@@ -26,9 +26,9 @@ from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.files import write_atomically
 from slam.runtime.timing import Stopwatch
-from slam.storage.files import write_atomically
-from slam.trajectory import Trajectory
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -262,7 +262,7 @@ class Slam:
 def _check(intrinsics: Intrinsics, camera_height_m: float | None, config: SlamConfig | None) -> None:
     """Refuse a camera that cannot be, and settings by their name."""
     if not isinstance(config, SlamConfig | None):
-        raise SlamError(f"config must be what slam.config.load_config gives; got {type(config).__name__}")
+        raise SlamError(f"config must be what slam.config.sections.load_config gives; got {type(config).__name__}")
     if not isinstance(intrinsics, Intrinsics):
         raise SlamError(f"intrinsics must be slam.frames.Intrinsics; got {type(intrinsics).__name__}")
     problem = impossible(intrinsics)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from slam.config import SlamConfig
+from slam.config.sections import SlamConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import map_units, scaled_poses
 from slam.frontend.scale.metric_scale import Scale
@@ -19,11 +19,11 @@ from slam.frontend.window.joining import SharedCorners, join
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
+from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.graph.similarity_graph import optimise_similarities
 from slam.loops.closure import LoopClosures
 from slam.loops.maps import MapLoop, find_map_loops
 from slam.loops.verification import Loop, RejectedLoop
-from slam.se3 import FloatArray, apply, invert, make
-from slam.similarity_graph import optimise_similarities
 
 logger = logging.getLogger(__name__)
 

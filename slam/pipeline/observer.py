@@ -11,8 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from slam.config import SlamConfig
-from slam.errors import MissingFrameError, SequenceError
+from slam.config.sections import SlamConfig
 from slam.frames import DepthMap, Frame, Intrinsics, Predictor
 from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
@@ -24,15 +23,16 @@ from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import OdometryState, VisualOdometry
 from slam.frontend.window.odometry import WindowState
+from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.pending import PendingFrame, PendingTask
 from slam.pipeline.reading import predicted_depth
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
+from slam.runtime.storage.cache import GetOrCompute, without_cache
+from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
-from slam.se3 import FloatArray, chain
-from slam.storage.cache import GetOrCompute, without_cache
-from slam.storage.spill import SpillFile
 
 logger = logging.getLogger(__name__)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 
-from slam.config import GpsConfig, ScaleMode
-from slam.errors import SlamError
+from slam.config.sections import GpsConfig, ScaleMode
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.scale_estimate import ScaleEstimate
-from slam.geodesy import GpsTrack
-from slam.pose_graph import PoseGraph
-from slam.se3 import FloatArray
+from slam.geometry.geodesy import GpsTrack
+from slam.geometry.se3 import FloatArray
+from slam.graph.pose_graph import PoseGraph
+from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 

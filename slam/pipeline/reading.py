@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.errors import SequenceError, SlamError
 from slam.frames import DepthMap, Frame, Predictor, Sequence
+from slam.runtime.errors import SequenceError, SlamError
 
 
 def read_frame(sequence: Sequence, index: int) -> Frame | SequenceError:

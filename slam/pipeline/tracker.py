@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import SlamConfig
+from slam.config.sections import SlamConfig
 from slam.frontend.factors import chain_odometry, make_factors
 from slam.frontend.gap_interpolation import completed
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
+from slam.geometry.se3 import FloatArray, invert
 from slam.pipeline.observer import Observer
-from slam.se3 import FloatArray, invert
 
 State = Literal["starting", "tracking", "bridged", "relocalised"]
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from erfsfm.inference import DepthPosePredictor
-from slam.config import DepthConfig
-from slam.errors import SlamError
+from slam.config.sections import DepthConfig
 from slam.frames import Intrinsics, Predictor
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
 from slam.prediction.depth_source import DepthSource, SourcedPredictor
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
-from slam.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
-from slam.storage.fingerprint import code_fingerprint
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
+from slam.runtime.storage.fingerprint import code_fingerprint
 
 
 def open_depth(

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
 from erfsfm.common.readers.images import natural_key, read_values
 from erfsfm.common.readers.numbering import by_name
-from slam.config import DepthConfig
-from slam.errors import SlamError, sequence_errors
+from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Frame
 from slam.prediction.depth_source import Disparity, Kind, at_size, disparity_of
+from slam.runtime.errors import SlamError, sequence_errors
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 26

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
+from slam.runtime.errors import SlamError
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from erfsfm.inference import depth_at, limit_torch_threads
 from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
-from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
+from slam.runtime.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 
 class Networks(Protocol):

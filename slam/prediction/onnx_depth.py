@@ -22,11 +22,11 @@ from erfsfm.common.files import read_bytes
 from erfsfm.common.onnx_session import open_session
 from erfsfm.common.readers.images import resize_image
 from erfsfm.inference import NETWORK_THREADS
-from slam.config import DepthConfig
-from slam.errors import SlamError
+from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
 from slam.prediction.depth_source import Disparity, Kind, disparity_of
-from slam.storage.cache import Answer, GetOrCompute, without_cache
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 _MOST_BYTES = 2**31  # of a message of Protocol Buffers
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, SnippetPoses
-from slam.se3 import FloatArray, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.runtime.errors import SlamError
 
 _NOISE_CELL_PX = 32
 

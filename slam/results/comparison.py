@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from slam.errors import RunError
 from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.runtime.errors import RunError
 
 if TYPE_CHECKING:
     from rich.table import Table

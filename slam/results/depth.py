@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from slam.errors import SlamError
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
+from slam.geometry.se3 import FloatArray, apply
 from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
-from slam.se3 import FloatArray, apply
+from slam.runtime.errors import SlamError
 from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)

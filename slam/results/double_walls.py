@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from slam.evaluation.double_walls import double_wall_share
+from slam.formats.trajectory import Trajectory
+from slam.geometry.se3 import apply, invert
 from slam.loops.closure import LoopClosures
 from slam.mapping.map import TsdfMap
 from slam.results.summary import null
-from slam.se3 import apply, invert
-from slam.trajectory import Trajectory
 
 AT_LOOPS = "double_wall_share_at_loops"
 

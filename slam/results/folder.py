@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from erfsfm.common.lock import FolderLock
-from slam.errors import RunError
+from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
 from slam.results.output import TRAJECTORIES as TRAJECTORIES
 from slam.results.schema import MetricsFile
-from slam.storage.files import write_atomically
-from slam.storage.json_file import read_json
-from slam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.json_file import read_json
 
 logger = logging.getLogger(__name__)
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from slam.formats.geographic import write_geojson, write_kml
+from slam.formats.trajectory import Trajectory
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
 from slam.results.summary import null
-from slam.se3 import FloatArray
-from slam.trajectory import Trajectory
 
 GEOJSON = "trajectory_optimised.geojson"
 KML = "trajectory_optimised.kml"

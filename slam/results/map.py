@@ -6,7 +6,6 @@ import logging
 from dataclasses import asdict
 from typing import Any
 
-from slam.errors import EmptyMapError
 from slam.evaluation.double_walls import double_wall_share
 from slam.frames import Sequence
 from slam.mapping.map import TsdfMap
@@ -19,6 +18,7 @@ from slam.results.double_walls import AT_LOOPS, double_walls_at_loops
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
+from slam.runtime.errors import EmptyMapError
 
 logger = logging.getLogger(__name__)
 

@@ -9,14 +9,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slam.errors import SlamError
 from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
 from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
 from slam.frames import Intrinsics, Sequence
 from slam.frontend.lidar_odometry import readable_scan
+from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate
 from slam.results.summary import null
-from slam.se3 import FloatArray, Similarity, apply, invert
+from slam.runtime.errors import SlamError
 from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)

@@ -16,9 +16,11 @@ from erfsfm.evaluation.pose_metrics import (
 )
 from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
+from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
+from slam.geometry.se3 import umeyama
 from slam.pipeline.doubts import DOUBLED, doubled_frames
 from slam.pipeline.estimate import Estimate
 from slam.results.folder import TRAJECTORIES, RunFolder
@@ -33,9 +35,7 @@ from slam.results.summary import (
     finite,
     null,
 )
-from slam.se3 import umeyama
 from slam.sequences.continued import unused_scans
-from slam.trajectory import Trajectory, associate
 
 
 def lidar_trajectory(result: Estimate) -> Trajectory | None:

@@ -14,12 +14,12 @@ from datetime import datetime
 from pathlib import Path
 
 from erfsfm.common.files import unfinished_name, write_atomically
-from slam.errors import RunError
 from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
 from slam.results.schema import MetricsFile
-from slam.storage.files import KEYFRAMES_PART
-from slam.storage.json_file import read_json
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import KEYFRAMES_PART
+from slam.runtime.storage.json_file import read_json
 
 logger = logging.getLogger(__name__)
 

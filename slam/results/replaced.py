@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from slam.errors import RunError, TrajectoryError
+from slam.formats.trajectory import read_trajectory
 from slam.results.output import refuse_file_of_run
-from slam.trajectory import read_trajectory
+from slam.runtime.errors import RunError, TrajectoryError
 
 _TRAJECTORIES = (".txt", ".tum", ".kitti")
 

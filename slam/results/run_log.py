@@ -39,7 +39,7 @@ class RunLog(logging.Handler):
     def failed(self, reason: str) -> None:
         """Write the reason of a failure to the file alone: the caller gets the exception."""
         message = f"the run failed: {reason}"
-        self.handle(logging.LogRecord("slam.run", logging.ERROR, __file__, 0, message, None, None))
+        self.handle(logging.LogRecord("slam.commands.run.run", logging.ERROR, __file__, 0, message, None, None))
 
     def close(self) -> None:
         """Close the file."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from slam.config import ScaleMode
+from slam.config.sections import ScaleMode
 
 Count = Annotated[int, Field(ge=0)]
 

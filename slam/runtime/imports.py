@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import Thread
 from types import ModuleType
 
-from slam.errors import DownloadError, SequenceError, SlamError
+from slam.runtime.errors import DownloadError, SequenceError, SlamError
 
 
 @functools.cache

@@ -13,17 +13,17 @@ from erfsfm.common.readers.camera_file import camera_of
 from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.numbering import by_name
 from erfsfm.common.readers.scan import measured_points
-from slam import se3
-from slam.errors import SequenceError
+from slam.formats.trajectory import nearest_pairs
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_feather
-from slam.se3 import FloatArray
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_stamps
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_pairs
 
 _CAMERA = "ring_front_center"
 _IMAGES, _SCANS = f"sensors/cameras/{_CAMERA}", "sensors/lidar"

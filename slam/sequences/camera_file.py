@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile, camera_of, read_camera_file
-from slam.errors import SequenceError, sequence_errors
+from slam.runtime.errors import SequenceError, sequence_errors
 
 DEFAULT_FPS = 10.0
 _FOV = re.compile(r"fov=(?P<fov>[\d.]+)(?:,fps=(?P<fps>[\d.]+))?")

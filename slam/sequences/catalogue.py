@@ -10,8 +10,8 @@ from pathlib import Path
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
-from slam.errors import SequenceError, sequence_errors
 from slam.frames import Sequence
+from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
@@ -100,8 +100,8 @@ def sequence_names(dataset: Path) -> list[str]:
 
 def _open_embedded() -> SourcedSequence:
     # rendering needs Open3D, which is slow to import
-    from slam.sequences.simulation.sequence import SimulatedSequence
-    from slam.sequences.simulation.street import SimulationOptions
+    from slam.sequences.simulated import SimulatedSequence
+    from slam.simulation.street import SimulationOptions
 
     return SimulatedSequence(SimulationOptions(route="loop", frames=EMBEDDED_FRAMES, seed=EMBEDDED_SEED))
 

@@ -7,9 +7,9 @@ import logging
 import numpy as np
 
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
-from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Frame, Intrinsics, Sequence
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.images import MAX_GAP_FRAMES
 from slam.sequences.recording import MAX_GAP_S, require_frame

@@ -10,7 +10,7 @@ import numpy as np
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import read_values
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 KITTI_PER_METRE = 256.0
 

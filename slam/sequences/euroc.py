@@ -15,9 +15,9 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.numbering import by_table
 from erfsfm.common.yaml_file import parse_yaml
-from slam import se3
-from slam.errors import SequenceError
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener

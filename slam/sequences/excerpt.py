@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from slam.errors import SequenceError
 from slam.frames import Frame, Sequence
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.recording import Source, labels, require_frame
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from erfsfm.common.readers.folder import image_folder, recording_name
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import NumberedFiles, by_name
-from slam.errors import SequenceError
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.files import read_text
-from slam.errors import SequenceError
-from slam.geodesy import GpsTrack
-from slam.se3 import FloatArray
+from slam.geometry.geodesy import GpsTrack
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 
 _COLUMNS = ("stamp", "latitude", "longitude", "altitude")
 _DAY_S = 86400.0

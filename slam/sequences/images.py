@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from erfsfm.common.readers.images import first_usual, read_image
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Image
+from slam.runtime.errors import MissingFrameError, SequenceError
 
 MAX_GAP_FRAMES = 100
 

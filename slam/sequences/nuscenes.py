@@ -13,16 +13,16 @@ import numpy as np
 from erfsfm.common.readers.camera_file import camera_of
 from erfsfm.common.readers.numbering import by_table
 from erfsfm.common.readers.scan import read_velodyne
-from slam import se3
-from slam.errors import SequenceError
-from slam.se3 import FloatArray
+from slam.formats.trajectory import nearest_stamps
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_short_gaps, require_stamps
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_stamps
 
 _CAMERA, _LIDAR = "CAM_FRONT", "LIDAR_TOP"
 _TABLES = "v1.0-*"

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.files import read_text
-from slam import se3
-from slam.errors import SequenceError
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 
 _ROTATION_TOLERANCE = 0.01  # 7-Scenes writes seven digits, ScanNet six
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from slam import se3
-from slam.errors import SequenceError
 from slam.frames import runs
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 
 logger = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.errors import SequenceError, sequence_errors
 from slam.frames import Frame, Image, Intrinsics
-from slam.se3 import FloatArray, is_se3
+from slam.geometry.se3 import FloatArray, is_se3
+from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.gps import FASTEST_M_S

@@ -11,7 +11,7 @@ from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.numbering import by_name
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import Sized, own_camera
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles

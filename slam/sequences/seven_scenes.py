@@ -10,7 +10,7 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import by_table
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles

@@ -12,8 +12,9 @@ import numpy as np
 from erfsfm.common.files import read_text
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.errors import SequenceError
-from slam.se3 import FloatArray
+from slam.formats.trajectory import nearest_stamps, read_trajectory
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, find_camera_file
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles
@@ -21,7 +22,6 @@ from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near
 from slam.sequences.recording import RecordedSequence, Source, require_stamps
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_stamps, read_trajectory
 
 INDEX_FILE = "rgb.txt"
 _DEPTH_INDEX = "depth.txt"

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.depth_sampling import sampled_depth
-from slam.errors import SequenceError
-from slam.frames import DepthMap, Image, Intrinsics, Sequence
-from slam.se3 import FloatArray
+from slam.frames import DepthMap, Image, Intrinsics, Sequence, sampled_depth
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.recording import ImageSource, RecordedSequence
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from erfsfm.common.readers.folder import clip_name, video_name
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, VideoFrames, list_videos
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.recording import RecordedSequence, Source, uniform_stamps

@@ -32,9 +32,9 @@ import yaml
 from onnx import TensorProto, helper
 
 import erfsfm.cli
-import slam.cli
+import slam.commands.cli
 from erfsfm.networks.presets import build
-from slam.batch.manifest import drives_of
+from slam.commands.batch.manifest import drives_of
 from slam.frames import Intrinsics
 from slam.sequences.catalogue import open_sequence
 
@@ -82,15 +82,15 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
         r"--config default-gpu ",
         "it wants hours of labels, and a GPU; tests/erfsfm/training/test_pack.py packs small data",
     ),
-    (r"^erfsfm-slam download ", "it downloads; tests/slam/downloads has a server"),
-    (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/calibration renders them"),
+    (r"^erfsfm-slam download ", "it downloads; tests/slam/commands/downloads has a server"),
+    (r"^erfsfm-slam calibrate ", "it wants images of a board; tests/slam/commands/calibration renders them"),
     (r"--truth many-views", "it wants a drive; tests/erfsfm/evaluation/test_many_view_truth.py has a short one"),
     (r"depth_page.py", "it wants drive 0013 and a street of 160 frames"),
-    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/live has folders and videos that go on"),
-    (r"slam_node.py", "rclpy is on no package index; tests/slam/live runs its callbacks"),
-    (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/batch does"),
+    (r"^erfsfm-slam live ", "it wants a camera; tests/slam/commands/live has folders and videos that go on"),
+    (r"slam_node.py", "rclpy is on no package index; tests/slam/commands/live runs its callbacks"),
+    (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
-    (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/localisation has short ones"),
+    (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/commands/localisation has short ones"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
 if importlib.util.find_spec("rerun") is None:
@@ -188,7 +188,7 @@ def call(command: str) -> None:
         finished = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         assert finished.returncode == 0, finished.stdout + finished.stderr
         return
-    main = {"erfsfm": erfsfm.cli.main, "erfsfm-slam": slam.cli.main}[program]
+    main = {"erfsfm": erfsfm.cli.main, "erfsfm-slam": slam.commands.cli.main}[program]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [program, *arguments])
         try:
@@ -339,7 +339,7 @@ UsageError = typer.BadParameter.__bases__[0]  # typer has its own click
 def understood(command: str) -> None:
     """Read the words of a command line as its program does, and do nothing."""
     name, *words = shlex.split(command)
-    reader: Any = typer.main.get_command({"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.cli.app}[name])
+    reader: Any = typer.main.get_command({"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}[name])
     while hasattr(reader, "commands"):
         name, *words = words
         reader = reader.commands[name]

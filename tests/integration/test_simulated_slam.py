@@ -13,21 +13,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam import run_slam, se3
-from slam.config import load_config
+from slam import run_slam
+from slam.config.sections import load_config
 from slam.evaluation.map import pose_similarity
 from slam.evaluation.trajectory import trajectory_metrics
+from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.frames import Frame
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import ESSENTIAL_SOURCE
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.se3 import FloatArray
 from slam.sequences.excerpt import Excerpt
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions, write_kitti_root
-from slam.trajectory import Trajectory, read_trajectory
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions, write_kitti_root
 
 FACTOR = 0.2  # unscaled lengths per metre
 NOISE = {"rotation_sigma": np.deg2rad(0.3), "translation_relative_sigma": 0.05, "depth_relative_sigma": 0.03}

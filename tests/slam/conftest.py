@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam.formats.trajectory import Trajectory
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.results.folder import RunFolder
-from slam.se3 import FloatArray, chain, from_rotation_vector
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
-from slam.trajectory import Trajectory
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 MakeRun = Callable[..., RunFolder]
 

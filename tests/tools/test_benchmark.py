@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slam.formats.trajectory import Trajectory
+from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
-from slam.se3 import from_rotation_vector, invert
-from slam.trajectory import Trajectory
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

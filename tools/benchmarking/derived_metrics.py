@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.comparison import is_metric, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.results.summary import null
-from slam.se3 import FloatArray, invert, rotation_angle
 
 FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
 

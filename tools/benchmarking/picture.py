@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from slam.results.folder import RunFolder
-from slam.results.plots import draw_trajectories, trajectories_of
-from slam.storage.files import write_atomically
+from slam.results.report.plots import draw_trajectories, trajectories_of
+from slam.runtime.storage.files import write_atomically
 
 SIDE_IN = 1.9
 DPI = 90

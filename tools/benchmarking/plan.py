@@ -159,8 +159,8 @@ def worlds(
 
     ``truth`` is what is written beside the images.
     """
-    from slam.sequences.simulation.hazards import Hazard
-    from slam.sequences.simulation.street import VERSION
+    from slam.simulation.hazards import Hazard
+    from slam.simulation.street import VERSION
 
     every_hazard, beside = ",".join(get_args(Hazard)), "".join(f"-{kind}" for kind in truth)
     flags = [f"--{kind}" for kind in truth]

@@ -20,10 +20,10 @@ from benchmarking import plan
 from benchmarking.derived_metrics import derive_metrics
 from benchmarking.plan import BenchmarkSequence, Job
 
-from slam.batch import cluster
-from slam.batch.cluster import Spread
+from slam.commands.batch import cluster
+from slam.commands.batch.cluster import Spread
 from slam.results.comparison import failure
-from slam.storage.files import write_atomically
+from slam.runtime.storage.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on

@@ -20,14 +20,14 @@ from tf2_ros import TransformBroadcaster
 
 from erfsfm.common.errors import ErfsfmError
 from slam import Slam
-from slam.config import load_config
-from slam.errors import SlamError
+from slam.config.sections import load_config
+from slam.formats.trajectory import Trajectory, write_tum
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SlamError
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.ros.messages import camera_file_of, image_of
 from slam.sequences.undistortion import Undistortion
-from slam.trajectory import Trajectory, write_tum
 
 T_MAP_WORLD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 PARAMETERS = {

@@ -1,4 +1,4 @@
-// What the map's viewer uses of three.js; bundled by `npm run bundle` into slam/results/viewer/three.min.js.
+// What the map's viewer uses of three.js; bundled by `npm run bundle` into slam/results/report/viewer/three.min.js.
 export {
   BufferAttribute, BufferGeometry, Line, LineBasicMaterial, Mesh, MeshBasicMaterial, PerspectiveCamera, Scene, Vector3,
   WebGLRenderer,

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from slam.config import LengthConfig, ScaleMode
+from slam.config.sections import LengthConfig, ScaleMode
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -21,8 +21,8 @@ from slam.frontend.scale.scale_estimate import MIN_FRAMES, ScaleEstimate, scale_
 from slam.frontend.scale.step_lengths import StepLengths, gather_evidence, solve_lengths
 from slam.frontend.step_table import links
 from slam.frontend.visual.motion import Motion
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray
 
 LengthUnit = Literal["metres", "camera heights", "the networks' own unit"]
 

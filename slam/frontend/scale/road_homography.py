@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import RoadConfig
+from slam.config.sections import RoadConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray
-from slam.storage.cache import Answer, GetOrCompute, without_cache
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray
+from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them

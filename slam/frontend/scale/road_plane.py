@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import ScaleConfig
+from slam.config.sections import ScaleConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 _POINTS = 1500
 _LEAST_POINTS = 50

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.config import ScaleConfig, ScaleMode
-from slam.errors import SlamError
+from slam.config.sections import ScaleConfig, ScaleMode
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SlamError
 
 _REFERENCE_FRAMES = 50  # number of first frames that mode reference compares
 _REJECTION_MADS = 3.0  # distance from the median beyond which a frame is left out, median absolute deviations

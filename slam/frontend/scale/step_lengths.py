@@ -18,10 +18,10 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
 
-from slam.config import LengthConfig
+from slam.config.sections import LengthConfig
 from slam.frames import Ends
 from slam.frontend.visual.motion import Motion
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 _ITERATIONS = 20
 _HUBER_ITERATIONS = 5

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap
-from slam.robust import weighted_median
-from slam.se3 import FloatArray
+from slam.geometry.robust import weighted_median
+from slam.geometry.se3 import FloatArray
 
 # learned depth is counted in half octaves, in the unit of the networks
 _DEPTHS = 2.0 ** np.arange(-6.0, 9.0, 0.5)

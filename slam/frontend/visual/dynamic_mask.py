@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 _CELL_PX = 8.0
 _SPREAD_CELLS = 1.5

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
-from slam.resection import consensus, ransac_order
-from slam.se3 import FloatArray, nearest_rotation
+from slam.geometry.resection import consensus, ransac_order
+from slam.geometry.se3 import FloatArray, nearest_rotation
 
 _TRIMMINGS = 4
 _RESECTIONS = 200

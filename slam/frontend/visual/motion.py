@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.frames import Ends, RelativePose
 from slam.frontend.visual.step_noise import StepNoise
-from slam.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, invert, make
 
 _LEAST_RELATIVE_SIGMA = 1e-3
 

@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray
 
 _STEPS_KEPT = 100
 _LEAST_STEPS = 10

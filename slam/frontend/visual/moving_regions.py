@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 # side of the cells that connect corners, pixels: some two spacings of corners
 _CELL_PX = 24.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
@@ -39,10 +39,10 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimate,
     TwoViewEstimator,
 )
-from slam.resection import consensus, refine
-from slam.robust import MAD_TO_SIGMA
-from slam.se3 import FloatArray, invert, make
-from slam.storage.cache import GetOrCompute, without_cache
+from slam.geometry.resection import consensus, refine
+from slam.geometry.robust import MAD_TO_SIGMA
+from slam.geometry.se3 import FloatArray, invert, make
+from slam.runtime.storage.cache import GetOrCompute, without_cache
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_SOURCE = "essential"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.storage.cache import Given
+from slam.runtime.storage.cache import Given
 
 _NEAREST = 1e-6
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.frames import Ends
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from slam.frontend.visual.epipolar import UnitRelativePose, cross
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 # hat(w) row by row, by each component of w
 _HATS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)

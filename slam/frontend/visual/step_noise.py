@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.config import GeometryConfig
-from slam.robust import mad_sigmas
-from slam.se3 import FloatArray, invert
+from slam.config.sections import GeometryConfig
+from slam.geometry.robust import mad_sigmas
+from slam.geometry.se3 import FloatArray, invert
 
 _LEAST_STEPS = 20
 # a third difference of white noise has 1 + 9 + 9 + 1 times its variance

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Grey
 from slam.frontend.visual.predicted_flow import Pixels, PredictedFlow
-from slam.se3 import FloatArray
-from slam.storage.cache import Answer, GetOrCompute, without_cache
+from slam.geometry.se3 import FloatArray
+from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2

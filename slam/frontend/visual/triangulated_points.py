@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.robust import mad_sigma, weighted_median
-from slam.se3 import FloatArray
+from slam.geometry.robust import mad_sigma, weighted_median
+from slam.geometry.se3 import FloatArray
 
 _LEAST_COMMON = 12
 

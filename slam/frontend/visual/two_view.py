@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
     triangulated_depth,
@@ -25,9 +25,9 @@ from slam.frontend.visual.epipolar import (
 from slam.frontend.visual.motion_history import MotionHistory, MotionPrior
 from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
-from slam.robust import mad_sigma, weighted_median
-from slam.se3 import FloatArray
-from slam.storage.cache import Answer, GetOrCompute, Given, without_cache
+from slam.geometry.robust import mad_sigma, weighted_median
+from slam.geometry.se3 import FloatArray
+from slam.runtime.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration

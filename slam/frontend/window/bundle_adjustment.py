@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.window.projection import LEAST_DEPTH as _LEAST_DEPTH
-from slam.frontend.window.projection import pixel_jacobian
 from slam.frontend.window.reduced_system import Part, solve_sum
-from slam.se3 import FloatArray, apply, make
+from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
+from slam.geometry.projection import pixel_jacobian
+from slam.geometry.se3 import FloatArray, apply, make
 
 _FIRST_DAMPING = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from slam.frames import Intrinsics
-from slam.frontend.window.projection import LEAST_DEPTH, pixel_jacobian
-from slam.resection import consensus
-from slam.robust import mad_sigma
-from slam.se3 import FloatArray, apply, from_rotation_vector, make
+from slam.geometry.projection import LEAST_DEPTH, pixel_jacobian
+from slam.geometry.resection import consensus
+from slam.geometry.robust import mad_sigma
+from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, make
 
 MIN_POINTS = 20  # least number of points that give a camera its pose
 INLIER_PX = 3.0  # residual of an inlier of a camera's pose, pixels

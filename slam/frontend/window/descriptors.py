@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Grey
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 Descriptors = NDArray[np.uint8]
 

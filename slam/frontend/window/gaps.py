@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.frames import RelativePose, runs
 from slam.frontend.gap_interpolation import equal_step
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
 
 
 def led_through(

@@ -24,7 +24,7 @@ from slam.frontend.visual.epipolar import (
 )
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.window.flow import Pixels
-from slam.se3 import FloatArray, make, rotation_angle
+from slam.geometry.se3 import FloatArray, make, rotation_angle
 
 _LEAST_POINTS = 40
 _LEAST_RATIO = 0.5

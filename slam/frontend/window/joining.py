@@ -14,7 +14,7 @@ from slam.frames import Intrinsics
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise
 from slam.frontend.window.local_map import OUTLIER_PX, LocalMap, TrackIds, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame
-from slam.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)
 

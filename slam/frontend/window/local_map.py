@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import WindowConfig
+from slam.config.sections import WindowConfig
 from slam.frames import DepthMap, Grey, Intrinsics
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.window.descriptors import Descriptors
 from slam.frontend.window.flow import Pixels, flow, new_corners
-from slam.frontend.window.triangulation import triangulate
-from slam.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.triangulation import triangulate
 
 TrackIds = NDArray[np.int64]
 

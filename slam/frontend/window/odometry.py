@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config import WindowConfig
+from slam.config.sections import WindowConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
@@ -27,7 +27,7 @@ from slam.frontend.window.local_map import (
     TrackIds,
     WindowKeyframe,
 )
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
 

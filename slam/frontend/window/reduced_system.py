@@ -10,7 +10,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
 
 Part = tuple[NDArray[np.int64], FloatArray]
 _MOST_DENSE = 150  # cameras: each of more shares points with few others only

@@ -13,7 +13,7 @@ from slam.frontend.visual.two_view import CORNER_CORRELATION
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
 from slam.frontend.window.odometry import Segment
-from slam.se3 import FloatArray, apply, invert
+from slam.geometry.se3 import FloatArray, apply, invert
 
 WINDOW_SOURCE = "window"
 _LEAST_DEPTHS = 20

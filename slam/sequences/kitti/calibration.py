@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from slam import se3
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 
 def moved_to_camera(T_any_cam0: FloatArray, T_camera_cam0: FloatArray) -> FloatArray:

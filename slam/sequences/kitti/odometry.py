@@ -16,9 +16,10 @@ from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CA
 from erfsfm.common.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_odometry_root, odometry_camera
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.scan import read_velodyne
-from slam.errors import SequenceError
+from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
@@ -34,7 +35,6 @@ from slam.sequences.recording import (
     require_short_gaps,
 )
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import read_trajectory
 
 
 def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.readers.kitti_oxts import VELOCITY_EAST, VELOCITY_NORTH, VELOCITY_UP
-from slam import se3
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 _EARTH_RADIUS_M = 6378137.0
 _RATES = slice(17, 20)

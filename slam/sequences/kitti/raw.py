@@ -22,10 +22,10 @@ from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, dri
 from erfsfm.common.readers.kitti_oxts import read_packet
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
 from erfsfm.common.readers.scan import read_velodyne
-from slam import se3
-from slam.errors import SequenceError
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles

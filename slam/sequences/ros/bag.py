@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_rosbags
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")

@@ -15,9 +15,10 @@ import numpy as np
 
 from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.images import first_usual
-from slam.errors import SequenceError
+from slam.formats.trajectory import nearest_pairs
 from slam.frames import Image
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import describe_unknown, poses_near
@@ -35,7 +36,6 @@ from slam.sequences.ros.messages import (
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
 from slam.sequences.undistortion import calibrated
-from slam.trajectory import nearest_pairs
 
 logger = logging.getLogger(__name__)
 

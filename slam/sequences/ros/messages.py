@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CameraFile, camera_of
 from erfsfm.common.readers.images import decode_image, eight_bits
-from slam.errors import SequenceError
 from slam.frames import Image
-from slam.se3 import FloatArray
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SequenceError
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, POINT_CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.se3 import FloatArray, invert
+from slam.geometry.se3 import FloatArray, invert
 from slam.sequences.poses import poses_of
 from slam.sequences.ros.bag import Bag
 

@@ -12,7 +12,7 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import SnippetDraws
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 SIZE = (64, 208)
 

@@ -20,7 +20,7 @@ from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherCo
 from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
 from erfsfm.data.splits import overlapping
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.street import SimulatedStreet, SimulationOptions
 
 FRAMES = 9
 

@@ -5,7 +5,7 @@ import pytest
 
 from erfsfm.mvs.flow import combine, guided_flow, measure, rays, triangulate
 from erfsfm.mvs.projection import Projection
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+from slam.simulation.street import SimulatedStreet, SimulationOptions
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.errors import SlamError
 from slam.evaluation.coverage import coverage, squared_bound
 from slam.frames import LOOP_SOURCE, RelativePose
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import SlamError
 
 SIGMAS = np.repeat([0.003, 0.03], 3)
 COUNT = 3000

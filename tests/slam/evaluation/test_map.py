@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam import se3
 from slam.evaluation.map import compare, pose_similarity, statistics
 from slam.evaluation.surface import Indices, Mask, Surface, accumulated, backprojected, stretches
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 HEIGHT_M = 1.65
 CELL_M = 0.05

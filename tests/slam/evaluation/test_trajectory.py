@@ -13,10 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors
-from slam import se3
 from slam.evaluation.trajectory import ALIGNMENTS, align, exceeded, trajectory_metrics
-from slam.se3 import FloatArray
-from slam.trajectory import Trajectory, read_trajectory
+from slam.formats.trajectory import Trajectory, read_trajectory
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 A_KEYS = {"ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale"}
 SHAPE = {
@@ -231,7 +231,7 @@ def test_evo_writes_nothing_to_the_home_folder(tmp_path: Path) -> None:
     program = (
         "import sys, numpy as np\n"
         "from slam.evaluation.trajectory import trajectory_metrics\n"
-        "from slam.trajectory import Trajectory\n"
+        "from slam.formats.trajectory import Trajectory\n"
         "assert 'evo' not in sys.modules and 'torch' not in sys.modules\n"
         "T = np.tile(np.eye(4), (9, 1, 1)); T[:, :3, 3] = np.random.rand(9, 3)\n"
         "t = Trajectory(np.arange(9.0), T)\n"

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from erfsfm.common.errors import ErfsfmError
-from slam.cli import main as slam_main
-from slam.errors import SlamError
+from slam.commands.cli import main as slam_main
+from slam.runtime.errors import SlamError
 
 MORE_MEMORY = 2**30  # a reader may take so much
 FEW = settings(max_examples=12, derandomize=True, deadline=None, database=None, suppress_health_check=[*HealthCheck])

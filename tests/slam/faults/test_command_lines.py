@@ -18,8 +18,8 @@ import typer.main
 
 from erfsfm.cli import app as erfsfm_app
 from erfsfm.cli import main as erfsfm_main
-from slam.cli import app as slam_app
-from slam.cli import main as slam_main
+from slam.commands.cli import app as slam_app
+from slam.commands.cli import main as slam_main
 
 HOSTILE = (
     *(

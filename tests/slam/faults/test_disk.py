@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from erfsfm.cli import main as erfsfm_main
-from slam.cli import main as slam_main
+from slam.commands.cli import main as slam_main
 from slam.pipeline import batch
 from slam.results.folder import RunFolder
 
@@ -301,7 +301,7 @@ import resource, sys
 limit = int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 sys.argv = sys.argv[2:]
-from slam.cli import main
+from slam.commands.cli import main
 main()
 """
 

@@ -28,17 +28,18 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import read_split_file
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise, read_pose_noise, write_pose_noise
-from slam import run_slam, se3
-from slam.config import load_config
+from slam import run_slam
+from slam.config.sections import load_config
 from slam.formats.g2o import check_g2o
 from slam.formats.ply import coloured_ply, read_ply, write_ply
+from slam.formats.trajectory import Trajectory, read_trajectory
+from slam.geometry import se3
 from slam.loops.places import Places
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.results.schema import LoopsFile, MetricsFile
+from slam.runtime.storage.cache import DiskCache
+from slam.runtime.storage.json_file import read_json
 from slam.sequences.catalogue import open_sequence
-from slam.storage.cache import DiskCache
-from slam.storage.json_file import read_json
-from slam.trajectory import Trajectory, read_trajectory
 
 
 @dataclass(frozen=True)

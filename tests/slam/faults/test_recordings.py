@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.batch.manifest import drives_of
-from slam.errors import MissingFrameError
+from slam.commands.batch.manifest import drives_of
+from slam.geometry import se3
+from slam.runtime.errors import MissingFrameError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.gps import read_gps
 

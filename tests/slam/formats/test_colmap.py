@@ -8,7 +8,7 @@ import numpy as np
 
 from slam.formats.colmap import write_colmap
 from slam.frames import Intrinsics
-from slam.se3 import FloatArray, apply, chain, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, apply, chain, from_rotation_vector, invert
 
 CAMERA = Intrinsics(416, 128, 230.5, 231.25, 207.0, 63.5)
 POINTS = np.array([[1.0, 0.5, 12.0], [-3.0, 1.5, 20.0], [0.25, -2.0, 9.0]])

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import RunError
 from slam.formats.ply import coloured_ply, read_ply, read_ply_points, write_ply
+from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 
 POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])

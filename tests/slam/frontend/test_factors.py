@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config import FrontendConfig, GeometryConfig
+from slam.config.sections import FrontendConfig, GeometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
@@ -16,7 +16,7 @@ from slam.frontend.failure import MeasurementFailure
 from slam.frontend.network_factors import NETWORK_SOURCE, STUDENT_T_DOF
 from slam.frontend.scale.metric_scale import Scale, StepLength
 from slam.frontend.visual.motion import Motion
-from slam.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 
 FRAMES = 12
 METRES = 4.0  # per unscaled length

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE, interpolate_gaps, network_steps
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.visual.motion import Motion
-from slam.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
+from slam.runtime.errors import SlamError
 
 COUNT = 40
 STEP = from_rotation_vector(np.array([0.0, 0.02, 0.0]), np.array([0.0, 0.0, 1.0]))

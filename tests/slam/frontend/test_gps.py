@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config import GpsConfig
+from slam.config.sections import GpsConfig
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gps import fixes_of, scale_by_gps
 from slam.frontend.scale.scale_estimate import ScaleEstimate
-from slam.geodesy import GpsTrack, LocalFrame
-from slam.se3 import FloatArray
+from slam.geometry.geodesy import GpsTrack, LocalFrame
+from slam.geometry.se3 import FloatArray
 
 SPEED, HZ = 1.4, 10.0
 CONFIG = GpsConfig()

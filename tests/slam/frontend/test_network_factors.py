@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from erfsfm.pose_noise import PoseNoise
-from slam import se3
-from slam.errors import SlamError
 from slam.frames import RelativePose, SnippetPoses
 from slam.frontend.network_factors import (
     UncalibratedNoise,
@@ -19,6 +17,8 @@ from slam.frontend.network_factors import (
     network_factors,
     without_measured,
 )
+from slam.geometry import se3
+from slam.runtime.errors import SlamError
 
 USUAL = UncalibratedNoise()
 

@@ -13,7 +13,7 @@ from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.se3 import FloatArray, invert, make
+from slam.geometry.se3 import FloatArray, invert, make
 
 SIGMA = np.deg2rad(0.02)
 STEPS = 40

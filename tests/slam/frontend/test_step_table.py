@@ -8,7 +8,7 @@ import pytest
 from slam.frames import Ends, RelativePose
 from slam.frontend.step_table import StepTable, links, path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
-from slam.se3 import from_rotation_vector
+from slam.geometry.se3 import from_rotation_vector
 
 
 def motion(first: int, last: int, length: float = 1.0, is_triangulated: bool = True) -> Motion:

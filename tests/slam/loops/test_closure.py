@@ -8,18 +8,18 @@ import json
 import numpy as np
 import pytest
 
-from slam.config import LoopsConfig, load_config
+from slam.config.sections import LoopsConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.closure import MOST_REJECTED, close_loops
 from slam.loops.descriptors import FeatureExtractor
 from slam.loops.verification import Loop
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.se3 import FloatArray, invert, rotation_angle
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions
 
 SIZE = (312, 96)
 FACTOR = 0.2

@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.config import LoopsConfig
+from slam.config.sections import LoopsConfig
 from slam.frames import LOOP_SOURCE, RelativePose
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector, invert
 from slam.loops.consistency import agreeing
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop
-from slam.se3 import FloatArray, chain, from_rotation_vector, invert
 
 THRESHOLDS = LoopThresholds.of_frames(LoopsConfig())
 SIGMAS = np.repeat([np.deg2rad(0.3), 0.2], 3)

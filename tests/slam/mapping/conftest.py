@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.config import MappingConfig
+from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
+from slam.geometry import se3
 from slam.mapping.map import TsdfMap
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam.config import MappingConfig
+from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.mapping.colours import evened
 from slam.mapping.filters import FILTERS, DepthFilters, DepthView

@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.config import MappingConfig
-from slam.errors import SlamError
+from slam.config.sections import MappingConfig
 from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Keyframe
+from slam.geometry import se3
 from slam.mapping.map import TsdfMap
+from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
-from slam.storage.spill import SpillFile
+from slam.runtime.storage.spill import SpillFile
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]

@@ -5,11 +5,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from slam.config import MappingConfig
-from slam.errors import RunError
+from slam.config.sections import MappingConfig
 from slam.mapping.store import TILE_BLOCKS, SubmapStore
 from slam.mapping.submap import BLOCK_SIDE, FOLDER, Submap, remove_submaps, submap_paths
 from slam.mapping.surface import MapSurface
+from slam.runtime.errors import RunError
 
 
 def test_submaps_merge_to_the_surface_of_one(street_map):

@@ -14,23 +14,23 @@ import pytest
 
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
-from slam import se3
-from slam.config import load_config
-from slam.errors import SlamError
+from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.frames import Frame, Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.odometry import STILL_SOURCE
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.growing import GrowingSequence
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.se3 import FloatArray
+from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions
-from slam.trajectory import Trajectory, write_kitti, write_tum
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions
 
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5

@@ -13,16 +13,16 @@ import pytest
 from erfsfm.model_record import find_weights
 from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
-from slam.config import load_config
-from slam.errors import RunError, SlamError
+from slam.config.sections import load_config
 from slam.frames import Frame
 from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.results import folder as run_folder
 from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError, SlamError
+from slam.runtime.storage.json_file import read_json
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
-from slam.storage.json_file import read_json
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 SAME = (
     *(f"trajectory_{name}.tum.txt" for name in ("network", "odometry", "optimised")),

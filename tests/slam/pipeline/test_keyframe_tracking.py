@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from slam import Slam
-from slam.config import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
+from slam.config.sections import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
+from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.checkpoint import SERIALISER
 from slam.pipeline.keyframe_tracking import decided, is_vehicle
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
-from slam.se3 import chain, from_rotation_vector
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
 assert _SPEC is not None

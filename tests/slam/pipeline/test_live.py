@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from slam import Slam
-from slam.config import SlamConfig, load_config
-from slam.errors import SlamError
+from slam.config.sections import SlamConfig, load_config
 from slam.frames import DepthMap, Frame, SnippetPoses
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions
+from slam.runtime.errors import SlamError
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions
 
 FACTOR = 0.2
 FRAMES = 250

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.config import SlamConfig, WindowConfig
+from slam.config.sections import SlamConfig, WindowConfig
 from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.odometry import WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, window_poses
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops import maps
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
 from slam.pipeline import map_closure
 from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
-from slam.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.sequences.catalogue import open_sequence
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config import SlamConfig, load_config
-from slam.errors import MissingFrameError, SequenceError
+from slam.config.sections import SlamConfig, load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.frames import Frame
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.doubts import doubled_frames
@@ -28,10 +28,10 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.reading import read_frame
 from slam.prediction.oracle import OracleNoise, OraclePredictor
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
-from slam.se3 import FloatArray
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions
 
 FRAMES = 60
 BAD = range(25, 35)

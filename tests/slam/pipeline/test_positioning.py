@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.config import load_config
-from slam.errors import ConfigError, SlamError
+from slam.config.sections import load_config
 from slam.frames import Image, Intrinsics
 from slam.frontend.failure import MeasurementFailure
-from slam.geodesy import GpsTrack, LocalFrame
+from slam.geometry import se3
+from slam.geometry.geodesy import GpsTrack, LocalFrame
+from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.se3 import FloatArray
+from slam.runtime.errors import ConfigError, SlamError
 from slam.sequences.recording import RecordedSequence
 
 FRAMES = 200

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config import DepthConfig
-from slam.errors import SlamError
+from slam.config.sections import DepthConfig
 from slam.frames import Frame
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers
+from slam.runtime.errors import SlamError
 
 HEIGHT, WIDTH = 12, 40
 

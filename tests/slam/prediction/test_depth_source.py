@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from slam.errors import SlamError
 from slam.frames import DepthMap, Frame, Predictor, SnippetPoses
 from slam.prediction.depth_source import Disparity, SourcedPredictor, at_size, disparity_of, known_only, mixed_sha256
+from slam.runtime.errors import SlamError
 
 HEIGHT, WIDTH = 40, 96
 # disparity of a road below a far wall, in the networks' unit

@@ -10,11 +10,11 @@ import numpy as np
 import onnx
 import pytest
 
-from slam.config import DepthConfig
-from slam.errors import SlamError
+from slam.config.sections import DepthConfig
 from slam.frames import Frame, Image
 from slam.prediction.onnx_depth import OnnxDepth
-from slam.storage.cache import CacheNamespace, DiskCache
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.cache import CacheNamespace, DiskCache
 
 MakeNetwork = Callable[..., Path]
 PLAIN: dict[str, Any] = {"kind": "depth", "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}

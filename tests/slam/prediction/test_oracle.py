@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from slam import se3
 from slam.frames import Frame, Predictor
+from slam.geometry import se3
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 
 IMAGE = np.zeros((40, 60, 3), np.uint8)

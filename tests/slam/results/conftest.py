@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from slam.formats.ply import Ply, coloured_ply, write_ply
+from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.results.map_view import MapViews, write_map_views
-from slam.trajectory import Trajectory
+from slam.results.report.map_view import MapViews, write_map_views
 
 HALF_M, STEP_M, GROUND_M = 80.0, 2.0, 1.65
 

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slam.config import MappingConfig, ScaleMode
+from slam.config.sections import MappingConfig, ScaleMode
+from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import LengthUnit, Scale
@@ -18,7 +19,6 @@ from slam.results.double_walls import double_walls_at_loops
 from slam.results.folder import RunFolder
 from slam.results.map import write_map
 from slam.runtime.timing import Stopwatch
-from slam.trajectory import Trajectory
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
 PASS = 11  # frames, a metre apart

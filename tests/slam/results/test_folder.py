@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import RunError
+from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
-from slam.trajectory import Trajectory
+from slam.runtime.errors import RunError
 
 MakeRun = Callable[..., RunFolder]
 

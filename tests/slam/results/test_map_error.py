@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.config import ScaleMode
-from slam.errors import SequenceError
+from slam.config.sections import ScaleMode
 from slam.frames import Sequence
 from slam.frontend.scale.metric_scale import LengthUnit, Scale
 from slam.frontend.scale.scale_estimate import ScaleEstimate
+from slam.geometry.se3 import FloatArray, apply
 from slam.results.map_error import find_truth, map_errors
-from slam.se3 import FloatArray, apply
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.recording import RecordedSequence
-from slam.sequences.simulation.sequence import SimulatedSequence
-from slam.sequences.simulation.street import SimulationOptions, write_kitti_root
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions, write_kitti_root
 
 OPTIONS = SimulationOptions("straight", frames=24, seed=702, width=312, height=96)
 

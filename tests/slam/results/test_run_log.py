@@ -25,7 +25,7 @@ def test_lines_from_before_the_folder_are_kept_and_failures_are_written_here_alo
     assert [line.split(" ", 2)[2] for line in lines] == [
         "INFO slam.test: checked",
         "INFO slam.test: measured",
-        "ERROR slam.run: the run failed: no space",
+        "ERROR slam.commands.run.run: the run failed: no space",
     ]
     assert "no space" not in caplog.text
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from slam.errors import SequenceError
 from slam.frames import Intrinsics
+from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
 
 IMAGES = Intrinsics(40, 24, 30, 30, 20, 12)

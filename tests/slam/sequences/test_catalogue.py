@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds, sequence_names
 
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.cli import main
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+from slam.commands.cli import main
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 Call = Callable[..., tuple[int, str]]
 SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]

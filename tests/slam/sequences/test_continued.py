@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import MissingFrameError, SequenceError
 from slam.frames import Sequence
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.continued import Continued, missing_between
 from slam.sequences.excerpt import Excerpt

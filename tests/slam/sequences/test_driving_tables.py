@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.errors import MissingFrameError, SequenceError
 from slam.runtime import imports
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 
 HALF = 0.5  # the quaternion wxyz (0.5, -0.5, 0.5, -0.5) turns a car's axes to a camera's that looks ahead

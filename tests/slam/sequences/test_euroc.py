@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.doctor import examine
-from slam.errors import MissingFrameError, SequenceError
+from slam.commands.doctor import examine
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
 
 FIRST_NS, STEP_NS, FRAMES = 1403715273262142976, 50_000_000, 6

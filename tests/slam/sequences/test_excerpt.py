@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt, frame_range
 from slam.sequences.poses import rebased

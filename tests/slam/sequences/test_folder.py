@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence
 
 

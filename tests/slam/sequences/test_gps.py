@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.gps import read_gps
 
 NMEA = """$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47

@@ -7,7 +7,7 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.numbering import by_name
-from slam.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.images import ImageFiles
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.doctor import examine
-from slam.errors import MissingFrameError
+from slam.commands.doctor import examine
+from slam.runtime.errors import MissingFrameError
 from slam.sequences import catalogue
 from slam.sequences.catalogue import open_sequence
 

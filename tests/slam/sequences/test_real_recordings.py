@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam import se3
+from slam.geometry import se3
 from slam.sequences.catalogue import open_sequence, sequence_names
 
 pytestmark = pytest.mark.data

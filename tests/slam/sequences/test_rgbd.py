@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.recording import RecordedSequence
 

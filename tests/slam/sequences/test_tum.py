@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.recording import RecordedSequence
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import camera_of
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_kinds
 from slam.sequences.undistortion import Undistortion
 

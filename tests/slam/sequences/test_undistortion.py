@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.errors import SequenceError
 from slam.frames import Intrinsics
+from slam.runtime.errors import SequenceError
 from slam.sequences.undistortion import Undistortion, calibrated
 
 WIDTH, HEIGHT = 320, 240

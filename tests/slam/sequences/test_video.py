@@ -11,7 +11,7 @@ import pytest
 from erfsfm.common.readers import video as reader
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.discovery import discover
-from slam.errors import SequenceError
+from slam.runtime.errors import SequenceError
 from slam.sequences import video
 from slam.sequences.catalogue import open_sequence, sequence_names
 from slam.sequences.continued import missing_between

@@ -5,7 +5,7 @@ import pytest
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti_calibration import CalibrationFile
-from slam import se3
+from slam.geometry import se3
 from slam.sequences.kitti.calibration import moved_to_camera
 
 

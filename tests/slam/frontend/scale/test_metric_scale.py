@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.config import LengthConfig
+from slam.config.sections import LengthConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
@@ -17,6 +16,7 @@ from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.frontend.visual.motion import Motion
+from slam.geometry import se3
 
 DOWN = np.array([0.0, 1.0, 0.0])
 HEIGHT_M = 1.65

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slam import se3
-from slam.config import RoadConfig
+from slam.config.sections import RoadConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale import road_homography
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
+from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = RoadConfig()

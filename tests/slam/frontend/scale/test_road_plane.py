@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from slam.config import ScaleConfig
+from slam.config.sections import ScaleConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter

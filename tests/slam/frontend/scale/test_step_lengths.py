@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csc_array
 
-from slam.config import LengthConfig
+from slam.config.sections import LengthConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.scale.step_lengths import StepEvidence, gather_evidence, marginals, solve_lengths
 from slam.frontend.visual.motion import Motion
-from slam.se3 import from_rotation_vector
+from slam.geometry.se3 import from_rotation_vector
 
 CONFIG = LengthConfig()
 STEPS = 200

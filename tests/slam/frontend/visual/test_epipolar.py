@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam import se3
 from slam.frames import Intrinsics
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -16,7 +15,8 @@ from slam.frontend.visual.epipolar import (
     unit_pose_by_essential,
     unit_pose_by_pnp,
 )
-from slam.se3 import FloatArray
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
 
 FOCAL_PX = 240.0
 LENGTH = 0.8

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam import se3
 from slam.frames import RelativePose
 from slam.frontend.visual.motion import Motion, pose_sigmas
 from slam.frontend.visual.step_noise import StepNoise
+from slam.geometry import se3
 
 NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
 ROTATION_SIGMAS, DIRECTION_SIGMAS = np.full(3, 2e-4), np.array([0.004, 0.004, 0.0])

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slam import se3
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual import odometry
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.step_noise import StepNoise
+from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
 CONFIG = GeometryConfig()

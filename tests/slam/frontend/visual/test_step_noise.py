@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas, neighbour_residual, rotation_jitter
-from slam.se3 import from_rotation_vector
+from slam.geometry.se3 import from_rotation_vector
 
 CONFIG = GeometryConfig()
 

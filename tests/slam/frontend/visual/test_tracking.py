@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.predicted_flow import PredictedFlow

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.config import GeometryConfig
+from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Matches, TwoViewEstimate, TwoViewEstimator
-from slam.sequences.simulation.street import SimulatedStreet, SimulationOptions
+from slam.geometry import se3
+from slam.simulation.street import SimulatedStreet, SimulationOptions
 
 CONFIG = GeometryConfig()
 FOCAL_PX = 240.0

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from slam.frames import Frame, Intrinsics
-from slam.se3 import FloatArray, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 
 INTRINSICS = Intrinsics(width=320, height=240, fx=290.0, fy=290.0, cx=159.5, cy=119.5)
 FAR, NEAR = 4.0, 1.8

@@ -2,8 +2,8 @@ import numpy as np
 
 from slam.frames import Intrinsics
 from slam.frontend.window.camera_pose import resect
-from slam.frontend.window.projection import pixel_jacobian
-from slam.se3 import FloatArray, apply, from_rotation_vector, rotation_angle
+from slam.geometry.projection import pixel_jacobian
+from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, rotation_angle
 
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 T_TRUE = from_rotation_vector(np.array([0.1, -0.2, 0.3]), np.array([0.2, 0.1, -0.3]))

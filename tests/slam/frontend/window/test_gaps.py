@@ -2,13 +2,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from slam.config import PoseGraphConfig
+from slam.config.sections import PoseGraphConfig
 from slam.frames import RelativePose
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.window.gaps import led_through
 from slam.frontend.window.relative_poses import WINDOW_SOURCE
-from slam.pose_graph import PoseGraph
-from slam.se3 import FloatArray, from_rotation_vector, invert
+from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
+from slam.graph.pose_graph import PoseGraph
 
 
 def relative(T_world_camera: FloatArray, first: int, last: int, sigma: float, source: str) -> RelativePose:

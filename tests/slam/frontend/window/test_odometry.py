@@ -4,13 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.config import WindowConfig
+from slam.config.sections import WindowConfig
 from slam.frames import TrackingEvent
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses, window_poses
-from slam.se3 import FloatArray, rotation_angle, umeyama
-from slam.storage.serialisation import Serialiser
+from slam.geometry.se3 import FloatArray, rotation_angle, umeyama
+from slam.runtime.storage.serialisation import Serialiser
 
 _SPEC = importlib.util.spec_from_file_location("room", Path(__file__).with_name("room.py"))
 assert _SPEC is not None

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.errors import MissingFrameError, SequenceError, SlamError
+from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
 from slam.sequences.catalogue import open_sequence
 
 

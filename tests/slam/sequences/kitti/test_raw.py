@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam import se3
-from slam.errors import MissingFrameError, SequenceError
+from slam.geometry import se3
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_names
 from slam.sequences.kitti.raw import drive_sources
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.doctor import examine
-from slam.errors import SequenceError
+from slam.commands.doctor import examine
 from slam.frames import Intrinsics
 from slam.runtime import imports
+from slam.runtime.errors import SequenceError
 from slam.sequences.catalogue import open_sequence, sequence_names
 
 CAMERA = Intrinsics(40, 24, 30, 30, 20, 12)

@@ -1,0 +1,86 @@
+"""The verb ``batch`` of the command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slam.runtime.errors import RunError, SlamError
+from slam.runtime.progress import progress_bar
+from slam.runtime.storage.files import from_anywhere
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+verbs = typer.Typer()
+
+
+@verbs.command()
+def batch(
+    drives: Annotated[Path, typer.Argument(help="a manifest (YAML or CSV), or a data set")],
+    output: Annotated[Path, typer.Option(help="holds a run folder for each drive, drives.csv and index.html")],
+    sequence: Annotated[list[str] | None, typer.Option("--sequence", "-s", help="of the data set; repeat")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="drives at a time on this machine")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler in place of this machine")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="threads of a drive; default: the cores of this machine by the workers")
+    ] = None,
+    memory: Annotated[float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")] = 0.0,
+    weights: Annotated[str | None, typer.Option(help="as for run")] = None,
+    config: Annotated[str | None, typer.Option(help="as for run")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of every drive")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")] = 0,
+    device: Annotated[str, typer.Option(help="where the networks run: auto, cpu or cuda")] = "auto",
+) -> None:
+    """Many drives at once, each in a process of its own. Started again, it runs what is not whole.
+
+    Example: erfsfm-slam batch drives.yaml --workers 4 --output drives
+    """
+    from slam.commands.batch.cluster import workers as dask_workers
+    from slam.commands.batch.execution import Limits, run_drives
+    from slam.commands.batch.manifest import drives_of
+    from slam.commands.batch.summary import CSV, PAGE, check_output, failure_table, summary_table, write_summary
+
+    if memory and not Path("/proc/self/statm").exists():
+        raise SlamError("--memory needs Linux: leave it out here")
+    options = [word for value in overrides or [] for word in ("--set", _seen_from_here(value))]
+    if weights is not None:
+        options += ["--weights", from_anywhere(weights) if Path(weights, "model.yaml").is_file() else weights]
+    if config is not None:
+        options += ["--config", from_anywhere(config) if Path(config).is_file() else config]
+    options += ["--frames", frames] if frames is not None else []
+    options += ["--seed", str(seed), "--device", device]
+    planned = drives_of(drives, sequence or ["all"], options)
+    each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
+    check_output(output)
+    output.mkdir(parents=True, exist_ok=True)
+    with dask_workers(min(workers, len(planned)), scheduler) as spread, progress_bar() as progress:
+        outcomes = run_drives(planned, output, Limits(each, memory), spread, progress)
+    write_summary(output, outcomes)
+    _print(summary_table(outcomes))
+    kept = sum(outcome.status == "kept" for outcome in outcomes)
+    failed = sum(outcome.status == "failed" for outcome in outcomes)
+    typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / PAGE}, {output / CSV}")
+    if failed:
+        _print(failure_table(outcomes))
+        first = next(outcome for outcome in outcomes if outcome.status == "failed")
+        rest = "; the others are whole" if failed < len(outcomes) else ""
+        raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")
+
+
+def _seen_from_here(override: str) -> str:
+    """The path of ``depth.source`` holds in the folder of a drive, too."""
+    kind, colon, path = override.partition(":")
+    return f"{kind}:{from_anywhere(path)}" if kind.startswith("depth.source=") and colon else override
+
+
+def _print(table: Table) -> None:
+    from rich.console import Console
+
+    on_terminal = sys.stdout is not None and sys.stdout.isatty()
+    Console(width=None if on_terminal else 200).print(table)

@@ -1,0 +1,132 @@
+"""All drives of a batch in one CSV file and one page."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from slam.commands.batch.execution import Outcome
+from slam.results.comparison import METRES, MISSING, lookup, unit_of_lengths, written
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+CSV = "drives.csv"
+PAGE = "index.html"
+_ALIGNED = ("trajectories", "optimised", "align")
+_FIRST = ("drive", "status", "reason")
+# column, its place in metrics.json (but the unit of lengths), decimals on the page
+_COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
+    ("sequence", ("sequence", "name"), 0),
+    ("frames", ("sequence", "frames"), 0),
+    ("length_m", ("sequence", "length_m"), 0),
+    ("scale", ("scale", "mode"), 0),
+    ("unit", ("unit",), 0),
+    ("ate_6dof_m", (*_ALIGNED, "6dof", "ate_rmse_m"), 3),
+    ("ate_7dof_m", (*_ALIGNED, "7dof", "ate_rmse_m"), 3),
+    ("t_rel_percent", (*_ALIGNED, "7dof", "t_rel_percent"), 2),
+    ("r_rel_deg_per_100m", (*_ALIGNED, "7dof", "r_rel_deg_per_100m"), 3),
+    ("interpolated_frames", ("sequence", "bridged_frames"), 0),
+    ("loops", ("loops", "accepted"), 0),
+    ("map_triangles", ("map", "triangles"), 0),
+    ("leak", ("provenance", "leak"), 0),
+    ("seconds", ("timing", "seconds_total"), 1),
+    ("frames_per_second", ("timing", "frames_per_second"), 1),
+    ("peak_rss_mb", ("timing", "peak_rss_mb"), 0),
+)
+_TEMPLATES = Environment(loader=PackageLoader("slam", "commands/batch"), autoescape=True, undefined=StrictUndefined)
+
+
+def check_output(output: Path) -> None:
+    """Check that a batch may be written to a folder.
+
+    Raises:
+        RunError: a file, or a folder of other files with the names of a summary.
+    """
+    if output.exists() and not output.is_dir():
+        raise RunError(f"{output} is a file: give a folder as --output")
+    for name, mark in ((CSV, ",".join(_FIRST)), (PAGE, "<title>erfsfm-slam: ")):
+        path = output / name
+        if path.is_file() and mark.encode() not in path.read_bytes():
+            raise RunError(f"{path} is none of ours and would be replaced: choose another --output")
+
+
+def write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
+    """Write ``drives.csv`` and ``index.html``, each whole or not at all."""
+    rows = [_row(outcome) for outcome in outcomes]
+    names = [*_FIRST, *(name for name, _, _ in _COLUMNS)]
+
+    def fill(path: Path) -> None:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writer.writerows(rows)
+
+    write_atomically(output / CSV, fill, RunError)
+    page = _TEMPLATES.get_template("index.html.j2").render(
+        columns=[name for name, _, _ in _COLUMNS],
+        runs=[_cells(o, row, output) for o, row in zip(outcomes, rows) if o.status != "failed"],
+        failed=[(o.drive.name, o.reason) for o in outcomes if o.status == "failed"],
+    )
+    write_atomically(output / PAGE, lambda path: path.write_text(page, encoding="utf-8"), RunError)
+
+
+def summary_table(outcomes: Sequence[Outcome]) -> Table:
+    """The main numbers of the runs that are whole, for a terminal."""
+    from rich.table import Table
+
+    shown = ("frames", "length_m", "unit", "ate_6dof_m", "ate_7dof_m", "t_rel_percent", "seconds")
+    table = Table("drive", "status", *shown)
+    for outcome in outcomes:
+        if outcome.status != "failed":
+            row = _row(outcome)
+            cells = [written(row[name], decimals) for name, _, decimals in _COLUMNS if name in shown]
+            table.add_row(outcome.drive.name, outcome.status, *cells)
+    return table
+
+
+def failure_table(outcomes: Sequence[Outcome]) -> Table:
+    """The drives that failed, and why."""
+    from rich.table import Table
+
+    table = Table("failed", "reason")
+    for outcome in outcomes:
+        if outcome.status == "failed":
+            table.add_row(outcome.drive.name, outcome.reason)
+    return table
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    row: dict[str, Any] = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
+    metrics: dict[str, Any] = {}
+    if outcome.status != "failed":
+        metrics = RunFolder(outcome.folder).metrics()
+        metrics["unit"] = unit_of_lengths(metrics)
+    row |= {name: lookup(metrics, *place)[0] for name, place, _ in _COLUMNS}
+    return row if row["unit"] == METRES else row | {"ate_6dof_m": None}
+
+
+def _cells(outcome: Outcome, row: dict[str, Any], output: Path) -> tuple[str, str, list[str]]:
+    """Name, address of the report (empty without one), and numbers of a run."""
+    report = outcome.folder / "report.html"
+    address = quote(os.path.relpath(report, output.absolute())) if report.is_file() else ""
+    return outcome.drive.name, address, [_text(row[name], decimals) for name, _, decimals in _COLUMNS]
+
+
+def _text(value: Any, decimals: int) -> str:
+    return (
+        MISSING
+        if value is None
+        else {True: "yes", False: "no"}[value]
+        if isinstance(value, bool)
+        else written(value, decimals)
+    )

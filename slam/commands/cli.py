@@ -1,0 +1,290 @@
+"""The command line ``erfsfm-slam``."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from erfsfm import __version__
+from erfsfm.common import command_line
+from slam.commands.batch.cli import verbs as batch_verbs
+from slam.commands.calibration.cli import verbs as calibration_verbs
+from slam.commands.downloads.cli import verbs as download_verbs
+from slam.commands.exports.cli import verbs as export_verbs
+from slam.commands.live.cli import verbs as live_verbs
+from slam.commands.localisation.cli import verbs as localisation_verbs
+from slam.runtime.errors import SlamError
+from slam.runtime.progress import progress_bar
+from slam.runtime.terminal import print_table
+from slam.runtime.unused_options import UnusedDevice, UnusedSeed
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,  # markup would remove <...> or [...] from the help
+    pretty_exceptions_enable=False,
+    help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
+)
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
+DefaultSeed = Annotated[
+    int | None, typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or that of the old run")
+]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"erfsfm-slam {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options_of_all_verbs(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    dataset: Annotated[
+        str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
+    ] = None,
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+    ] = None,
+    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")] = "default",
+    config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
+    output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
+    ] = None,
+    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
+    continues: Annotated[
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
+    ] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None,
+    seed: DefaultSeed = None,
+    device: Device = "auto",
+    as_json: Json = False,
+) -> None:
+    """Trajectory, map and report of a sequence. Without options: the embedded simulated street.
+
+    Example: erfsfm-slam run --dataset KITTI --sequence 09
+    """
+    from slam.commands.run.run import run_slam
+
+    with progress_bar() as progress:
+        folder = run_slam(
+            dataset=dataset,
+            sequence=sequence,
+            camera=camera,
+            weights=weights,
+            config=config,
+            overrides=overrides or [],
+            frames=frames,
+            output=output,
+            seed=seed,
+            device=device,
+            progress=progress,
+            command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
+            cache=cache,
+            rerun=rerun,
+            continues=continues,
+            gps=gps,
+        )
+    metrics = folder.metrics()
+    if as_json:
+        typer.echo(json.dumps(metrics, indent=2))
+        return
+    _print_run(folder.path, metrics)
+
+
+@app.command()
+def evaluate(
+    paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders")],
+    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the two files")] = "auto",
+    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
+    as_json: Json = False,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Errors of trajectories or of whole runs.
+
+    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side.
+
+    Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
+    """
+    if all(path.is_dir() for path in paths):
+        if fail_over:
+            raise typer.BadParameter(
+                "a limit applies to two trajectory files, not to run folders", param_hint="--fail-over"
+            )
+        _evaluate_runs(paths, as_json)
+    elif len(paths) == 2:
+        _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)
+    else:
+        what = ", ".join(map(str, paths))
+        raise typer.BadParameter(f"give two trajectory files, or run folders that exist; got {what}")
+
+
+app.add_typer(export_verbs)
+app.add_typer(batch_verbs)
+app.add_typer(live_verbs)
+app.add_typer(calibration_verbs)
+app.add_typer(download_verbs)
+
+
+app.add_typer(localisation_verbs)
+
+
+@app.command()
+def simulate(
+    output: Annotated[Path, typer.Argument(help="the root to write")],
+    route: Annotated[str, typer.Option(help="loop, grid or straight")] = "loop",
+    frames: Annotated[int, typer.Option(help="10 frames a second, about 1 m apart; a loop needs 250 or more")] = 300,
+    seed: Seed = 0,
+    width: Annotated[int, typer.Option(help="pixels")] = 416,
+    height: Annotated[int, typer.Option(help="pixels")] = 128,
+    lidar: Annotated[bool, typer.Option("--lidar", help="write 64-beam scans")] = False,
+    depth: Annotated[bool, typer.Option("--depth", help="write exact depth maps")] = False,
+    hazards: Annotated[str, typer.Option(help="comma list of moving-cars, exposure, blur, stop, rain")] = "",
+    device: UnusedDevice = "auto",
+) -> None:
+    """A simulated street as a KITTI odometry root. Its ground truth is exact.
+
+    Example: erfsfm-slam simulate world --route grid --frames 600 --seed 600 --depth --lidar
+    """
+    from slam.simulation.street import SimulatedStreet, parse_options, write_kitti_root
+
+    street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards))
+    with progress_bar() as progress:
+        write_kitti_root(street, output, depth, lidar, lambda done: progress("frames", done, frames))
+    typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")
+
+
+@app.command()
+def plot(
+    runs: Annotated[list[Path], typer.Argument(help="run folders")],
+    what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
+    output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Figures of runs for a paper.
+
+    Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
+    """
+    from slam.results.folder import RunFolder
+    from slam.results.report.plots import plot_runs
+
+    plot_runs([RunFolder.open(path) for path in runs], what.split(","), output)
+    typer.echo(f"figure in {output}")
+
+
+@app.command()
+def config() -> None:
+    """The full default configuration as YAML.
+
+    Example: erfsfm-slam config > mine.yaml && erfsfm-slam run --config mine.yaml
+    """
+    from slam.config.sections import SlamConfig, dump_yaml
+
+    typer.echo(dump_yaml(SlamConfig()), nl=False)
+
+
+@app.command()
+def doctor(
+    dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
+) -> None:
+    """Check the installation. Missing parts come with what to do.
+
+    Example: erfsfm-slam doctor --dataset /data/kitti
+    """
+    from slam.commands.doctor import examine
+
+    for line in examine(dataset, camera):
+        typer.echo(line)
+
+
+def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
+    from slam.results.comparison import comparison_json, comparison_table
+    from slam.results.folder import RunFolder
+
+    runs = [RunFolder.open(path) for path in paths]
+    if as_json:
+        typer.echo(json.dumps(comparison_json(runs), indent=2))
+    else:
+        print_table(comparison_table(runs))
+
+
+def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
+    from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
+    from slam.formats.trajectory import associate, read_trajectory
+    from slam.results.terminal_table import metrics_table
+
+    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
+    metrics = trajectory_metrics(*pair)
+    if as_json:
+        typer.echo(json.dumps(metrics, indent=2))
+    else:
+        print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        for line in evo_commands(estimate, reference, format):
+            typer.echo(line)
+    broken = exceeded(metrics, limits)
+    if broken:
+        raise SlamError("; ".join(broken))
+
+
+def _print_run(path: Path, metrics: dict[str, Any]) -> None:
+    from slam.results.comparison import unit_notes
+    from slam.results.terminal_table import metrics_table
+
+    sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
+    known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
+    title = f"{sequence['name']}, scale {metrics['scale']['mode']}"
+    if sequence["length_m"] is None:
+        typer.echo(f"{title}: no errors, for {sequence['length_m_reason']}")
+    else:
+        print_table(metrics_table(known, title))
+    for note in unit_notes(metrics):
+        typer.echo(note)
+    for gap in sequence["bridged"]:
+        typer.echo(f"INTERPOLATED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
+    depth = "" if provenance["depth_source"] == "network" else f"; depth {provenance['depth_source']}"
+    typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}{depth}")
+    if provenance["leak"]:
+        typer.echo("LEAK: these weights were trained on frames of this sequence")
+    frames, before = sequence["frames"], sequence.get("continued_at", 0)
+    processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
+    seconds, per_second = timing["seconds_total"], timing["frames_per_second"]
+    report = path / "report.html"
+    typer.echo(
+        f"{processed} in {seconds:.1f} s ({per_second:.1f} a second); everything in {path}"
+        + (f", read {report}" if report.is_file() else "")
+    )
+
+
+def main() -> None:
+    """Run the command line: a known error becomes one line and exit code 1."""
+    terminal = logging.StreamHandler(sys.stderr)
+    terminal.setLevel(logging.WARNING)  # run.log has the rest
+    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", handlers=[terminal])
+    command_line.run(app, "erfsfm-slam")

@@ -1,0 +1,54 @@
+"""The verb ``download`` of the command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from slam.runtime.errors import DownloadError
+from slam.runtime.progress import progress_bar
+from slam.runtime.unused_options import UnusedDevice, UnusedSeed
+
+verbs = typer.Typer()
+
+
+@verbs.command()
+def download(
+    data_set: Annotated[Literal["kitti-odometry", "tum-rgbd"], typer.Argument(help="which")],
+    sequence: Annotated[str, typer.Option("--sequence", "-s", help="09, or freiburg1_xyz")],
+    to: Annotated[Path, typer.Option(help="folder that gets it")],
+    camera: Annotated[Literal["colour", "grey"], typer.Option(help="of KITTI")] = "colour",
+    lidar: Annotated[bool, typer.Option("--lidar", help="KITTI's scans as well")] = False,
+    accept_licence: Annotated[
+        bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
+    ] = False,
+    mirror: Annotated[str | None, typer.Option(help="address of the archives, in place of the official one")] = None,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """One sequence of a public data set from its official server.
+
+    Of KITTI's archives only the files of the sequence are fetched. Run again, an interrupted download goes on.
+
+    Example: erfsfm-slam download kitti-odometry --sequence 09 --to KITTI
+    """
+    from slam.commands.downloads import kitti, licences, tum
+
+    is_kitti = data_set == "kitti-odometry"
+    typer.echo(licences.KITTI if is_kitti else licences.TUM)
+    if not accept_licence:
+        if not sys.stdin.isatty():
+            raise DownloadError("the licence above is to be accepted: give --accept-licence")
+        if not typer.confirm("Do you accept it?"):
+            raise DownloadError("the licence was not accepted: nothing is downloaded")
+    with progress_bar() as progress:
+        if is_kitti:
+            server, is_grey = mirror or kitti.SERVER, camera == "grey"
+            count = kitti.download_kitti(sequence, to, server, is_grey, lidar, progress)
+            typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")
+        else:
+            folder = tum.download_tum(sequence, to, mirror or tum.SERVER, progress)
+            typer.echo(f"{folder}: erfsfm-slam run --dataset {folder}")

@@ -1,0 +1,77 @@
+"""Sequences of KITTI odometry, out of the archives that hold all of them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+from slam.commands.downloads.zip_members import ZipMembers
+from slam.runtime.errors import DownloadError
+
+SERVER = "https://s3.eu-central-1.amazonaws.com/avg-kitti"
+_WITH_POSES = 11  # sequences 00 to 10
+_SEQUENCES = 22
+_COLOUR, _GREY = ("data_odometry_color.zip", "image_2"), ("data_odometry_gray.zip", "image_0")
+_CALIBRATION, _POSES, _SCANS = "data_odometry_calib.zip", "data_odometry_poses.zip", "data_odometry_velodyne.zip"
+_NAME = re.compile(r"\d\d")
+
+Progress = Callable[[str, int, int], None]
+
+
+def download_kitti(
+    sequence: str, folder: Path, server: str, is_grey: bool, with_scans: bool, progress: Progress
+) -> int:
+    """Fetch one sequence as an odometry root: images of the left camera, calibration, times and poses.
+
+    What is there already is kept, so an interrupted download goes on.
+
+    Args:
+        sequence: ``00`` to ``21``; poses are public of the first eleven.
+        folder: gets ``dataset/sequences/NN`` and ``dataset/poses/NN.txt``.
+        server: address of the folder of the archives.
+        is_grey: the grey camera instead of the colour camera.
+        with_scans: LiDAR as well.
+        progress: called with (stage, done, total).
+
+    Returns:
+        The number of files.
+
+    Raises:
+        DownloadError: one line; files that are whole stay.
+    """
+    if not _NAME.fullmatch(sequence) or int(sequence) >= _SEQUENCES:
+        raise DownloadError(f"KITTI odometry has no sequence {sequence}: give 00 to {_SEQUENCES - 1}")
+    archive, camera = _GREY if is_grey else _COLOUR
+    home = f"dataset/sequences/{sequence}"
+    wanted: list[tuple[str, tuple[str, ...]]] = [(_CALIBRATION, (f"{home}/calib.txt", f"{home}/times.txt"))]
+    if int(sequence) < _WITH_POSES:
+        wanted.append((_POSES, (f"dataset/poses/{sequence}.txt",)))
+    wanted.append((archive, (f"{home}/{camera}/",)))
+    if with_scans:
+        wanted.append((_SCANS, (f"{home}/velodyne/",)))
+    parts = []
+    for name, prefixes in wanted:
+        source = ZipMembers(f"{server.rstrip('/')}/{name}")
+        parts.append((source, source.matching(*prefixes)))
+    _require_space(folder, [member for _, members in parts for member in members])
+    total, done = sum(len(members) for _, members in parts), 0
+    for source, members in parts:
+        for member in members:
+            source.fetch(member, folder)
+            done += 1
+            progress("files", done, total)
+    return total
+
+
+def _require_space(folder: Path, members: list[zipfile.ZipInfo]) -> None:
+    """Refuse before anything is fetched where the disk is too small for all."""
+    missing = sum(member.file_size for member in members if not (folder / member.filename).is_file())
+    folder.mkdir(parents=True, exist_ok=True)
+    free = shutil.disk_usage(folder).free
+    if missing > free:
+        raise DownloadError(
+            f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to"
+        )

@@ -1,0 +1,176 @@
+"""Parts of a run as files for other programs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from slam.commands.exports.map_file import has_map, map_file
+from slam.commands.exports.nerfstudio import interpolated, write_scene
+from slam.commands.exports.occupancy import occupancy_grid
+from slam.commands.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
+from slam.commands.exports.raster import height_raster, write_raster
+from slam.commands.exports.surface import prepared
+from slam.commands.exports.target import check_target
+from slam.formats.colmap import write_colmap
+from slam.formats.g2o import check_g2o
+from slam.formats.gltf import write_gltf
+from slam.formats.las import write_las
+from slam.formats.obj import write_obj
+from slam.formats.ply import Ply, read_ply, rotated, write_ply
+from slam.formats.ros_map import write_ros_map
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
+from slam.geometry import se3
+from slam.loops.places import PLACES, Places
+from slam.results.comparison import CAMERA_HEIGHTS, METRES, lookup, unit_of_lengths
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError
+from slam.runtime.storage.files import write_atomically
+
+Progress = Callable[[str, int, int], None]
+Writer = Callable[[Path, Ply], None]
+
+_WRITERS: dict[str, dict[str, Writer]] = {
+    "mesh": {".ply": write_ply, ".obj": write_obj, ".glb": write_gltf, ".gltf": write_gltf},
+    "cloud": {".ply": write_ply, ".las": write_las, ".laz": write_las},
+}
+
+
+def export(
+    folder: RunFolder,
+    what: str,
+    output: Path,
+    up: str = "y-down",
+    options: ExportOptions | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one part of a run, each file whole or not at all; missing parent folders are made.
+
+    The part is read whole and checked before anything is written.
+
+    Args:
+        folder: the run.
+        what: ``mesh`` (PLY, OBJ or glTF by the end of ``output``), ``cloud`` (PLY, LAS or LAZ), ``trajectory`` (the
+            optimised one: TUM where ``output`` ends in ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o),
+            ``colmap`` (a model in text form), ``nerfstudio`` (images and ``transforms.json``), ``raster`` (heights
+            and colours from above) or ``occupancy`` (a grid for ROS).
+        output: the file; for ``colmap``, ``nerfstudio`` and ``raster`` the folder.
+        up: ``y-down`` as the run has it; ``z``: x right, y ahead, z up; ``y-up``: x right, y up, z backwards. Cameras
+            keep their own axes, only the world is rotated.
+        options: what to do with the part on the way.
+        progress: called with (stage, done, total).
+
+    Returns:
+        What was written.
+
+    Raises:
+        SlamError: an option that is unknown or has no effect, a part that the run lacks or that is damaged, images
+            that are not found, or a file that cannot be written.
+    """
+    options = options or ExportOptions()
+    options.check(what, up)
+    check_target(folder, what, output)
+    if what in _WRITERS:
+        _export_map(folder, what, output, up, options, progress)
+    elif what == "trajectory":
+        write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
+        write(output, _trajectory(folder, up))
+    elif what == "graph":
+        source = folder.require("graph.g2o")
+        check_g2o(source)
+        write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
+    elif what == "colmap":
+        _export_colmap(folder, output, up, options, progress)
+    elif what == "nerfstudio":
+        cloud = _cloud(folder, up, options, progress)
+        write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
+    elif what == "raster":
+        _export_raster(folder, output, options, progress)
+    else:
+        return _export_occupancy(folder, output, options, progress)
+    return output
+
+
+def _export_map(
+    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress | None
+) -> None:
+    writers = _WRITERS[what]
+    write = writers.get(output.suffix.lower())
+    if write is None:
+        known = ", ".join(writers)
+        raise RunError(f"a {what} is written as {known}; got '{output.name}', give a name that ends in one of these")
+    with map_file(folder, what, progress) as source:
+        ply = read_ply(source)
+        if write is write_ply and up == "y-down" and options == ExportOptions():
+            write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
+        else:
+            write(output, _rotated(prepared(ply, options), up))
+
+
+def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress | None) -> None:
+    """Poses of all frames with a usable image, the run's camera, and the cloud of the map where there is one."""
+    trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
+    cloud = _cloud(folder, up, options, progress)
+    points = np.zeros((0, 3)) if cloud is None else cloud.points
+    colours = None if cloud is None else cloud.colours
+    if colours is None:
+        colours = np.full(points.shape, 128, np.uint8)
+    write_colmap(output, camera, trajectory.T_world_camera, points, colours, interpolated(folder))
+
+
+def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:
+    unit = unit_of_lengths(folder.metrics())
+    if options.origin is not None and unit != METRES:
+        raise RunError(f"a place on the earth needs metres, but this run's lengths are in {unit}: leave --origin")
+    with map_file(folder, "mesh", progress) as source:
+        mesh = prepared(read_ply(source), options)
+    raster = height_raster(_rotated(mesh, "z"), options.resolution or DEFAULT_RESOLUTION, options.origin)
+    write_raster(output, raster, unit)
+
+
+def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
+    if output.suffix.lower() not in (".yaml", ".pgm"):
+        raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
+    unit = unit_of_lengths(folder.metrics())
+    if unit not in (METRES, CAMERA_HEIGHTS):
+        raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
+    with map_file(folder, "mesh", progress) as source:
+        mesh = prepared(read_ply(source), options)
+    trajectory = _trajectory(folder, "z")
+    resolution = options.resolution or DEFAULT_RESOLUTION
+    grid = occupancy_grid(_rotated(mesh, "z"), trajectory.T_world_camera, resolution, unit == METRES)
+    written = output.with_suffix(".yaml")
+    write_ros_map(written, grid.cells, grid.corner, grid.resolution, unit)
+    return written
+
+
+def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress | None) -> Ply | None:
+    """The cloud of the map, None where the run has none."""
+    if not has_map(folder, "cloud"):
+        return None
+    with map_file(folder, "cloud", progress) as source:
+        return _rotated(prepared(read_ply(source), options), up)
+
+
+def _rotated(ply: Ply, up: str) -> Ply:
+    return ply if up == "y-down" else rotated(ply, R_UP_WORLDS[up])
+
+
+def _trajectory(folder: RunFolder, up: str) -> Trajectory:
+    """The optimised trajectory in the given axes."""
+    folder.require("trajectory_optimised.tum.txt")
+    trajectory = folder.trajectory("optimised")
+    if trajectory is None:
+        raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
+    frames, _ = lookup(folder.metrics(), "sequence", "frames")
+    if frames is not None and frames != len(trajectory):
+        raise RunError(
+            f"{folder.path}: trajectory_optimised.tum.txt is damaged: it has {len(trajectory)} rows for {frames} frames"
+        )
+    if up != "y-down":
+        T_up_world = se3.make(R_UP_WORLDS[up], np.zeros(3))
+        trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
+    return trajectory

@@ -1,0 +1,69 @@
+"""What a live drive says of every frame: JSON on a stream and over ZeroMQ."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+from slam.formats.trajectory import Trajectory
+from slam.pipeline.tracker import Tracked
+from slam.runtime.errors import SlamError
+from slam.runtime.imports import import_zmq
+
+_LAST_PORT = 65535
+
+Emit = Callable[[dict[str, Any]], None]
+
+
+def pose_message(index: int, stamp: float, tracked: Tracked, unit: str | None) -> dict[str, Any]:
+    """One frame: its pose ``(4, 4)`` as 12 numbers, row by row as in KITTI's files."""
+    pose = [float(x) for x in tracked.T_world_camera[:3].ravel()]
+    scale = {"unit": unit, "scale": tracked.unit}
+    return {"type": "pose", "frame": index, "stamp": stamp, "state": tracked.state, **scale, "T_world_camera": pose}
+
+
+def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run: str) -> dict[str, Any]:
+    """All poses after the whole drive was solved, with its loops closed."""
+    poses = [[float(x) for x in T[:3].ravel()] for T in trajectory.T_world_camera]
+    state = "loop closed" if loops else "whole drive"
+    stamps = [float(stamp) for stamp in trajectory.stamps]
+    content = {"type": "trajectory", "state": state, "loops": loops, "unit": unit, "run": run}
+    return content | {"stamps": stamps, "T_world_camera": poses}
+
+
+@contextmanager
+def emitters(stream: TextIO, address: str | None) -> Iterator[Emit]:
+    """Write every message as a line, and publish it where an address is given.
+
+    Raises:
+        SlamError: pyzmq is not installed, or the address cannot be bound.
+    """
+    if address is None:
+        yield lambda message: _write(stream, message)
+        return
+    zmq = import_zmq()
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.linger = 1000
+        try:
+            socket.bind(address)
+        except zmq.ZMQError as error:
+            raise SlamError(f"--publish {address} cannot be bound: {error}; write tcp://127.0.0.1:5555") from error
+        port = re.fullmatch(r"tcp://.*:(\d+)", address)
+        if port and int(port[1]) > _LAST_PORT:  # ZeroMQ binds the remainder
+            raise SlamError(
+                f"--publish {address} cannot be bound: ports end at {_LAST_PORT}; write tcp://127.0.0.1:5555"
+            )
+
+        def both(message: dict[str, Any]) -> None:
+            _write(stream, message)
+            socket.send_json(message)
+
+        yield both
+
+
+def _write(stream: TextIO, message: dict[str, Any]) -> None:
+    stream.write(json.dumps(message) + "\n")
+    stream.flush()

@@ -1,0 +1,89 @@
+"""Frames of a source in a thread of their own; only the newest waits, so that nothing falls behind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from threading import Condition, Event, Thread
+
+from slam.commands.live.source import Source
+from slam.frames import Image
+from slam.runtime.errors import SequenceError
+
+INTERRUPTED, OVER = "it was interrupted", "the source ended"
+EXPECTED = (INTERRUPTED, OVER)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """An image, its stamp, and when it came by the monotonic clock, seconds."""
+
+    stamp: float
+    image: Image
+    at_s: float
+
+
+class Reader:
+    """Iterates over the arrivals that were not dropped.
+
+    Attributes:
+        dropped: number of images replaced by a newer one before they were taken.
+        ended: why there are no more, after the last one.
+    """
+
+    def __init__(self, source: Source, most_wait_s: float, prepare: Callable[[Image], Image]) -> None:
+        """Start to read.
+
+        Args:
+            source: is read until it ends, dies, or sends nothing for ``most_wait_s``.
+            most_wait_s: seconds.
+            prepare: what is done with every image that is taken, such as undistortion.
+        """
+        self.dropped, self.ended = 0, ""
+        self._source, self._most_wait_s, self._prepare = source, most_wait_s, prepare
+        self._newest: Arrival | None = None
+        self._reason: str | None = None
+        self._changed, self._stopped = Condition(), Event()
+        Thread(target=self._read, name="reader", daemon=True).start()
+
+    def __iter__(self) -> Iterator[Arrival]:
+        while (arrival := self._take()) is not None:
+            yield Arrival(arrival.stamp, self._prepare(arrival.image), arrival.at_s)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an image waits to be taken."""
+        return self._newest is not None
+
+    def stop(self) -> None:
+        """End after the image that waits."""
+        self._stopped.set()
+        self._end(INTERRUPTED)
+
+    def _take(self) -> Arrival | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._newest is not None or self._reason is not None, self._most_wait_s)
+            arrival, self._newest = self._newest, None
+            if arrival is None:
+                self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
+                self._stopped.set()
+            return arrival
+
+    def _read(self) -> None:
+        try:
+            for stamp, image in self._source.images(self._stopped):
+                with self._changed:
+                    if self._stopped.is_set():
+                        return
+                    self.dropped += self._newest is not None
+                    self._newest = Arrival(stamp, image, time.monotonic())
+                    self._changed.notify()
+            self._end(OVER)
+        except SequenceError as error:
+            self._end(f"the source died: {error}")
+
+    def _end(self, reason: str) -> None:
+        with self._changed:
+            self._reason = self._reason or reason
+            self._changed.notify()

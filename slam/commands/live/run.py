@@ -1,0 +1,186 @@
+"""A live run from start to end: a source in, poses out while it lasts, a run folder at its end."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+
+from erfsfm.common.lock import FolderLock
+from erfsfm.common.signals import raising_on_termination
+from erfsfm.inference import DepthPosePredictor
+from slam.commands.live.messages import Emit, corrected_message, pose_message
+from slam.commands.live.reader import EXPECTED
+from slam.commands.live.sequence import StreamedSequence, calibration_of
+from slam.commands.live.source import open_source
+from slam.commands.live.view import Viewer
+from slam.commands.run.job import Job, Stream, complete
+from slam.commands.run.run import RunRequest, provenance_of
+from slam.config.sections import load_config
+from slam.formats.trajectory import Trajectory
+from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.growing import GrowingSequence
+from slam.pipeline.observer import Observer
+from slam.pipeline.requirements import require_possible
+from slam.pipeline.tracker import Tracker
+from slam.prediction.assembly import make_predictor, open_depth
+from slam.prediction.depth_source import mixed_sha256
+from slam.results.folder import RunFolder
+from slam.results.output import check_output
+from slam.results.run_log import run_log
+from slam.runtime.errors import SlamError
+from slam.runtime.imports import import_rerun
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """All inputs of a live run.
+
+    Attributes:
+        source: number of a camera, address of a stream, a pipe, a video, or a folder being filled.
+        calibration: ``camera.yaml`` or ``fov=DEGREES``; None looks beside a folder or a video.
+        weights: a shipped name or a training output folder.
+        config: a YAML file or a shipped name.
+        overrides: ``section.key=value`` each.
+        output: the run folder; None makes ``results/<stamp>_<name>``.
+        seed: of everything random.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        command: recorded in the metrics.
+        wait_s: seconds without an image after which the stream has ended.
+        view: open the rerun viewer.
+    """
+
+    source: str
+    calibration: Path | None = None
+    weights: str = "default"
+    config: str | Path | None = None
+    overrides: tuple[str, ...] = ()
+    output: Path | None = None
+    seed: int = 0
+    device: str = "auto"
+    command: str = "slam.commands.live.run.run_live"
+    wait_s: float = 10.0
+    view: bool = False
+
+
+def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
+    """Track a stream until it ends, stalls, dies or is interrupted, then leave a whole run.
+
+    Args:
+        request: all inputs.
+        emit: called with every message.
+
+    Raises:
+        SlamError, ErfsfmError: one line; as ``slam.commands.run.run.run_slam``.
+    """
+    with run_log() as log, raising_on_termination() as ignore_signals:
+        job, sequence = _prepare(request, emit)
+        with _stopping(sequence), FolderLock() as lock:
+            folder = RunFolder.create(request.output, Path(job.settings.output.root), sequence.name, lock)
+            try:
+                return complete(job, folder, log, ignore_signals)
+            except SlamError as error:
+                dropped = sequence.reader.dropped
+                raise SlamError(f"{error}{_DROPPED.format(dropped) if dropped else ''}") from error
+
+
+def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
+    """Open and check all inputs; the source is read from here on."""
+    if request.output is not None:
+        check_output(request.output)
+    if request.view:
+        import_rerun("--view")
+    settings = load_config(request.config, request.overrides)
+    networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
+    source = open_source(request.source, request.wait_s)
+    camera = calibration_of(request.source, request.calibration, source)
+    source.fps = camera.fps
+    intrinsics = StreamedSequence.intrinsics_of(camera)
+    depth = open_depth(settings.depth, intrinsics, None)
+    predictor, _ = make_predictor(networks, depth, settings.depth, intrinsics)
+    name = Path(request.source).stem or "live"
+    growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
+    require_possible(growing, settings, predictor.sources + 1)
+    sequence = StreamedSequence(name, source, camera, request.wait_s)
+    pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
+    tracker = Tracker(predictor.sources, sequence.camera_height_m, settings, networks.noise)
+    session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
+    recorded = RunRequest(
+        dataset=request.source,
+        camera=request.calibration,
+        weights=request.weights,
+        output=request.output,
+        seed=request.seed,
+        command=request.command,
+    )
+    provenance = provenance_of(recorded, networks, sequence, depth)
+    stream = Stream(sequence.frames, session.watch, session.finish, session.tracked)
+    sha256 = mixed_sha256(networks.sha256, depth)
+    return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
+
+
+_DROPPED = "; {} images were dropped, for they came faster than they were measured ('run' takes all of a recording)"
+
+
+class _Session:
+    """Says where the camera is while frames come, and how it ended."""
+
+    def __init__(self, sequence: StreamedSequence, tracker: Tracker, emit: Emit, viewer: Viewer | None) -> None:
+        self._sequence, self._tracker, self._emit, self._viewer = sequence, tracker, emit, viewer
+        self._said = 0
+
+    def watch(self, observer: Observer) -> None:
+        """Say the poses of frames that were finished since the last call."""
+        if not self._sequence.reader.is_waiting:
+            observer.flush()
+        for tracked in self._tracker.add(observer):
+            index, self._said = self._said, self._said + 1
+            arrival = self._sequence.arrivals.get(index)
+            message = pose_message(index, float(self._sequence.stamps[index]), tracked, self._tracker.unit_name)
+            late = None if arrival is None else round(1e3 * (time.monotonic() - arrival.at_s), 1)
+            self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
+            if self._viewer is not None:
+                self._viewer.show(index, observer.drive, tracked)
+
+    def tracked(self) -> Trajectory:
+        """The poses that were said so far."""
+        T_world_camera = self._tracker.T_world_camera
+        return Trajectory(self._sequence.stamps[: len(T_world_camera)], T_world_camera)
+
+    def finish(self, result: Estimate, folder: Path) -> None:
+        """Say all poses again as the whole drive gives them, and why it ended."""
+        reader = self._sequence.reader
+        message = corrected_message(result.optimised, len(result.loops.accepted), result.scale.unit_name, str(folder))
+        self._emit(message | {"dropped": reader.dropped, "ended": reader.ended})
+        if self._viewer is not None:
+            self._viewer.correct(result.optimised)
+        (logger.warning if reader.dropped else logger.info)("%d images were dropped", reader.dropped)
+        (logger.info if reader.ended in EXPECTED else logger.warning)("the stream ended: %s", reader.ended)
+
+
+@contextmanager
+def _stopping(sequence: StreamedSequence) -> Iterator[None]:
+    """The first ctrl-C ends the stream, the second one the run."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGINT, before)
+        Thread(target=sequence.reader.stop).start()  # its lock may be held by the code that was interrupted
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

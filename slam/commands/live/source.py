@@ -1,0 +1,176 @@
+"""Where frames come from while they are taken: a camera, a stream, a video at its own speed, a folder being filled."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+from typing import Any, BinaryIO, Protocol
+
+import cv2
+import numpy as np
+
+from erfsfm.common.errors import DataError
+from erfsfm.common.files import open_written
+from erfsfm.common.readers.images import IMAGE_SUFFIXES, first_size, is_image, natural_key, read_image
+from slam.frames import Image
+from slam.runtime.errors import SequenceError, sequence_errors
+from slam.sequences.camera_file import DEFAULT_FPS
+
+_DESCRIBED_STREAMS = (".sdp", ".m3u8")
+_POLL_S = 0.01
+_WRITING_S = 1.0  # that an image may take to be written
+
+logger = logging.getLogger(__name__)
+
+
+class Source(Protocol):
+    """Images as they come, each with its stamp in seconds."""
+
+    width: int
+    height: int
+    fps: float
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
+        ...
+
+
+class FolderSource:
+    """A folder that another program fills; image ``k`` in natural order was taken at ``k / fps``."""
+
+    def __init__(self, folder: Path, wait_s: float) -> None:
+        """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
+
+        Raises:
+            SequenceError: none came.
+        """
+        self._folder, self.fps = folder, DEFAULT_FPS
+        self._past: set[str] = set()
+        self.height, self.width = self._first_size(wait_s)
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """Every usable image, in natural order; one that comes after its successor is left out with a warning."""
+        count, last = 0, Path()
+        while not stopped.is_set():
+            waiting = self._waiting()
+            for path in waiting:
+                if stopped.is_set():
+                    return
+                if natural_key(path) < natural_key(last):
+                    logger.warning("%s came after %s, before which its name belongs; it is left out", path, last.name)
+                else:
+                    image = self._usable(path)
+                    if image is not None:
+                        yield count / self.fps, image
+                    count, last = count + 1, path
+                self._past.add(path.name)
+            if not waiting:
+                time.sleep(_POLL_S)
+
+    def _usable(self, path: Path) -> Image | None:
+        """An image of the size of the first once it is whole; others are named in a warning."""
+        try:
+            image = self._read(path, time.monotonic() + _WRITING_S)
+        except SequenceError as error:
+            logger.warning("%s; it is left out", error)
+            return None
+        height, width = image.shape[:2]
+        if (height, width) == (self.height, self.width):
+            return image
+        logger.warning("%s is %d x %d, not %d x %d; it is left out", path, width, height, self.width, self.height)
+        return None
+
+    def _waiting(self) -> list[Path]:
+        """Images that were not read yet, in natural order."""
+        try:
+            fresh = [path for path in self._folder.iterdir() if path.name not in self._past]
+        except OSError as error:
+            raise SequenceError(f"{self._folder} cannot be read any more: {error.strerror or error}") from error
+        return sorted(filter(is_image, fresh), key=natural_key)
+
+    @sequence_errors()
+    def _first_size(self, wait_s: float) -> tuple[int, int]:
+        deadline = time.monotonic() + wait_s
+        while time.monotonic() < deadline:
+            with suppress(DataError):
+                if waiting := self._waiting():
+                    return first_size(waiting)
+            time.sleep(_POLL_S)
+        if waiting := self._waiting():
+            return first_size(waiting)
+        suffixes = ", ".join(IMAGE_SUFFIXES)
+        raise SequenceError(f"no image came to {self._folder} within {wait_s:g} s: looked for {suffixes}")
+
+    @sequence_errors()
+    def _read(self, path: Path, deadline: float) -> Image:
+        """An image; one that is still being written is read again until ``deadline`` or until the next one is there."""
+        is_written = False
+        while True:
+            try:
+                return read_image(path)
+            except DataError:
+                if time.monotonic() > deadline or is_written:
+                    raise
+                is_written = self._waiting()[-1:] != [path]
+                time.sleep(_POLL_S)
+
+
+class VideoSource:
+    """What OpenCV opens: a camera by number, a stream by address, a pipe, or a file, which plays at its own speed."""
+
+    def __init__(self, name: str, wait_s: float) -> None:
+        """Open it; wait up to ``wait_s`` for somebody who writes to a pipe.
+
+        Raises:
+            SequenceError: it cannot be opened or gives no image.
+        """
+        self._name = name
+        self._is_file = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
+        self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
+        # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
+        source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"
+        self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(source)
+        self.fps = float(self._is_file and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self._first = self._next()
+        if self._first is None:
+            raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
+        self.height, self.width = self._first.shape[:2]
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        """Images at their time: in a file that of its frame rate, elsewhere that of their arrival."""
+        began, count, image = time.monotonic(), 0, self._first
+        while image is not None and not stopped.is_set():
+            stamp = count / self.fps if self._is_file else time.monotonic() - began
+            if self._is_file and stopped.wait(max(began + stamp - time.monotonic(), 0.0)):
+                break
+            yield stamp, image
+            count, image = count + 1, self._next()
+        self._capture.release()
+        if self._pipe is not None:
+            self._pipe.close()
+
+    def _next(self) -> Image | None:
+        read, image = self._capture.read()
+        return np.ascontiguousarray(image[..., ::-1]) if read and image is not None else None
+
+
+def _opened(pipe: str, wait_s: float) -> BinaryIO:
+    try:
+        return os.fdopen(open_written(pipe, wait_s), "rb")
+    except OSError as error:
+        raise SequenceError(f"no image comes from {pipe}: it is {error.strerror}") from error
+
+
+def open_source(camera: str, wait_s: float) -> Source:
+    """A source by what the user named; its ``fps``, of files, may be set before the first image.
+
+    Raises:
+        SequenceError: it cannot be opened, or no image comes within ``wait_s``.
+    """
+    folder = Path(camera)
+    return FolderSource(folder, wait_s) if folder.is_dir() else VideoSource(camera, wait_s)

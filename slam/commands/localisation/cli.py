@@ -1,0 +1,69 @@
+"""The verb ``localize`` of the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slam.runtime.progress import progress_bar
+from slam.runtime.terminal import print_table
+from slam.runtime.unused_options import UnusedDevice, UnusedSeed
+
+verbs = typer.Typer()
+
+
+@verbs.command()
+def localize(
+    images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
+    map: Annotated[Path, typer.Option("--map", help="a run folder")],
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml or fov=DEGREES; default: beside the images, else the run's")
+    ] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
+    every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,
+    truth: Annotated[
+        Path | None, typer.Option(help="KITTI or TUM poses, a row an image, in the world of the run's reference")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="TUM file for the poses found; image numbers as stamps")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON instead of a table")] = False,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Poses of new images in an earlier run's map. They are in its frame and unit. With --truth also their errors.
+
+    Example: erfsfm-slam localize photos --map results/latest --output photos.tum
+    """
+    from slam.commands.localisation.accuracy import MapTruth, summary, summary_line, true_poses
+    from slam.commands.localisation.localiser import image_numbers, localise
+    from slam.commands.localisation.tables import localisation_json, localisation_table, write_localisations
+    from slam.results.comparison import unit_notes
+    from slam.results.folder import RunFolder
+    from slam.results.replaced import check_replaced_trajectory
+    from slam.runtime.errors import RunError
+
+    run_folder = RunFolder.open(map)
+    if output is not None:
+        check_replaced_trajectory(output)
+        if truth is not None and output.resolve() == truth.resolve():
+            raise RunError(f"--output {output} is the file of --truth: choose another --output")
+    numbers = image_numbers(images, frames, every)
+    known = None if truth is None else (MapTruth.of(run_folder), true_poses(truth, images, numbers))
+    with progress_bar() as progress:
+        found = []
+        for localisation in localise(images, run_folder, camera, numbers):
+            found.append(localisation)
+            progress("images", len(found), len(numbers))
+    errors = None if known is None else [known[0].error(*pair) for pair in zip(found, known[1], strict=True)]
+    if output is not None:
+        write_localisations(output, found, numbers)
+    if as_json:
+        typer.echo(json.dumps(localisation_json(found, errors), indent=2))
+    else:
+        print_table(localisation_table(found, errors))
+        for note in unit_notes(run_folder.metrics()):
+            typer.echo(note)
+        if errors is not None:
+            typer.echo(summary_line(summary(errors)))

@@ -1,0 +1,170 @@
+"""A run that passed all checks, from its first frame to its whole folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.signals import Terminated
+from erfsfm.common.threads import limit_library_threads, take_working_memory
+from slam.config.sections import SlamConfig, dump_yaml
+from slam.formats.trajectory import Trajectory
+from slam.frames import Frame, Intrinsics
+from slam.frames import Sequence as FrameSequence
+from slam.loops.places import PLACES, Places
+from slam.pipeline.batch import Progress, SlamPipeline
+from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
+from slam.pipeline.estimate import Estimate
+from slam.pipeline.observer import FrontEndState, Observer
+from slam.results.depth import DepthQuality
+from slam.results.folder import RunFolder
+from slam.results.gps import write_places
+from slam.results.map import write_map
+from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
+from slam.results.output import ESTIMATE
+from slam.results.report.map_view import write_map_views
+from slam.results.report.page import DepthExample, write_report
+from slam.results.report.rerun import write_rerun
+from slam.results.run_log import LOG, RunLog
+from slam.results.summary import Provenance, as_json, describe_start
+from slam.runtime.errors import RunError, SlamError
+from slam.sequences.continued import Continued
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Frames that come while they are taken, and who watches them.
+
+    ``watch`` is called with the observer after every frame, ``finish`` with the estimate and the run folder;
+    ``tracked`` gives the poses so far.
+    """
+
+    frames: Callable[[], Iterator[Frame]]
+    watch: Callable[[Observer], None]
+    finish: Callable[[Estimate, Path], None]
+    tracked: Callable[[], Trajectory]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run that passed all checks; ``rerun`` is an ``.rrd`` file to write, ``stream`` None for a recording."""
+
+    settings: SlamConfig
+    recording: FrameSequence
+    pipeline: SlamPipeline
+    provenance: Provenance
+    predictors_sha256: str
+    checkpoint: SessionCheckpoint | None
+    rerun: Path | None = None
+    progress: Progress | None = None
+    stream: Stream | None = None
+
+    def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
+        """What is kept of this run after some of its frames."""
+        return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
+
+
+def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[[], None]) -> RunFolder:
+    """Run to the end; however that is, the folder keeps the results and the reason.
+
+    Raises:
+        SlamError, ErfsfmError: one line.
+    """
+    folder.write_metrics(describe_start(job.provenance))
+    try:
+        log.begin(folder.path / LOG)
+        with limit_library_threads():
+            take_working_memory()
+            _run(job, folder)
+    except BaseException as error:
+        ignore_signals()
+        _leave_failure(job, folder, log, error)
+        if folder.replaces is not None and isinstance(error, SlamError):
+            is_kept = (folder.replaces / ESTIMATE).is_file()  # else it failed while one was put in the other's place
+            kept = f"{folder.replaces} {'keeps' if is_kept else 'lost'} its earlier run, this one is in {folder.path}"
+            raise RunError(f"{error}; {kept}") from error
+        raise
+    return folder
+
+
+def _run(job: Job, folder: RunFolder) -> None:
+    """Estimate, then map, then report; each is on disk before the next begins."""
+    folder.write_text("config.yaml", dump_yaml(job.settings))
+    stream, checkpoints = job.stream, _checkpoints(job, folder.path)
+    frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
+    # a run does not go on without the images of a live drive, nor in a folder without those before its own
+    goes_on = stream is None and not isinstance(job.recording, Continued)
+    estimate = job.pipeline.estimate(checkpoints if goes_on else None, frames, watch)
+    _write_estimate(folder, estimate, job)
+    if checkpoints is not None:
+        checkpoints.finish(estimate.state)
+    metrics = estimate_metrics(estimate, job.recording, job.provenance, job.settings.gps.factors)
+    folder.write_metrics(metrics)
+    folder.publish()
+    if stream is not None:
+        stream.finish(estimate, folder.path)
+    quality = DepthQuality(job.recording, estimate.scale.is_metric)
+    result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
+    numbers = write_map(folder, result, job.recording, job.progress)
+    depth = quality.summary(job.settings.depth.refine != "none")
+    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    output = job.settings.output
+    views = write_map_views(folder, output.viewer_triangles if output.report else 0)
+    if output.report:
+        examples = [DepthExample(i, image, depth) for i, image, depth in result.drive.examples]
+        write_report(folder, examples, views)
+    if job.rerun is not None:
+        write_rerun(job.rerun, result, job.recording.intrinsics)
+
+
+def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
+    """What keeps the drive for runs that go on; None where the configuration says so."""
+    keep, before = job.settings.output.keep, job.checkpoint
+    if keep == "nothing":
+        return None
+    is_here = before is not None and not isinstance(job.recording, Continued)
+    kept = before.state.drive if before is not None and is_here else None
+    return CheckpointWriter(folder, job.checkpoint_of, keep == "keyframes", kept)
+
+
+def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
+    """Trajectories, graph, loops and places."""
+    for name in ("network", "odometry", "optimised"):
+        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+    if result.reference is not None:
+        folder.write_trajectory("reference", result.reference)
+    write_places(folder, result, job.recording.name)
+    lidar = lidar_trajectory(result)
+    if lidar is not None:
+        folder.write_trajectory("trajectory_lidar", lidar)
+    result.graph.write_g2o(folder.path / "graph.g2o")
+    folder.write_text("loops.json", as_json(result.loops.details()))
+    folder.write(PLACES, _places(result, job.recording.intrinsics).write)
+
+
+def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
+    """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
+    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.drive.views)
+    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
+    return Places(intrinsics, views, T_world_camera)
+
+
+def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseException) -> None:
+    """Write the reason of the failure, and of a live drive its poses, which nothing else could give again.
+
+    Errors of writing them are ignored, so the first one is raised.
+    """
+    known = isinstance(error, SlamError | ErfsfmError | Terminated)
+    reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    log.failed(reason)
+    with suppress(SlamError, OSError):
+        folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
+        if job.stream is not None and folder.trajectory("odometry") is None:
+            folder.write_trajectory("trajectory_odometry", job.stream.tracked())
+        if job.settings.output.report:
+            write_report(folder, [], None)

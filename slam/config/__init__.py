@@ -1,0 +1,1 @@
+"""Frozen settings, their YAML files and overrides."""

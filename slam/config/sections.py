@@ -1,0 +1,244 @@
+"""The configuration of a SLAM run: one frozen section for each component.
+
+A YAML file may leave keys out, which then have their defaults; ``configs/slam/default.yaml`` lists all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from erfsfm.common.config_tree import Section
+from erfsfm.common.config_tree import dump_explained as dump_yaml
+from slam.config.files import load_sections
+from slam.config.frontend import (
+    FrontendConfig,
+    GapsConfig,
+    GeometryConfig,
+    GpsConfig,
+    LengthConfig,
+    LidarConfig,
+    RoadConfig,
+    ScaleConfig,
+    ScaleMode,
+)
+from slam.config.window import WindowConfig
+
+__all__ = [
+    "DepthConfig",
+    "FrontendConfig",
+    "GapsConfig",
+    "GeometryConfig",
+    "GpsConfig",
+    "LengthConfig",
+    "LidarConfig",
+    "LoopsConfig",
+    "MappingConfig",
+    "OutputConfig",
+    "PoseGraphConfig",
+    "RoadConfig",
+    "ScaleConfig",
+    "ScaleMode",
+    "SlamConfig",
+    "WindowConfig",
+    "dump_yaml",
+    "load_config",
+]
+
+
+DEPTH_SOURCES = ("onnx", "npy", "png")
+
+
+class DepthConfig(Section):
+    """Where depth comes from, see ``docs/depth-models.md``, and what keyframes make of it."""
+
+    source: str = Field(
+        default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
+    )
+    kind: Literal["auto", "depth", "disparity"] = Field(
+        default="auto",
+        description="what the source gives; auto: depth in folders, in ONNX files that we exported theirs",
+    )
+    align: Literal["none", "scale", "affine"] = Field(
+        default="none",
+        description="none: one unit in all frames; scale: a unit of its own in each; affine: also a shift of disparity",
+    )
+    mean: tuple[float, float, float] | None = Field(
+        default=None, description="of RGB in [0, 1], subtracted for onnx; null in ONNX files that we exported"
+    )
+    std: tuple[float, float, float] | None = Field(default=None, description="divides RGB less the mean; likewise")
+    height: int = Field(default=0, ge=0, description="input height for onnx; 0 where the file fixes it")
+    width: int = Field(default=0, ge=0, description="input width for onnx; 0 where the file fixes it")
+    output_name: str = Field(default="", description="output for onnx, where the network has several")
+    png_scale: float = Field(default=256.0, gt=0, description="value of 1 m (or other unit) for png; 0 is unknown")
+    refine: Literal["none", "multiview"] = Field(
+        default="multiview", description="refine the keyframes' depth by their neighbours at the optimised poses"
+    )
+
+    @field_validator("source")
+    @classmethod
+    def _known_source(cls, source: str) -> str:
+        kind, colon, path = source.partition(":")
+        if source != "network" and not (kind in DEPTH_SOURCES and colon and path):
+            raise ValueError("network, onnx:FILE, npy:FOLDER or png:FOLDER")
+        return source
+
+    @field_validator("std")
+    @classmethod
+    def _positive(cls, std: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if std is not None and min(std) <= 0:
+            raise ValueError("three numbers above 0")
+        return std
+
+
+class LoopsConfig(Section):
+    """Loop closure, see ``loops/closure.py``; metres, or camera heights under scale mode none."""
+
+    enabled: bool = Field(default=True, description="detect and close loops")
+    frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
+    min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
+    agreement_deg: float = Field(
+        default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"
+    )
+    agreement_ratio: float = Field(
+        default=0.1,
+        gt=0,
+        description="largest difference of the translations measured in both directions, over the depth",
+    )
+    min_support: int = Field(default=2, ge=0, description="least number of images with loops that support a loop")
+
+
+class PoseGraphConfig(Section):
+    """The pose graph, see ``pose_graph.py``."""
+
+    kernel: Literal["none", "huber"] = Field(default="huber", description="robust loss")
+    huber_k: float = Field(default=1.345, gt=0, description="whitened residual at which Huber becomes linear")
+    max_loop_residual: float = Field(default=8.0, gt=0, description="whitened residual beyond which a loop is removed")
+
+
+class MappingConfig(Section):
+    """TSDF fusion, see ``mapping/``; without a known scale, lengths follow the depth of the scene."""
+
+    enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
+    frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
+    keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance moved after which a frame is fused")
+    width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
+    voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
+    truncation_voxels: float = Field(
+        default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
+    )
+    sky_brightness: int = Field(
+        default=245,
+        ge=1,
+        le=256,
+        description="level of all colours from which on a pixel above the horizon is sky, if the upper border is too",
+    )
+    sky_blueness: int = Field(
+        default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"
+    )
+    depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth")
+    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, whatever its sigma")
+    sure_sigma_m: float = Field(
+        default=1.2, ge=0, description="largest sigma of depth that is fused up to sure_reach times depth_max_m"
+    )
+    sure_reach: float = Field(default=1.4, ge=1, description="for depth as sure as that")
+    border: float = Field(
+        default=0.02, ge=0, lt=0.5, description="left, right and upper border left out, over the image's width"
+    )
+    bonnet: float = Field(
+        default=0.0, ge=0, lt=1, description="lower part left out, over the image's height: the car's own bonnet"
+    )
+    max_depth_step: float = Field(
+        default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
+    )
+    consistency: float = Field(
+        default=0.12, gt=0, description="largest relative depth difference to the previous keyframe"
+    )
+    max_relative_sigma: float = Field(
+        default=0.2, gt=0, description="largest sigma of refined depth that is fused, relative to it"
+    )
+    min_weight: float = Field(default=2.0, ge=0, description="least number of observations of an extracted voxel")
+    min_component_triangles: int = Field(
+        default=300, ge=0, description="least number of triangles of a connected piece of the mesh"
+    )
+    close_holes_m: float = Field(default=1.5, ge=0, description="largest diameter of a hole of the road to close")
+    submap_m: float = Field(default=60.0, gt=0, description="length of road in a submap")
+    memory_mb: int = Field(
+        default=1000, ge=100, description="memory of the map, MiB: a submap ends before submap_m where it would be more"
+    )
+
+    def in_unit(self, per_metre: float) -> MappingConfig:
+        """The same lengths in a unit of which a metre has ``per_metre``."""
+        lengths = {name: per_metre * getattr(self, name) for name in type(self).model_fields if name.endswith("_m")}
+        return self.model_copy(update=lengths)
+
+    @property
+    def reach_m(self) -> float:
+        """Depth up to which anything is fused."""
+        return self.depth_max_m * self.sure_reach
+
+    @model_validator(mode="after")
+    def _near_before_far(self) -> Self:
+        if self.depth_min_m >= self.depth_max_m:
+            raise ValueError("a range with depth_min_m < depth_max_m")
+        return self
+
+
+class OutputConfig(Section):
+    """What a run writes."""
+
+    root: str = Field(default="results", min_length=1, description="parent folder of run folders")
+    report: bool = Field(default=True, description="write report.html")
+    viewer_triangles: int = Field(
+        default=60_000, ge=0, description="most triangles of the map that turns in the report; 0 for pictures alone"
+    )
+    keep: Literal["nothing", "drive", "keyframes"] = Field(
+        default="drive",
+        description="for run --continue: nothing, the measurements of the drive, or also the keyframes of the map",
+    )
+
+
+class SlamConfig(Section):
+    """All settings of a run."""
+
+    depth: DepthConfig = DepthConfig()
+    frontend: FrontendConfig = FrontendConfig()
+    geometry: GeometryConfig = GeometryConfig()
+    window: WindowConfig = WindowConfig()
+    gaps: GapsConfig = GapsConfig()
+    road: RoadConfig = RoadConfig()
+    lengths: LengthConfig = LengthConfig()
+    lidar: LidarConfig = LidarConfig()
+    gps: GpsConfig = GpsConfig()
+    scale: ScaleConfig = ScaleConfig()
+    loops: LoopsConfig = LoopsConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
+    mapping: MappingConfig = MappingConfig()
+    output: OutputConfig = OutputConfig()
+
+
+def load_config(file_or_name: str | Path | None = None, overrides: Sequence[str] = ()) -> SlamConfig:
+    """Read a configuration and change some of its keys.
+
+    Args:
+        file_or_name: a YAML file, or the name of one under ``configs/slam``; None for the defaults.
+        overrides: ``section.key=value`` each, the value in YAML.
+
+    Raises:
+        ConfigError: one line that names the key or file, what came and what is allowed.
+    """
+    return load_sections(SlamConfig, file_or_name, overrides)
+
+
+def load_stored(path: Path, *sections: str) -> SlamConfig:
+    """Sections of the configuration that a run has kept; the others, which are not read, have their defaults.
+
+    A run of an earlier release may have keys that are gone: they are left out.
+
+    Raises:
+        ConfigError: one line that names the key or file, what came and what is allowed.
+    """
+    return load_sections(SlamConfig, path, (), sections)

@@ -1,0 +1,283 @@
+"""Trajectories: camera poses with time stamps, their KITTI and TUM files, and association by time stamp.
+
+Conventions: ``docs/conventions.md``. Quaternions are those of TUM files.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from erfsfm.common.files import read_text
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.runtime.errors import TrajectoryError
+from slam.runtime.storage.files import write_atomically
+
+logger = logging.getLogger(__name__)
+
+_COLUMNS = {"kitti": 12, "tum": 8}
+# Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
+_ROTATION_TOLERANCE = 1e-3
+_FARTHEST = 1e12  # metres: to Saturn
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera poses in time order.
+
+    ``stamps`` ``(N,)`` in seconds, ``T_world_camera`` ``(N, 4, 4)``, metres or the trajectory's own unit.
+    ``timed`` is False where the stamps are row numbers, as in a KITTI file.
+    """
+
+    stamps: FloatArray
+    T_world_camera: FloatArray
+    timed: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that do not fit, and stamps that are no times.
+
+        Raises:
+            ValueError: if there is no pose, the shapes are not ``(N,)`` and ``(N, 4, 4)``, or stamps do not increase.
+        """
+        count = len(self.T_world_camera)
+        if not count or self.stamps.shape != (count,) or self.T_world_camera.shape != (count, 4, 4):
+            raise ValueError(
+                "stamps and T_world_camera must have shapes (N,) and (N, 4, 4), N >= 1; "
+                f"got {self.stamps.shape} and {self.T_world_camera.shape}"
+            )
+        if not (np.isfinite(self.stamps).all() and (np.diff(self.stamps) > 0).all()):
+            raise ValueError("stamps must be finite and increase")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Camera centres in the world ``(N, 3)``."""
+        return self.T_world_camera[:, :3, 3]
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path through all positions."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def rebased(self) -> Trajectory:
+        """The same motion with the first camera as the world: the first pose is the identity."""
+        T_first_world = se3.invert(self.T_world_camera[0])
+        return Trajectory(self.stamps, T_first_world @ self.T_world_camera, self.timed)
+
+    def select(self, rows: NDArray[np.intp]) -> Trajectory:
+        """The poses of some rows, in the order given."""
+        return Trajectory(self.stamps[rows], self.T_world_camera[rows], self.timed)
+
+
+def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
+    """Read a KITTI file (12 numbers a row) or a TUM file (8); ``auto`` decides by the first row.
+
+    Blank lines and lines that start with ``#`` are skipped. Rotations that are not orthonormal by rounding
+    are replaced by the nearest rotation.
+
+    Raises:
+        TrajectoryError: if the file cannot be read as such; the message names file and line.
+    """
+    path = Path(path)
+    if format not in ("auto", *_COLUMNS):
+        raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
+    lines, numbers = _read_numbers(path, _COLUMNS.get(format, 0))
+    if numbers.shape[1] == _COLUMNS["kitti"]:
+        T_world_camera, stamps = _kitti_poses(numbers), np.arange(len(numbers), dtype=np.float64)
+    else:
+        T_world_camera, stamps = _tum_poses(path, lines, numbers), numbers[:, 0]
+        backwards = np.flatnonzero(np.diff(stamps) <= 0)
+        if backwards.size:
+            raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: time stamps must increase")
+    R = T_world_camera[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check below
+        deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero(~((deviation < _ROTATION_TOLERANCE) & (np.linalg.det(R) > 0)))
+    if wrong.size:
+        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the 3x3 part is not a rotation matrix")
+    T_world_camera[:, :3, :3] = se3.nearest_rotation(R)
+    return Trajectory(stamps, T_world_camera, timed=numbers.shape[1] == _COLUMNS["tum"])
+
+
+def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
+    """Write the upper 3x4 of each ``T_world_camera``, row by row, atomically.
+
+    Raises:
+        TrajectoryError: if the file cannot be written.
+    """
+    rows = trajectory.T_world_camera[:, :3].reshape(len(trajectory), 12)
+    _write(Path(path), (_row(row) for row in rows))
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write ``t tx ty tz qx qy qz qw`` a row, atomically; stamps are written with all their digits.
+
+    Raises:
+        TrajectoryError: if the file cannot be written.
+    """
+    quaternions_xyzw = Rotation.from_matrix(trajectory.T_world_camera[:, :3, :3]).as_quat(canonical=True)
+    poses = np.hstack([trajectory.positions, quaternions_xyzw])  # (N, 7)
+    stamps = (np.format_float_positional(stamp, min_digits=9) for stamp in trajectory.stamps)
+    rows = (f"{stamp} {_row(pose)}" for stamp, pose in zip(stamps, poses))
+    _write(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
+
+
+def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The rows of both that belong to the same frames, equally many.
+
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. If one of
+    them is not timed, row k belongs to row k and the lengths must agree.
+
+    Raises:
+        TrajectoryError: if the lengths differ and stamps are missing, or no stamps match.
+    """
+    if not (estimate.timed and reference.timed):
+        if len(estimate) != len(reference):
+            raise TrajectoryError(
+                f"the estimate has {len(estimate)} poses and the reference {len(reference)}; files without "
+                "time stamps are compared row by row: give each frame a row, or use TUM files for both"
+            )
+        return estimate, reference
+    # Slack, because the tolerance itself is a difference of rounded stamps.
+    within_s = matching_tolerance_s(estimate, reference) * (1.0 + 1e-6)
+    rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
+    if not rows_estimate.size:
+        raise TrajectoryError(
+            f"no time stamps match within {matching_tolerance_s(estimate, reference):.3g} s: the estimate "
+            f"covers {_time_span(estimate)} and the reference {_time_span(reference)}; "
+            "bring both to the same clock"
+        )
+    expected = min(len(estimate), len(reference))
+    if rows_estimate.size < 0.9 * expected:
+        logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
+    return estimate.select(rows_estimate), reference.select(rows_reference)
+
+
+def matching_tolerance_s(estimate: Trajectory, reference: Trajectory) -> float:
+    """Largest time difference of a matching pair: half the frame period (median) of the denser one."""
+    periods = [float(np.median(np.diff(each.stamps))) for each in (estimate, reference) if len(each) > 1]
+    return 0.5 * min(periods, default=0.02)
+
+
+def nearest_pairs(a: FloatArray, b: FloatArray, within_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of two increasing series of stamps that are each other's nearest and at most ``within_s`` apart."""
+    nearest_b, nearest_a = nearest_stamps(a, b), nearest_stamps(b, a)
+    rows_a = np.arange(len(a))
+    chosen = (nearest_a[nearest_b] == rows_a) & (np.abs(b[nearest_b] - a) <= within_s)
+    return rows_a[chosen], nearest_b[chosen]
+
+
+def nearest_stamps(stamps: FloatArray, candidates: FloatArray) -> NDArray[np.intp]:
+    """For each stamp ``(N,)`` the row of the nearest of the increasing candidates; of two as near the earlier one."""
+    after = np.clip(np.searchsorted(candidates, stamps), 1, max(len(candidates) - 1, 1))
+    if len(candidates) == 1:
+        return np.zeros(len(stamps), dtype=np.intp)
+    before_is_nearer = stamps - candidates[after - 1] <= candidates[after] - stamps
+    nearest: NDArray[np.intp] = np.where(before_is_nearer, after - 1, after)
+    return nearest
+
+
+def _time_span(trajectory: Trajectory) -> str:
+    return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
+
+
+def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
+    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; with 0 columns, those of the first row."""
+    lines: list[int] = []
+    rows: list[list[float]] = []
+    for line, words in _read_words(path):
+        columns = columns or len(words)
+        _check_columns(f"{path}, line {line}", len(words), columns)
+        try:
+            rows.append([_number(word) for word in words])
+        except ValueError as error:
+            raise TrajectoryError(f"{path}, line {line}: {_reason(error)}") from error
+        lines.append(line)
+    if not rows:
+        raise TrajectoryError(f"{path}: there is no pose in this file")
+    numbers = np.array(rows)
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if bad.size:
+        raise TrajectoryError(f"{path}, line {lines[bad[0]]}: a number is not finite")
+    positions = numbers[:, 3::4] if columns == _COLUMNS["kitti"] else numbers[:, 1:4]
+    far = np.flatnonzero((np.abs(positions) > _FARTHEST).any(axis=1))
+    if far.size:
+        raise TrajectoryError(f"{path}, line {lines[far[0]]}: a position is farther than {_FARTHEST:g}")
+    return lines, numbers
+
+
+def _number(word: str) -> float:
+    """Python's reading of a number, without its underscores.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if "_" in word:
+        raise ValueError(f"not a number: {word!r}")
+    return float(word)
+
+
+def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and words of each line that holds data."""
+    if path.is_dir():
+        raise TrajectoryError(f"{path}: this is a folder, not a trajectory file")
+    try:
+        text = read_text(path, "utf-8-sig")
+    except FileNotFoundError as error:
+        raise TrajectoryError(f"{path}: no such file") from error
+    except UnicodeDecodeError as error:
+        raise TrajectoryError(f"{path}: this is not a text file (UTF-8)") from error
+    except OSError as error:
+        raise TrajectoryError(f"{path}: {error.strerror}") from error
+    for line, content in enumerate(text.splitlines(), start=1):
+        words = content.split()
+        if words and not words[0].startswith("#"):
+            yield line, words
+
+
+def _check_columns(where: str, found: int, wanted: int) -> None:
+    if wanted not in _COLUMNS.values():
+        raise TrajectoryError(f"{where}: {wanted} columns; a KITTI row has 12, a TUM row 8")
+    if found == wanted:
+        return
+    name = "KITTI" if wanted == _COLUMNS["kitti"] else "TUM"
+    other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(found, "")
+    raise TrajectoryError(f"{where}: {found} columns where {name} has {wanted}{other}")
+
+
+def _reason(error: ValueError) -> str:
+    """Python's message about a word that is not a number, reworded."""
+    return str(error).replace("could not convert string to float:", "not a number:")
+
+
+def _kitti_poses(numbers: FloatArray) -> FloatArray:
+    T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T_world_camera[:, :3] = numbers.reshape(-1, 3, 4)
+    return T_world_camera
+
+
+def _tum_poses(path: Path, lines: list[int], numbers: FloatArray) -> FloatArray:
+    quaternions_xyzw = numbers[:, 4:]
+    deviation = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0)
+    wrong = np.flatnonzero(deviation >= _ROTATION_TOLERANCE)
+    if wrong.size:
+        raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the quaternion does not have length 1")
+    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, 1:4])
+
+
+def _row(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.9e}" for value in values)
+
+
+def _write(path: Path, rows: Iterable[str]) -> None:
+    text = "".join(f"{row}\n" for row in rows)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), TrajectoryError)

@@ -1,0 +1,1 @@
+"""Pose graphs of rigid transforms and of similarities."""

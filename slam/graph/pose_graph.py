@@ -1,0 +1,241 @@
+"""The pose graph: relative poses in, the most likely trajectory out.
+
+GTSAM perturbs a pose on the right, ``T Exp(xi)``, rotation first; the sigmas of a ``RelativePose`` follow
+that order. A Huber kernel limits outliers: redescending ones do not recover from a drifted start.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from slam.config.sections import PoseGraphConfig
+from slam.formats.g2o import write_g2o
+from slam.frames import LOOP_SOURCE, MeasuredPosition, RelativePose
+from slam.geometry.se3 import FloatArray, invert, is_se3
+from slam.runtime.errors import SlamError
+
+_ANCHOR_SIGMA = 1e-6
+_LOOSE_SIGMAS = np.repeat([0.3, 1e3], 3)  # of the first pose where positions hold the graph: radians, metres
+_OUTLYING = 3.0
+_MAX_ITERATIONS = 100  # of Levenberg-Marquardt
+_MAX_DROPPED_LOOPS = 10  # largest number of loops removed where the system is singular
+_RELATIVE_TOLERANCE = 1e-6  # relative decrease of the error below which it ends
+
+logger = logging.getLogger(__name__)
+
+
+class PoseGraph:
+    """Camera poses as nodes 0 to N - 1 and relative poses as factors; node 0 is fixed as the world frame."""
+
+    def __init__(self, config: PoseGraphConfig) -> None:
+        self._config = config
+        self._relative_poses: list[RelativePose] = []
+        self._dropped: list[RelativePose] = []
+        self._T_world_camera: FloatArray | None = None
+        self._positions: tuple[MeasuredPosition, ...] = ()
+        self._T_fixed_world: FloatArray = np.eye(4)
+
+    @property
+    def T_fixed_world(self) -> FloatArray:
+        """``(4, 4)``: the world in the axes of the measured positions; the identity without any."""
+        return self._T_fixed_world.copy()
+
+    @property
+    def relative_poses(self) -> tuple[RelativePose, ...]:
+        """The factors in use, in the order they were added."""
+        return tuple(self._relative_poses)
+
+    @property
+    def dropped(self) -> tuple[RelativePose, ...]:
+        """Loop factors dropped: the system was singular with them, or they contradict the rest."""
+        return tuple(self._dropped)
+
+    @property
+    def errors(self) -> FloatArray:
+        """Whitened squared residual ``(F,)`` of each factor at the optimised trajectory."""
+        return whitened_squared(self._relative_poses, self._solution())
+
+    def add_relative(self, *relative_poses: RelativePose) -> None:
+        """Add measurements as factors.
+
+        Raises:
+            SlamError: if one is not a rigid transform, links a frame to itself or has no positive sigmas.
+        """
+        for relative_pose in relative_poses:
+            _check(relative_pose)
+        self._relative_poses += relative_poses
+
+    def add_positions(self, positions: Sequence[MeasuredPosition], T_fixed_world_initial: FloatArray) -> None:
+        """Add positions measured in axes in which the world lies about at ``T_fixed_world_initial`` ``(4, 4)``."""
+        self._positions, self._T_fixed_world = tuple(positions), T_fixed_world_initial
+
+    def optimise(self, T_world_camera_initial: FloatArray) -> FloatArray:
+        """Solve for all poses from an initial trajectory; the first pose is fixed.
+
+        Args:
+            T_world_camera_initial: start ``(N, 4, 4)``, in the unit of the factors.
+
+        Returns:
+            ``T_world_camera`` ``(N, 4, 4)``.
+
+        Raises:
+            SlamError: if frames are not connected or the system cannot be solved.
+        """
+        _check_connected(self._relative_poses, len(T_world_camera_initial))
+        if not is_se3(T_world_camera_initial, tolerance=1e-5):
+            raise SlamError("the initial trajectory of the pose graph must be finite rigid transforms")
+        for _ in range(_MAX_DROPPED_LOOPS + 1):
+            try:
+                self._T_world_camera = self._solve(T_world_camera_initial)
+                return self._T_world_camera.copy()
+            except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException among them
+                reason = _first_line(error)
+                self._drop_newest_loop(reason)
+                _check_connected(self._relative_poses, len(T_world_camera_initial))
+        raise SlamError(f"the pose graph cannot be solved even without {len(self._dropped)} loop edges")
+
+    def drop_contradicted_loops(self) -> tuple[RelativePose, ...]:
+        """Drop the loops with a large residual at the optimised trajectory while most others have a small one.
+
+        Where the odometry is overconfident all loops have large residuals. So a loop must also lie far above the
+        median residual of all loops.
+
+        Returns:
+            The loops dropped; where there are any, optimise again.
+        """
+        squared = self.errors
+        is_loop = np.array([edge.source == LOOP_SOURCE for edge in self._relative_poses], dtype=bool)
+        if not is_loop.any():
+            return ()
+        typical = float(np.median(np.sqrt(squared[is_loop])))
+        limit = max(self._config.max_loop_residual, _OUTLYING * typical)
+        beyond = is_loop & (squared > limit**2)
+        gone = tuple(edge for edge, out in zip(self._relative_poses, beyond, strict=True) if out)
+        self._relative_poses = [edge for edge, out in zip(self._relative_poses, beyond, strict=True) if not out]
+        self._dropped += gone
+        return gone
+
+    def write_g2o(self, path: Path) -> None:
+        """Write the optimised graph in g2o's text format at full precision, atomically."""
+        write_g2o(path, self._relative_poses, self._solution())
+
+    def _solution(self) -> FloatArray:
+        if self._T_world_camera is None:
+            raise SlamError("the pose graph has not been optimised yet")
+        return self._T_world_camera
+
+    def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
+        values = gtsam.Values()
+        for k, T in enumerate(self._T_fixed_world @ T_world_camera_initial):
+            values.insert(k, _pose3(T))
+        values = self._minimise(values)
+        T_fixed_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
+        if not np.isfinite(T_fixed_camera).all():
+            raise RuntimeError("the solution is not finite")
+        T_fixed_camera[:, :3, :3] = Rotation.from_matrix(T_fixed_camera[:, :3, :3]).as_matrix()
+        rebased: FloatArray = T_world_camera_initial[0] @ invert(T_fixed_camera[0]) @ T_fixed_camera
+        if self._positions:
+            self._T_fixed_world = T_fixed_camera[0] @ invert(T_world_camera_initial[0])
+        rebased[0] = T_world_camera_initial[0]
+        return rebased
+
+    def _minimise(self, values: Any) -> Any:
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
+        for edge in self._relative_poses:
+            graph.add(_between(edge, self._config))
+        for position in self._positions:
+            graph.add(_position(position, self._config))
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(_MAX_ITERATIONS)
+        parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        solved = optimiser.optimize()
+        logger.info(
+            "pose graph (%s): %d factors, error %.4g to %.4g in %d iterations",
+            self._config.kernel,
+            len(self._relative_poses),
+            graph.error(values),
+            optimiser.error(),
+            optimiser.iterations(),
+        )
+        return solved
+
+    def _drop_newest_loop(self, reason: str) -> None:
+        loops = [k for k, edge in enumerate(self._relative_poses) if edge.source == LOOP_SOURCE]
+        if not loops:
+            raise SlamError(f"the pose graph cannot be solved: {reason}")
+        edge = self._relative_poses.pop(loops[-1])
+        self._dropped.append(edge)
+        logger.warning("loop %d -> %d dropped from the graph: %s", edge.from_index, edge.to_index, reason)
+
+
+def whitened_squared(relative_poses: Iterable[RelativePose], T_world_camera: FloatArray) -> FloatArray:
+    """Whitened squared 6-dof residual ``(F,)`` of each measurement at a trajectory ``(N, 4, 4)``."""
+    squared = []
+    for edge in relative_poses:
+        T_from_to = invert(T_world_camera[edge.from_index]) @ T_world_camera[edge.to_index]
+        residual = gtsam.Pose3.Logmap(_pose3(edge.T_from_to).between(_pose3(T_from_to)))
+        squared.append(float(((residual / edge.sigmas) ** 2).sum()))
+    return np.array(squared)
+
+
+def _check_connected(relative_poses: Sequence[RelativePose], count: int) -> None:
+    ends = np.array([(e.from_index, e.to_index) for e in relative_poses], dtype=int).reshape(-1, 2)
+    if len(ends) and (ends.min() < 0 or ends.max() >= count):
+        raise SlamError(f"a factor links frame {ends.max()}, but the trajectory has {count} frames")
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, component = connected_components(links, directed=False)
+    loose = np.flatnonzero(component != component[0])
+    if len(loose):
+        raise SlamError(f"{len(loose)} of {count} frames are not connected to the first, from frame {loose[0]} on")
+
+
+def _first_line(error: RuntimeError) -> str:
+    return str(error).strip().partition("\n")[0]
+
+
+def _anchor(pose: Any, is_loose: bool = False) -> Any:
+    sigmas = _LOOSE_SIGMAS if is_loose else np.full(6, _ANCHOR_SIGMA)
+    return gtsam.PriorFactorPose3(0, pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def _between(edge: RelativePose, config: PoseGraphConfig) -> Any:
+    noise = _noise(edge.graph_sigmas, config)
+    return gtsam.BetweenFactorPose3(edge.from_index, edge.to_index, _pose3(edge.T_from_to), noise)
+
+
+def _position(measured: MeasuredPosition, config: PoseGraphConfig) -> Any:
+    noise = _noise(measured.sigmas, config)
+    return gtsam.GPSFactorArm(measured.index, measured.position, measured.lever_arm, noise)
+
+
+def _noise(sigmas: FloatArray, config: PoseGraphConfig) -> Any:
+    noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, dtype=np.float64))
+    if config.kernel == "none":
+        return noise
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(config.huber_k), noise)
+
+
+def _check(edge: RelativePose) -> None:
+    name = f"factor {edge.from_index} -> {edge.to_index} ({edge.source})"
+    if edge.from_index == edge.to_index or min(edge.from_index, edge.to_index) < 0:
+        raise SlamError(f"{name} must link two different frames")
+    if not is_se3(edge.T_from_to, tolerance=1e-5):
+        raise SlamError(f"{name} is not a finite rigid transform")
+    for sigmas in (edge.sigmas, edge.graph_sigmas):
+        if sigmas.shape != (6,) or not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+            raise SlamError(f"{name} needs six positive sigmas; got {sigmas}")
+
+
+def _pose3(T_a_b: FloatArray) -> Any:
+    return gtsam.Pose3(gtsam.Rot3(T_a_b[:3, :3]), T_a_b[:3, 3])

@@ -1,0 +1,87 @@
+"""Keyframes' learned depth refined by their neighbours at the optimised poses (`erfsfm.mvs`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from erfsfm.mvs.appearance import Appearance
+from erfsfm.mvs.refine import RefinedDepth, Road, refine
+from slam.frames import DepthMap, Image, Intrinsics
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
+
+BASELINES = (0.07, 0.2)  # wanted distances of neighbours over the median depth, after the keyframe and before it
+BASELINE_RANGE = 2.5  # accepted factor on these
+MOST_NEIGHBOURS = 3
+MAX_FRAMES_APART = 40
+MAX_ROTATION_DEG = 20.0
+_REMEMBERED = 24
+
+
+class DepthRefiner:
+    """Refines keyframes of one drive in time order."""
+
+    def __init__(
+        self,
+        intrinsics: Intrinsics,
+        indices: Sequence[int],
+        T_world_camera: FloatArray,
+        image: Callable[[int], Image],
+    ) -> None:
+        """Prepare.
+
+        Args:
+            intrinsics: of the keyframes' images.
+            indices: frame numbers of the K keyframes, ascending.
+            T_world_camera: their poses ``(K, 4, 4)``, in the unit of the depths to come.
+            image: the n-th keyframe's image ``(H, W, 3)``.
+        """
+        self._intrinsics = intrinsics
+        self._indices = np.asarray(indices)
+        self._T_world_camera = T_world_camera
+        self._appearance = lru_cache(maxsize=_REMEMBERED)(lambda n: _appearance(image(n)))
+
+    def refine(self, n: int, depth: DepthMap, road: Road | None) -> RefinedDepth | None:
+        """The n-th keyframe's metric depth ``(H, W)``, refined; None where no neighbour is at a useful distance.
+
+        Pixels without depth, as other sources than the networks may have, begin with that of the nearest pixel which
+        has one; what the images do not measure there has an infinite sigma.
+        """
+        unknown = ~(np.isfinite(depth) & (depth > 0))
+        if unknown.all():
+            return None
+        neighbours = self._neighbours(n, float(np.median(depth[~unknown])))
+        if not neighbours:
+            return None
+        if unknown.any():
+            nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+            depth = depth[tuple(nearest)]
+        T_neighbour_target = invert(self._T_world_camera[neighbours]) @ self._T_world_camera[n]
+        others = [self._appearance(k) for k in neighbours]
+        refined = refine(self._appearance(n), depth, others, self._intrinsics.K, T_neighbour_target, road)
+        refined.relative_sigma[unknown & ~refined.measured] = np.inf
+        return refined
+
+    def _neighbours(self, n: int, median_depth: float) -> list[int]:
+        """The best keyframe at each wanted distance, at most three; those after are nearer to what is ahead."""
+        near = np.flatnonzero(np.abs(self._indices - self._indices[n]) <= MAX_FRAMES_APART)
+        T_target_other = invert(self._T_world_camera[n]) @ self._T_world_camera[near]
+        distance = np.linalg.norm(T_target_other[:, :3, 3], axis=1)
+        turned = rotation_angle(T_target_other[:, :3, :3])
+        chosen: list[int] = []
+        for side in (near > n, near < n):
+            for baseline in BASELINES:
+                off = np.abs(np.log(np.maximum(distance, 1e-9) / (baseline * median_depth)))
+                usable = side & (off < np.log(BASELINE_RANGE)) & (turned < np.deg2rad(MAX_ROTATION_DEG))
+                usable &= ~np.isin(near, chosen)
+                if usable.any():
+                    chosen.append(int(near[np.where(usable, off, np.inf).argmin()]))
+        return sorted(chosen[:MOST_NEIGHBOURS])
+
+
+def _appearance(image: Image) -> Appearance:
+    return Appearance.of(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8))

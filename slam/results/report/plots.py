@@ -1,0 +1,305 @@
+"""Figures for a paper and for the report: trajectories, errors, drift, depth and the map from above.
+
+Colours are those of Okabe and Ito (2008), distinct for colour-blind readers; line styles are distinct in
+grey. Matplotlib is imported inside the functions, without changes of its global state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from erfsfm.common.figure_file import require_figure, save_figure
+from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
+from slam.formats.trajectory import Trajectory, associate
+from slam.frames import DepthMap, Image
+from slam.results.comparison import METRES, unit_of_lengths
+from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.report.map_picture import AerialView
+from slam.runtime.errors import RunError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, FigureBase
+
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.labelsize": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e6ea",
+    "grid.linewidth": 0.7,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "erfsfm-slam",
+}
+_LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE: ("Ground truth", {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.2, "zorder": 4}),
+    "network": ("Network, chained", {"color": "#e69f00", "linestyle": "-", "linewidth": 1.3}),
+    "odometry": ("Odometry", {"color": "#cc79a7", "linestyle": (0, (6, 1.5, 1, 1.5)), "linewidth": 1.5}),
+    "optimised": ("Optimised", {"color": "#0072b2", "linestyle": "-", "linewidth": 2.0}),
+    "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
+}
+
+
+def trajectory_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Top view, x to the right and z ahead, all estimates aligned to the reference by 7 degrees of freedom.
+
+    Args:
+        trajectories: by name: ``reference``, ``network``, ``odometry``, ``optimised``, ``lidar``.
+        title: over the figure.
+        unit: of the positions where there is no reference.
+    """
+    return _figure(draw_trajectories, trajectories, title, unit, (7.4, 5.6))
+
+
+def errors_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Position error over the distance travelled, after the 7-dof alignment.
+
+    Raises:
+        RunError: there is no reference.
+    """
+    return _figure(draw_errors, trajectories, title, unit, (7.4, 3.4))
+
+
+def drift_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """Relative translation and rotation error over the length of segments, after the 7-dof alignment.
+
+    Raises:
+        RunError: there is no reference.
+    """
+    return _figure(draw_drift, trajectories, title, unit, (7.4, 3.4))
+
+
+def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw the top view on a figure or a part of one."""
+    axes = canvas.subplots()
+    has_reference = REFERENCE in trajectories
+    for name, trajectory in aligned(trajectories).items():
+        label, look = _LOOKS[name]
+        if not has_reference and name == "network" and "optimised" in trajectories:
+            label += " (scaled)"
+        axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
+    start = trajectories[REFERENCE if has_reference else next(iter(trajectories))].positions[0]
+    marker: dict[str, Any] = {"marker": "o", "markersize": 6.5, "markerfacecolor": "white", "markeredgewidth": 1.3}
+    axes.plot(start[0], start[2], color="black", linestyle="", zorder=5, label="Start", **marker)
+    unit = "m" if has_reference else unit
+    axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.legend(title="Estimates aligned by 7 dof" if has_reference else None, title_fontsize=9, **_beside())
+    return [axes]
+
+
+def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw the position error on a figure or a part of one."""
+    reference = _reference(trajectories)
+    axes = canvas.subplots()
+    for name, trajectory in estimates(aligned(trajectories)):
+        estimate, truth = associate(trajectory, reference)
+        error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
+        label, look = _LOOKS[name]
+        axes.plot(travelled(truth), error, label=label, **look)
+    axes.set(xlabel="distance travelled (m)", ylabel="position error (m), 7 dof")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.legend(**_beside())
+    return [axes]
+
+
+def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
+    """Draw translation and rotation drift on a figure or a part of one."""
+    reference = _reference(trajectories)
+    left, right = canvas.subplots(1, 2)
+    lengths: set[float] = set()
+    for name, trajectory in estimates(aligned(trajectories)):
+        drifts = segment_drifts(*associate(trajectory, reference))
+        length = [drift.length_m for drift in drifts]
+        lengths.update(length)
+        label, look = _LOOKS[name]
+        look = look | {"marker": "o", "markersize": 3.5}
+        left.plot(length, [100.0 * drift.translation for drift in drifts], label=label, **look)
+        right.plot(length, [np.rad2deg(100.0 * drift.rotation) for drift in drifts], label=label, **look)
+    left.set_ylabel("translation error (%), 7 dof")
+    right.set_ylabel("rotation error (deg / 100 m)")
+    for axes in (left, right):
+        axes.set_xlabel("segment length (m)")
+        axes.set_ylim(bottom=0)
+        if not lengths:
+            axes.text(0.5, 0.5, "path shorter than 10 m", ha="center", transform=axes.transAxes)
+        elif max(lengths) <= 100.0:
+            axes.set_xticks(sorted(lengths))
+    canvas.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return [left, right]
+
+
+def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Sequence[str]) -> Figure:
+    """Frames above their disparity, near in yellow and far in black, one colour scale for all.
+
+    Args:
+        images: ``(H, W, 3)`` uint8 RGB each.
+        depths: z-depth ``(H, W)`` each, any unit; grey where it is not positive and finite.
+        labels: over each frame.
+    """
+    from matplotlib import colormaps
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    height, width = images[0].shape[:2]
+    columns = min(len(images), 3 if width > 2 * height else 5)
+    blocks = -(-len(images) // columns)
+    disparities = [_disparity(depth) for depth in depths]
+    seen = np.concatenate([disparity.compressed() for disparity in disparities])
+    limits = np.percentile(seen, [2, 98]) if seen.size else np.array([0.0, 1.0])
+    colours = colormaps["inferno"].with_extremes(bad="#9aa0a6")
+    with figure_style() as new_figure:
+        block_width = 7.4 / columns
+        size = (7.4, blocks * (2 * block_width * height / width + 0.3))
+        narrow = ConstrainedLayoutEngine(w_pad=0.02, h_pad=0.02, hspace=0.02, wspace=0.02)
+        figure = new_figure(figsize=size, layout=narrow)
+        grid = figure.subplots(2 * blocks, columns, squeeze=False)
+        for axes in grid.flat:
+            axes.axis("off")
+        for k, (image, disparity, label) in enumerate(zip(images, disparities, labels)):
+            row, column = divmod(k, columns)
+            grid[2 * row, column].imshow(image)
+            grid[2 * row, column].set_title(label, fontsize=9, loc="left", pad=3)
+            grid[2 * row + 1, column].imshow(disparity, cmap=colours, vmin=limits[0], vmax=limits[1])
+    return figure
+
+
+def map_figure(view: AerialView, trajectory: Trajectory | None = None, unit: str = "m") -> Figure:
+    """The map from above in its colours, with the trajectory over it.
+
+    Args:
+        view: the map as an image.
+        trajectory: camera poses in the same world.
+        unit: of all lengths.
+    """
+    with figure_style() as new_figure:
+        share = (view.z[1] - view.z[0]) / (view.x[1] - view.x[0])
+        figure = new_figure(figsize=(7.4, np.clip(6.4 * share + 1.0, 2.6, 7.0)), layout="constrained")
+        axes = figure.subplots()
+        axes.imshow(view.image, extent=(*view.x, *view.z), interpolation="antialiased", zorder=2)
+        if trajectory:
+            path = trajectory.positions[:, [0, 2]]
+            look = _LOOKS["optimised"][1] | {"linewidth": 1.2, "zorder": 4}
+            axes.plot(path[:, 0], path[:, 1], color="white", linewidth=2.6, zorder=3)
+            axes.plot(path[:, 0], path[:, 1], **look, label="Optimised trajectory")
+            figure.legend(loc="outside upper center")
+        axes.set_aspect("equal")
+        axes.set(xlim=view.x, ylim=view.z, xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
+    return figure
+
+
+def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> None:
+    """Write one figure: a column for each run, a row for each of ``what``.
+
+    Raises:
+        RunError: an unknown ``what``, or a run without what the figure needs.
+        ConfigError: as `require_figure`.
+    """
+    panels = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
+    what = [name.strip() for name in what]
+    unknown = [name for name in what if name not in panels]
+    if unknown or not what or not runs:
+        wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
+        raise RunError(f"{wanted}: give at least one run and some of {', '.join(panels)}")
+    require_figure(output)
+    contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
+    heights = [4.6 if name == "trajectory" else 3.2 for name in what]
+    with figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4 * len(runs), sum(heights)), layout="constrained")
+        grid = figure.subfigures(len(what), len(runs), squeeze=False, height_ratios=heights)
+        for name, row in zip(what, grid):
+            drawn = [panels[name](part, each, length_unit(run)) for part, each, run in zip(row, contents, runs)]
+            if name != "trajectory":
+                _share_heights(drawn)
+        for part, run in zip(grid[0], runs):
+            part.suptitle(run.path.resolve().name, fontsize=12)
+        try:
+            save_figure(figure, output, dpi=200)
+        except OSError as error:
+            raise RunError(str(error)) from error
+
+
+def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, Trajectory]:
+    """The trajectories of a run, the reference first.
+
+    Raises:
+        RunError: there is none, or no reference where one is needed.
+    """
+    found = {name: run.trajectory(name) for name in (REFERENCE, *TRAJECTORIES)}
+    trajectories = {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+    if not trajectories:
+        raise RunError(f"{run.path} holds no trajectory: run the sequence again")
+    if needs_reference:
+        if REFERENCE not in trajectories:
+            raise RunError(f"{run.path} has no reference: errors and drift need ground truth; plot --what trajectory")
+        if len(trajectories) == 1:
+            raise RunError(f"{run.path} holds no estimated trajectory: run the sequence again")
+    return trajectories
+
+
+def length_unit(run: RunFolder) -> str:
+    """The unit of a run's trajectories and map, for the axes of a plot."""
+    unit = unit_of_lengths(run.metrics())
+    return "m" if unit == METRES else unit
+
+
+def _figure(
+    draw: Callable[[FigureBase, Mapping[str, Trajectory], str], list[Axes]],
+    trajectories: Mapping[str, Trajectory],
+    title: str,
+    unit: str,
+    size: tuple[float, float],
+) -> Figure:
+    with figure_style() as new_figure:
+        figure = new_figure(figsize=size, layout="constrained")
+        if title:
+            figure.suptitle(title, fontsize=12)
+        draw(figure, trajectories, unit)
+    return figure
+
+
+@contextmanager
+def figure_style() -> Iterator[Callable[..., Figure]]:
+    """The figure class under our style; without pyplot it leaves no global state."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_STYLE):
+        yield Figure
+
+
+def _beside() -> dict[str, Any]:
+    return {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+
+
+def _reference(trajectories: Mapping[str, Trajectory]) -> Trajectory:
+    if REFERENCE not in trajectories:
+        raise RunError("errors and drift need ground truth, and this run has no reference")
+    return trajectories[REFERENCE]
+
+
+def _disparity(depth: DepthMap) -> Any:
+    """1 / depth, masked where there is no depth."""
+    known = np.isfinite(depth) & (depth > 0)
+    return np.ma.masked_array(1.0 / np.where(known, depth, 1.0), mask=~known)
+
+
+def _share_heights(drawn: Sequence[Sequence[Axes]]) -> None:
+    """Set one upper limit for the axes of a row, so that runs can be compared."""
+    for same in zip(*drawn):
+        top = max(axes.get_ylim()[1] for axes in same)
+        for axes in same:
+            axes.set_ylim(0.0, top)

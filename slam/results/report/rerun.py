@@ -1,0 +1,86 @@
+"""A run as a recording for the rerun viewer: images and depth along the drive, trajectories, the map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.formats.trajectory import Trajectory
+from slam.frames import Intrinsics
+from slam.frontend.drive import Keyframe
+from slam.geometry.se3 import FloatArray
+from slam.pipeline.estimate import Estimate
+from slam.runtime.errors import EmptyMapError
+from slam.runtime.imports import import_rerun
+from slam.runtime.storage.files import write_atomically
+
+_COLOURS = {"reference": (120, 120, 120), "odometry": (240, 150, 40), "optimised": (40, 110, 240)}
+_JPEG_QUALITY = 85
+_POINT_VOXELS = 0.25  # radius of a map point in voxels
+
+
+def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
+    """Write ``.rrd``: on the timeline ``frame`` the camera with image and depth, over all time trajectories and map.
+
+    The world is that of the optimised trajectory, y down. Images and depth are those of keyframes,
+    thinned; depth is in the unit of the trajectory.
+
+    Args:
+        path: the file.
+        result: of a whole run.
+        intrinsics: of the sequence's images.
+
+    Raises:
+        SlamError: rerun is not installed, or the file cannot be written.
+    """
+    rr = import_rerun("--rerun")
+
+    def fill(partial: Path) -> None:
+        stream = rr.RecordingStream("erfsfm-slam")
+        stream.save(str(partial))
+        stream.log("world", rr.ViewCoordinates.RDF, static=True)
+        for name in _COLOURS:
+            trajectory: Trajectory | None = getattr(result, name)
+            if trajectory is not None:
+                strip = rr.LineStrips3D([trajectory.positions], colors=[_COLOURS[name]])
+                stream.log(f"world/{name}", strip, static=True)
+        keyframes = {keyframe.index: keyframe for keyframe in result.drive.keyframes}
+        for index, T_world_camera in enumerate(result.optimised.T_world_camera):
+            stream.set_time("frame", sequence=index)
+            stream.set_time("time", duration=float(result.optimised.stamps[index]))
+            _log_camera(rr, stream, T_world_camera)
+            if index in keyframes:
+                _log_images(rr, stream, keyframes[index], intrinsics, float(result.scale.per_frame[index]))
+        _log_map(rr, stream, result)
+        stream.flush()
+        stream.disconnect()
+
+    write_atomically(path, fill)
+
+
+def _log_camera(rr: Any, stream: Any, T_world_camera: FloatArray) -> None:
+    stream.log("world/camera", rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3]))
+
+
+def _log_images(rr: Any, stream: Any, keyframe: Keyframe, intrinsics: Intrinsics, scale: float) -> None:
+    height, width = keyframe.depth_unscaled.shape
+    K = intrinsics.resized(width, height).K
+    stream.log("world/camera/image", rr.Pinhole(image_from_camera=K, width=width, height=height))
+    stream.log("world/camera/image", rr.Image(keyframe.image).compress(jpeg_quality=_JPEG_QUALITY))
+    stream.log(
+        "world/camera/image/depth", rr.DepthImage(np.nan_to_num(keyframe.depth_unscaled * np.float32(scale)), meter=1.0)
+    )
+
+
+def _log_map(rr: Any, stream: Any, result: Estimate) -> None:
+    if result.map is None:
+        return
+    try:
+        cloud = result.map.cloud()
+    except EmptyMapError:  # an empty map, which the run has reported
+        return
+    colours = np.round(255 * np.clip(cloud.colours, 0, 1)).astype(np.uint8)
+    points = rr.Points3D(cloud.points_world, colors=colours, radii=_POINT_VOXELS * result.map.voxel_size)
+    stream.log("world/map", points, static=True)

@@ -1,0 +1,45 @@
+"""Atomic writes, with one line of error, and places of files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from erfsfm.common import files
+from slam.runtime.errors import SlamError
+
+# some keyframes of a pass that has not ended (`slam.pipeline.checkpoint`)
+KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")
+
+
+def write_atomically(
+    path: Path, fill: Callable[[Path], object], error: type[SlamError] = SlamError, sync: bool = True
+) -> None:
+    """`erfsfm.common.files.write_atomically` that raises a `SlamError`.
+
+    Raises:
+        SlamError: (or the given kind) the file cannot be written.
+    """
+    try:
+        files.write_atomically(path, fill, sync)
+    except OSError as cause:
+        raise error(str(cause)) from cause
+
+
+def remove(path: Path, error: type[SlamError] = SlamError) -> None:
+    """Remove a file if it is there.
+
+    Raises:
+        SlamError: (or the given kind) it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as cause:
+        raise error(f"{path} cannot be removed: {cause.strerror or cause}") from cause
+
+
+def from_anywhere(name_or_path: str | Path) -> str:
+    """A file or folder that is there by its whole path, which holds in any folder; all else as it is."""
+    path = Path(name_or_path)
+    return str(path.absolute() if path.exists() else name_or_path)

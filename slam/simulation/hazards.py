@@ -1,0 +1,150 @@
+"""Hazards of a simulated drive: moving cars, exposure jumps, motion blur, a stop, rain."""
+
+import dataclasses
+from typing import Literal
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slam.geometry import se3
+from slam.simulation.geometry import Bend, Float32Array, FloatArray, Mesh, Soup
+from slam.simulation.objects import car, frame_at
+from slam.simulation.route import STEP, Route
+
+Hazard = Literal["moving-cars", "exposure", "blur", "stop", "rain"]
+
+STILL_FRAMES = 30  # 3 s at 10 frames a second
+SHUTTER = 0.5  # exposure time of a blurred image over the frame interval
+BLUR_SAMPLES = 6
+_FLAT = Bend(np.zeros(3), np.ones(3), np.zeros((3, 2)))
+
+
+def exposure_curve(seed: int, frames: int) -> FloatArray:
+    """Gain and gamma of every frame ``(N, 2)``, piecewise constant."""
+    rng = np.random.default_rng([seed, 31])
+    curve = np.empty((frames, 2))
+    start = 0
+    while start < frames:
+        stop = start + int(rng.integers(12, 45))
+        curve[start:stop] = rng.uniform(0.55, 1.5), rng.uniform(0.75, 1.3)
+        start = stop
+    return curve
+
+
+def exposed(rgb: Float32Array, gain: float, gamma: float) -> Float32Array:
+    """An image about [0, 1] under another exposure."""
+    return np.asarray(gain * np.power(np.clip(rgb, 0.0, 1.0), gamma), dtype=np.float32)
+
+
+def rained_on(rgb: Float32Array, seed: int, index: int) -> Float32Array:
+    """Rain streaks and reduced contrast over an image ``(H, W, 3)`` about [0, 1]."""
+    rng = np.random.default_rng([seed, 32, index])
+    height, width = rgb.shape[:2]
+    drops = (rng.random((height, width)) < 0.005).astype(np.float32) * rng.uniform(0.4, 1.0)
+    length = max(3, height // 11)
+    kernel = np.zeros((length, length), dtype=np.float32)
+    slant = float(rng.uniform(-0.3, 0.3))
+    for row in range(length):
+        kernel[row, int(length / 2 + slant * (row - length / 2))] = 1.0
+    streaks = np.clip(cv2.filter2D(drops, -1, kernel), 0.0, 1.0)[..., None] * 0.4
+    veiled = rgb * 0.85 + 0.07
+    return np.asarray(veiled + streaks * (0.85 - veiled), dtype=np.float32)
+
+
+def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
+    """Poses while the shutter is open around a frame, ``(BLUR_SAMPLES, 4, 4)``; all one pose at a stop."""
+    low, high = max(index - 1, 0), min(index + 1, len(T_street_camera) - 1)
+    here = T_street_camera[index]
+    T_low_high = se3.invert(T_street_camera[low]) @ T_street_camera[high]
+    turn = Rotation.from_matrix(T_low_high[:3, :3]).as_rotvec()
+    if np.array_equal(here, T_street_camera[high]):
+        return np.repeat(here[None], BLUR_SAMPLES, axis=0)
+    fraction = (np.arange(BLUR_SAMPLES) + 0.5) / BLUR_SAMPLES - 0.5
+    fraction *= SHUTTER / (high - low)
+    T_here_shutter = se3.from_rotation_vector(fraction[:, None] * turn, fraction[:, None] * T_low_high[:3, 3])
+    return np.asarray(here @ T_here_shutter)
+
+
+class Traffic:
+    """Moving cars: one ahead of the camera for a while, others oncoming."""
+
+    def __init__(self, drive: Route, seed: int) -> None:
+        rng = np.random.default_rng([seed, 33])
+        self._route = drive
+        self._starts: list[tuple[float, float, float]] = []  # offset in lane samples, per frame, side in metres
+        meets = float(rng.uniform(4.0, 15.0))
+        while meets < len(drive.sample):
+            speed = -float(rng.uniform(0.7, 1.2)) / STEP
+            start = float(drive.sample[int(meets)]) - speed * meets
+            self._starts.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3))))
+            meets += float(rng.uniform(12.0, 40.0))
+        self._gap = float(rng.uniform(9.0, 14.0)) / STEP
+        self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
+        soup = Soup(rng)
+        firsts = []
+        for _ in range(len(self._starts) + 1):
+            firsts.append(soup.instances)
+            car(soup, rng, frame_at(0.0, 0.0, 0.0))
+        self._mesh = soup.finish(_FLAT)
+        self._car_of_triangle = np.searchsorted(firsts, self._mesh.instance, side="right") - 1
+
+    def placed(self, index: int) -> Mesh | None:
+        """The cars within sight at a frame, in the street frame; None if there are none."""
+        camera = self._route.T_street_camera[index, :3, 3]
+        T_street_cars = [self._leader(index), *(self._oncoming(start, index) for start in self._starts)]
+        parts = []
+        for number, T_street_car in enumerate(T_street_cars):
+            if T_street_car is None:
+                continue
+            distance = float(np.linalg.norm(T_street_car[:3, 3] - camera))
+            if 2.6 < distance < 120.0:  # nearer only where the drive crosses itself
+                parts.append(self._part(number, T_street_car))
+        if not parts:
+            return None
+        corners = np.concatenate([part.vertices for part in parts])
+        return dataclasses.replace(
+            self._mesh,
+            vertices=corners,
+            triangles=np.arange(len(corners), dtype=np.uint32).reshape(-1, 3),
+            uv=np.concatenate([part.uv for part in parts], axis=-1),
+            normals=np.concatenate([part.normals for part in parts], axis=-1),
+            tangents=np.concatenate([part.tangents for part in parts], axis=-1),
+            instance=np.concatenate([part.instance for part in parts]),
+            material=np.concatenate([part.material for part in parts]),
+        )
+
+    def _part(self, number: int, T_street_car: FloatArray) -> Mesh:
+        """One car's triangles, three vertices each, moved into the street."""
+        mine = self._car_of_triangle == number
+        R, t = T_street_car[:3, :3].astype(np.float32), T_street_car[:3, 3].astype(np.float32)
+        return dataclasses.replace(
+            self._mesh,
+            vertices=self._mesh.vertices[self._mesh.triangles[mine].ravel()] @ R.T + t,
+            uv=self._mesh.uv[..., mine],
+            normals=R @ self._mesh.normals[:, mine],
+            tangents=R @ self._mesh.tangents[:, mine],
+            instance=self._mesh.instance[mine],
+            material=self._mesh.material[mine],
+        )
+
+    def _leader(self, index: int) -> FloatArray | None:
+        """A car in the camera's lane that keeps its distance, until it drives away."""
+        faster = max(0.0, index - self._leader_leaves) * 0.5 / STEP
+        return self._at(float(self._route.sample[index]) + self._gap + faster, 0.0, 1.0)
+
+    def _oncoming(self, start: tuple[float, float, float], index: int) -> FloatArray | None:
+        return self._at(start[0] + start[1] * index, start[2], -1.0)
+
+    def _at(self, sample: float, left_m: float, sense: float) -> FloatArray | None:
+        """``T_street_car`` at a lane sample, beside the lane; None beyond its ends."""
+        lane = self._route.lane_street
+        k = int(np.floor(sample))
+        if not 2 <= k < len(lane) - 3:
+            return None
+        ahead = sense * (lane[k + 2] - lane[k - 2])
+        ahead /= np.linalg.norm(ahead)
+        left = np.cross([0.0, 0.0, 1.0], ahead)
+        left /= np.linalg.norm(left)
+        position = lane[k] + (sample - k) * (lane[k + 1] - lane[k]) + sense * left_m * left
+        return se3.make(np.stack([ahead, left, np.cross(ahead, left)], axis=1), position)

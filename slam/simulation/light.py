@@ -1,0 +1,80 @@
+"""Sun, sky and haze of one world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam.simulation.geometry import Float32Array
+from slam.simulation.noise import Texels, fractal
+
+
+@dataclass(frozen=True)
+class Weather:
+    """How a world is lit.
+
+    Attributes:
+        sun: unit direction towards the sun, street frame, ``(3,)``.
+        sunshine: strength of the direct light, 0 overcast.
+        ambient: strength of the light from everywhere.
+        zenith: colour of the sky overhead, ``(3,)``.
+        horizon: colour of the sky low down, and of the haze, ``(3,)``.
+        clouds: cover, 0 to 1.
+        visibility_m: distance at which the haze has taken 63 %.
+        exposure: gain of the camera.
+    """
+
+    sun: Float32Array
+    sunshine: float
+    ambient: float
+    zenith: Float32Array
+    horizon: Float32Array
+    clouds: float
+    visibility_m: float
+    exposure: float
+
+
+def draw_weather(seed: int) -> Weather:
+    """Weather of a world."""
+    rng = np.random.default_rng([seed, 20])
+    azimuth, elevation = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.1)
+    sun = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    sunshine = float(rng.uniform(0.25, 0.75))
+    return Weather(
+        sun=np.array(sun, dtype=np.float32),
+        sunshine=sunshine,
+        ambient=0.95 - 0.6 * sunshine,
+        zenith=(np.array([0.38, 0.56, 0.85]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        horizon=(np.array([0.80, 0.84, 0.88]) + rng.uniform(-0.06, 0.06, 3)).astype(np.float32),
+        clouds=float(rng.uniform(0.0, 1.0)),
+        visibility_m=float(rng.uniform(220.0, 600.0)),
+        exposure=float(rng.uniform(0.95, 1.2)),
+    )
+
+
+def sky(weather: Weather, directions: Float32Array) -> Float32Array:
+    """Colour of the sky along unit ``directions`` in the street frame, ``(3, N)`` both."""
+    up = np.clip(directions[2], 0.0, 1.0)
+    rgb = weather.horizon[:, None] + np.sqrt(up) * (weather.zenith - weather.horizon)[:, None]
+    plane = directions[:2] / (up + 0.12)
+    still = np.zeros_like(up)
+    size = 0.006 / (up + 0.12)
+    texels = Texels(plane[0], plane[1], size, size, still, still)
+    cover = fractal(texels, (1.6, 1.6, 0.6), (0.6, 0.6, 0.35), (0.22, 0.22, 0.18)) + weather.clouds - 0.5
+    fraction = np.clip(1.6 * cover, 0.0, 0.85)
+    white = 0.88 + 0.08 * np.clip(cover, 0.0, 1.0)
+    return np.asarray(rgb + fraction * (white - rgb), dtype=np.float32)
+
+
+def light(weather: Weather, normals: Float32Array, lit: Float32Array) -> Float32Array:
+    """Irradiance on surfaces that face the viewer, ``(3, N)``.
+
+    Args:
+        weather: of the world.
+        normals: unit, towards the viewer, ``(3, N)``.
+        lit: 1 where the sun is seen, ``(N,)``.
+    """
+    direct = weather.sunshine * np.clip(weather.sun @ normals, 0.0, 1.0) * lit
+    around = weather.ambient * (0.78 + 0.22 * normals[2])
+    warm = np.array([[1.05], [1.0], [0.92]], dtype=np.float32)
+    cool = np.array([[0.96], [1.0], [1.06]], dtype=np.float32)
+    return np.asarray(direct * warm + around * cool, dtype=np.float32)

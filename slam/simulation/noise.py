@@ -1,0 +1,111 @@
+"""Value noise on an integer lattice and box-filtered stripes, band-limited against aliasing."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.simulation.geometry import Float32Array
+
+Lengths = NDArray[np.floating[Any]]
+
+_SIZE = 256  # lattice cells before the noise repeats
+
+
+@dataclass(frozen=True)
+class Texels:
+    """Texture coordinates of the pixels of one material; every field is ``(N,)``, metres.
+
+    Attributes:
+        u: along the surface.
+        v: across or up the surface.
+        u_size: footprint of the pixel along u.
+        v_size: footprint of the pixel along v.
+        shift: offset of the instance in the noise along u.
+        shift_v: the same along v.
+    """
+
+    u: Float32Array
+    v: Float32Array
+    u_size: Float32Array
+    v_size: Float32Array
+    shift: Float32Array
+    shift_v: Float32Array
+
+
+@functools.cache
+def _lattice() -> Float32Array:
+    """Random values in [-1, 1], flattened ``(_SIZE ** 2,)``."""
+    return np.random.default_rng(20261121).uniform(-1.0, 1.0, _SIZE * _SIZE).astype(np.float32)
+
+
+def value_noise(u: Float32Array, v: Float32Array) -> Float32Array:
+    """Smooth noise in [-1, 1] with one lattice cell per unit, ``(N,)``."""
+    table = _lattice()
+    whole_u, whole_v = np.floor(u), np.floor(v)
+    a, b = u - whole_u, v - whole_v
+    a *= a * (3.0 - 2.0 * a)
+    b *= b * (3.0 - 2.0 * b)
+    i, j = whole_u.astype(np.int32), whole_v.astype(np.int32)
+    left, right = (i & 255) << 8, ((i + 1) & 255) << 8
+    low, high = j & 255, (j + 1) & 255
+    bottom = np.take(table, left | low)
+    bottom += a * (np.take(table, right | low) - bottom)
+    top = np.take(table, left | high)
+    top += a * (np.take(table, right | high) - top)
+    top -= bottom
+    top *= b
+    top += bottom
+    return top
+
+
+def cell_hash(u: Float32Array, v: Float32Array, salt: int) -> Float32Array:
+    """A random number in [0, 1] for each integer cell, ``(N,)``."""
+    i = (np.floor(u).astype(np.int32) + 37 * salt) & 255
+    j = (np.floor(v).astype(np.int32) + 101 * salt) & 255
+    return np.asarray(0.5 + 0.5 * np.take(_lattice(), (i << 8) | j))
+
+
+def fractal(texels: Texels, *octaves: tuple[float, float, float]) -> Float32Array:
+    """Sum of noise octaves, each faded out where its waves are smaller than about two pixels.
+
+    Args:
+        texels: texture coordinates.
+        octaves: wavelength along u, wavelength along v (metres), amplitude.
+    """
+    total = np.zeros_like(texels.u)
+    for k, (wave_u, wave_v, amplitude) in enumerate(octaves):
+        pixels = np.minimum(wave_u / texels.u_size, wave_v / texels.v_size)
+        weight = np.clip((pixels - 1.2) / 1.8, 0.0, 1.0)
+        visible = weight > 0.0
+        if not visible.all():
+            chosen = np.flatnonzero(visible)
+            if not len(chosen):
+                continue
+            u = (texels.u[chosen] + texels.shift[chosen]) / wave_u + 17.3 * k
+            v = (texels.v[chosen] + texels.shift_v[chosen]) / wave_v + 5.7 * k
+            total[chosen] += amplitude * weight[chosen] * value_noise(u, v)
+            continue
+        u = (texels.u + texels.shift) / wave_u + 17.3 * k
+        v = (texels.v + texels.shift_v) / wave_v + 5.7 * k
+        total += amplitude * weight * value_noise(u, v)
+    return total
+
+
+def stripes(x: Lengths, size: Lengths, period: Lengths | float, width: Lengths | float) -> Float32Array:
+    """Fraction of each pixel covered by stripes [k period, k period + width], filtered over ``size``."""
+    half = 0.5 * np.maximum(size, 1e-4)
+
+    def integral(at: Lengths) -> Lengths:
+        whole = np.floor(at / period)
+        return np.asarray(whole * width + np.minimum(at - whole * period, width))
+
+    return np.asarray((integral(x + half) - integral(x - half)) / (2.0 * half))
+
+
+def band(x: Lengths, size: Lengths, low: Lengths | float, high: Lengths | float) -> Float32Array:
+    """Fraction of each pixel covered by the one stripe [low, high]."""
+    inverse = 1.0 / np.maximum(size, 1e-4)
+    return np.asarray(np.clip((x - low) * inverse + 0.5, 0, 1) - np.clip((x - high) * inverse + 0.5, 0, 1))

@@ -1,0 +1,46 @@
+"""The simulated camera: intrinsics, rays and the size of a pixel on a surface."""
+
+import numpy as np
+
+from slam.simulation.geometry import Float32Array, FloatArray
+
+# KITTI odometry 00-02 (rectified colour camera), the size it was recorded at
+_KITTI_SIZE = (1241, 376)
+_KITTI_FOCAL_PX = 718.856
+_KITTI_CENTRE_PX = (607.1928, 185.2157)
+
+
+def kitti_intrinsics(width: int, height: int) -> FloatArray:
+    """KITTI's camera matrix for a resized image, half-pixel exact, ``(3, 3)``."""
+    sx, sy = width / _KITTI_SIZE[0], height / _KITTI_SIZE[1]
+    cx, cy = (_KITTI_CENTRE_PX[0] + 0.5) * sx - 0.5, (_KITTI_CENTRE_PX[1] + 0.5) * sy - 0.5
+    return np.array([[_KITTI_FOCAL_PX * sx, 0.0, cx], [0.0, _KITTI_FOCAL_PX * sy, cy], [0.0, 0.0, 1.0]])
+
+
+def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:
+    """Directions with z = 1 through every pixel, row by row, camera frame, ``(H * W, 3)``."""
+    v, u = np.mgrid[0:height, 0:width].reshape(2, -1)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(width * height)], axis=1)
+    return rays.astype(np.float32)
+
+
+def footprint(
+    pixel: Float32Array, rays: Float32Array, normals: Float32Array, tangents: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Extent of a pixel on a surface along its u and v axes, grazing angle included.
+
+    A round pixel of size f seen at angle a to the normal is an ellipse of axes f and f / cos a; along a
+    tangent t it extends f sqrt(1 + (ray . t)^2 / cos^2 a).
+
+    Args:
+        pixel: size of the pixel at the surface's distance, metres, ``(N,)``.
+        rays: unit, ``(3, N)``.
+        normals: unit, ``(3, N)``.
+        tangents: unit direction of u, ``(3, N)``.
+    """
+    cosine = np.abs((rays * normals).sum(axis=0))
+    along_u = (rays * tangents).sum(axis=0)
+    cosine2 = np.maximum(cosine * cosine, 1e-4)
+    u2 = along_u * along_u
+    v2 = np.maximum(1.0 - cosine * cosine - u2, 0.0)
+    return pixel * np.sqrt(1.0 + u2 / cosine2), pixel * np.sqrt(1.0 + v2 / cosine2)

@@ -1,0 +1,233 @@
+"""Camera poses over time: a drive along a street plan, with a car's speed, sway and lane keeping."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from slam.geometry import se3
+from slam.runtime.errors import SequenceError
+from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
+from slam.simulation.streets import (
+    SMALLEST_BLOCK,
+    StreetPlan,
+    grid_walk,
+    loop_cycle,
+    road_plan,
+    town_plan,
+)
+
+RouteKind = Literal["loop", "grid", "straight"]
+
+STEP = 0.25  # between samples of a path in the plan, metres
+OVERLAP = 67.0  # length of the start that a loop drives again, metres
+START = 25.0  # of a lone road, so that there is something behind the camera, metres
+CRUISE = 1.1  # metres per frame
+SLOWEST = 0.5  # metres per frame, except around a stop
+LATERAL_ACCELERATION = 0.045  # in corners, metres per frame squared (4.5 m/s^2)
+ACCELERATION = 0.022  # along the road, metres per frame squared
+FEWEST_LOOP_FRAMES = 250
+
+
+@dataclass(frozen=True)
+class Route:
+    """The camera's trajectory through a street plan.
+
+    Attributes:
+        plan: the streets.
+        bend: from plan to street coordinates.
+        T_street_camera: ``(N, 4, 4)``; street: x east, y north, z up, metres.
+        camera_height_m: of the camera at rest above the road.
+        lane_street: the driven path on the road, at least ``STEP`` metres of plan each, ``(M, 3)``.
+        lane_offset_m: from the middle of the street to the right.
+        sample: where in ``lane_street`` each frame is, ``(N,)``.
+    """
+
+    plan: StreetPlan
+    bend: Bend
+    T_street_camera: FloatArray
+    camera_height_m: float
+    lane_street: FloatArray
+    lane_offset_m: float
+    sample: FloatArray
+
+
+def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) -> Route:
+    """Lay out streets and a drive of ``frames`` frames over them.
+
+    Args:
+        route: ``loop`` drives its start again, ``grid`` repeats streets in both directions (with about
+            250 frames), ``straight`` never comes back.
+        frames: how many poses.
+        seed: decides everything.
+        still_frames: how long to stand still in the middle.
+
+    Raises:
+        SequenceError: if there are too few frames for the route.
+    """
+    moving = frames - still_frames
+    if moving < 2:
+        raise SequenceError(f"this drive needs at least {still_frames + 2} frames; got {frames}")
+    if route == "loop" and frames < FEWEST_LOOP_FRAMES:
+        raise SequenceError(f"a loop closes within {FEWEST_LOOP_FRAMES} frames or more; got {frames} frames")
+    stops = still_frames > 0
+    plan, bend, lane_plan = _layout(route, moving, seed, stops)
+    arrival = _arrival(bend, lane_plan, stops, moving)
+    if route == "loop":
+        arrival *= (moving - 1.0) / arrival[-1]
+    rng = np.random.default_rng([seed, 2])
+    camera_height_m = float(rng.uniform(1.5, 1.8))
+    sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
+    T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m)
+    if stops:
+        rest = int(np.argmin(np.diff(sample)))
+        order = np.insert(np.arange(moving), rest, [rest] * still_frames)
+        sample, T_street_camera = sample[order], T_street_camera[order]
+    lane_street = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
+    return Route(plan, bend, T_street_camera, camera_height_m, lane_street, _lane_offset(plan, seed), sample)
+
+
+def _layout(route: RouteKind, moving: int, seed: int, stops: bool) -> tuple[StreetPlan, Bend, FloatArray]:
+    """Streets, their bend, and the lane to drive ``(M, 2)``, long enough for ``moving`` frames."""
+    rng = np.random.default_rng([seed, 0])
+    if route == "straight":
+        end = START + 1.25 * moving + 5.0
+        plan = road_plan(rng, end)
+        bend = road_bend(np.random.default_rng([seed, 1]), plan.xs[0] - 200.0, plan.xs[-1] + 200.0)
+        return plan, bend, _lane(plan, seed)[int(START / STEP) : int(end / STEP)]
+    bend = town_bend(np.random.default_rng([seed, 1]))
+    if route == "grid":
+        side = 3 if moving < 500 else 4 if moving < 1200 else 5
+        spacing = 24.0 if moving < 330 else 30.0 if moving < 500 else 40.0 if moving < 1200 else 52.0
+        walk = grid_walk(rng, side, int(0.95 * moving / spacing), spare=int(0.35 * moving / spacing) + 2)
+        plan = town_plan(rng, walk, spacing, side_streets=0.6)
+        return plan, bend, _lane(plan, seed)[int(5.0 / STEP) :]
+    edges = max(8, 2 * round((0.95 * moving - OVERLAP) / 84.0))
+    spacing = 36.0
+    for _ in range(8):
+        rng = np.random.default_rng([seed, 0])
+        cycle = loop_cycle(rng, edges)
+        plan = town_plan(rng, cycle + cycle + cycle[:1], spacing, side_streets=0.35)
+        lane_plan = _loop_lane(plan, seed)
+        stretch = (moving - 1.0) / _arrival(bend, lane_plan, stops, moving)[-1]
+        if abs(stretch - 1.0) < 0.004:
+            break
+        spacing = max(SMALLEST_BLOCK, spacing * stretch**1.2)
+    return plan, bend, lane_plan
+
+
+def _lane_offset(plan: StreetPlan, seed: int) -> float:
+    """How far right of the middle of the street the car drives, metres."""
+    return float(np.random.default_rng([seed, 4]).uniform(0.33, 0.38)) * plan.half_width
+
+
+def _loop_lane(plan: StreetPlan, seed: int) -> FloatArray:
+    """Lane around a cycle that is driven twice, cut off ``OVERLAP`` metres after its start is revisited."""
+    first, second = plan.node(plan.drive[0]), plan.node(plan.drive[1])
+    lane = _lane(plan, seed)[int(0.5 * float(np.linalg.norm(second - first)) / STEP) :]
+    away = np.linalg.norm(lane - lane[0], axis=1)
+    met = int(60.0 / STEP)
+    met += int(np.argmax(away[met:] < 2.0))
+    met += int(np.argmin(away[met : met + int(8.0 / STEP)]))
+    return lane[: met + int(OVERLAP / STEP) + 1]
+
+
+def _lane(plan: StreetPlan, seed: int) -> FloatArray:
+    """The whole driven path: right-hand lane with rounded corners and a little drift, ``(M, 2)``."""
+    rng = np.random.default_rng([seed, 3])
+    nodes = np.stack([plan.node(node) for node in plan.drive])  # (n, 2)
+    offset = _lane_offset(plan, seed)
+    ahead = np.diff(nodes, axis=0)
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    turns = ahead[:-1, 0] * ahead[1:, 1] - ahead[:-1, 1] * ahead[1:, 0]
+    corners = [nodes[0] + offset * right[0]]
+    for node, before, after, turn in zip(nodes[1:-1], right[:-1], right[1:], turns):
+        corners.append(node + offset * (before + after if abs(turn) > 0.5 else after))
+    corners.append(nodes[-1] + offset * right[-1])
+    points = [corners[0]]
+    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:]):
+        points.extend(_corner(rng, before, corner, after))
+    path = _resample(np.stack([*points, corners[-1]]))
+    path = gaussian_filter1d(path, 1.6 / STEP, axis=0, mode="nearest")
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    drift = gaussian_filter1d(rng.standard_normal(len(path)), 14.0 / STEP)
+    drift *= 0.13 / max(float(drift.std()), 1e-9)
+    path += np.clip(drift, -0.28, 0.28)[:, None] * np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    return _resample(path)
+
+
+def _corner(rng: np.random.Generator, before: FloatArray, corner: FloatArray, after: FloatArray) -> list[FloatArray]:
+    """An arc of 8.5 to 11 m radius, less where the edges are short; nothing but the corner if straight on."""
+    a, b = before - corner, after - corner
+    shorter = min(float(np.linalg.norm(a)), float(np.linalg.norm(b)))
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    wish = rng.uniform(8.5, 11.0)
+    if a @ b < -0.5:
+        return [corner]
+    radius = min(wish, 0.49 * shorter)
+    centre = corner + radius * (a + b)
+    return [centre - radius * (np.cos(t) * b + np.sin(t) * a) for t in np.linspace(0.0, np.pi / 2.0, 12)]
+
+
+def _resample(path: FloatArray) -> FloatArray:
+    """Points every ``STEP`` metres along a polyline."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    along = np.arange(0.0, length[-1], STEP)
+    return np.stack([np.interp(along, length, path[:, i]) for i in range(path.shape[1])], axis=1)
+
+
+def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> FloatArray:
+    """Frame number at each point of a lane: slow in corners, acceleration bounded as a car's."""
+    points = bend(np.pad(lane_plan, ((0, 0), (0, 1))))
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    tangent = np.gradient(points[:, :2], axis=0)
+    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+    curvature = np.abs(gaussian_filter1d(np.gradient(heading), 4.0)) / float(step.mean())
+    along = np.cumsum(step)
+    cruise = CRUISE * (1.0 + 0.12 * np.sin(along / 23.0) * np.sin(along / 61.0 + 1.0))
+    speed = np.clip(np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature[1:], 1e-4)), SLOWEST, cruise)
+    if stops:
+        rest = 0.5 * min(float(along[-1]), 0.9 * moving)
+        speed = np.minimum(speed, 0.08 + np.sqrt(2.5 * ACCELERATION * np.abs(along - rest)))
+    for k in range(1, len(speed)):
+        speed[k] = min(speed[k], np.sqrt(speed[k - 1] ** 2 + 2.0 * ACCELERATION * step[k]))
+    for k in range(len(speed) - 2, -1, -1):
+        speed[k] = min(speed[k], np.sqrt(speed[k + 1] ** 2 + 2.0 * ACCELERATION * step[k]))
+    return np.concatenate([[0.0], np.cumsum(step / speed)])
+
+
+def _poses(
+    rng: np.random.Generator, bend: Bend, lane_plan: FloatArray, sample: FloatArray, camera_height_m: float
+) -> FloatArray:
+    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension."""
+    rows = np.arange(len(lane_plan))
+    direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
+    plan_xy = np.stack([np.interp(sample, rows, lane_plan[:, i]) for i in range(2)], axis=1)
+    tangent = np.stack([np.interp(sample, rows, direction[:, i]) for i in range(2)], axis=1)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    at = np.pad(plan_xy, ((0, 0), (0, 1)))
+    ahead = np.pad(tangent, ((0, 0), (0, 1)))
+    across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(at))], axis=1)
+    forward = bend(at + ahead) - bend(at - ahead)
+    right = bend(at + across) - bend(at - across)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right -= (right * forward).sum(axis=1, keepdims=True) * forward
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    down = np.cross(forward, right)
+    suspension = _suspension(rng, len(at))
+    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
+    position = bend(at) - (camera_height_m + suspension[:, 3:]) * down
+    T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
+    return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))
+
+
+def _suspension(rng: np.random.Generator, frames: int) -> FloatArray:
+    """Suspension: pitch, yaw and roll about x, y, z in radians and height in metres, correlated in time, ``(N, 4)``."""
+    white = rng.standard_normal((frames + 60, 4))
+    slow, fast = (gaussian_filter1d(white, sigma, axis=0) * np.sqrt(3.54 * sigma) for sigma in (8.0, 2.0))
+    mixed = (0.8 * slow + 0.6 * fast)[30:-30]
+    sizes = np.array([np.deg2rad(0.3), np.deg2rad(0.2), np.deg2rad(0.3), 0.012])
+    return np.asarray(np.clip(mixed, -2.2, 2.2) * sizes)

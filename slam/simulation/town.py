@@ -1,0 +1,239 @@
+"""Surfaces of a street plan: roads, pavements, lots and the objects on them."""
+
+import numpy as np
+
+from slam.simulation import objects
+from slam.simulation.geometry import Bend, FloatArray, Material, Mesh, Soup
+from slam.simulation.streets import StreetPlan
+
+KERB = 0.13  # height of pavements above the road, metres
+ROUNDING = 5.0  # radius of kerbs at corners, metres
+Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
+
+
+def build_town(plan: StreetPlan, bend: Bend, seed: int) -> Mesh:
+    """Every static surface of the world, in street coordinates."""
+    rng = np.random.default_rng([seed, 10])
+    town = _Town(plan, rng)
+    town.ground()
+    for i in range(len(plan.xs) - 1):
+        for j in range(len(plan.ys) - 1):
+            town.block(i, j)
+    town.backdrop()
+    return town.soup.finish(bend)
+
+
+class _Town:
+    """The mesh under construction, with the colours and proportions of one world."""
+
+    def __init__(self, plan: StreetPlan, rng: np.random.Generator) -> None:
+        self.plan, self.rng, self.soup = plan, rng, Soup(rng)
+        self.density = float(rng.uniform(0.5, 0.9))  # of buildings
+        self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
+        self.greenery = float(rng.uniform(0.25, 0.8))
+        self.pavement_width = float(rng.uniform(1.6, 2.4))
+        grey = objects.colour(rng, (0.36, 0.36, 0.37), (0.28, 0.28, 0.30), (0.42, 0.41, 0.39), spread=0.03)
+        stone = objects.colour(rng, (0.55, 0.54, 0.52), (0.50, 0.46, 0.43), spread=0.04)
+        turf = objects.colour(rng, (0.26, 0.36, 0.14), (0.34, 0.38, 0.18), spread=0.02)
+        paint = np.array([0.80, 0.80, 0.76])
+        dash, fraction, edged = rng.uniform(3.0, 6.0), rng.uniform(0.35, 0.6), rng.random() < 0.7
+        lines = (plan.half_width, float(dash), float(fraction), float(edged))
+        soup = self.soup
+        self.asphalt = soup.instance(Material.ASPHALT, grey, paint, lines)
+        self.junction = soup.instance(Material.JUNCTION, grey, paint)
+        self.pavement = soup.instance(Material.PAVEMENT, stone, 0.7 * stone, (float(rng.uniform(0.5, 1.2)),))
+        self.kerb = soup.instance(Material.KERB, 1.15 * stone, 0.6 * stone, (1.0,))
+        self.grass = soup.instance(Material.GRASS, turf, 0.55 * turf)
+        self.gravel = soup.instance(Material.GRAVEL, 0.9 * stone, 0.5 * stone)
+
+    def ground(self) -> None:
+        """Roads, junctions, and a wide meadow under it all."""
+        xs, ys = self.plan.xs, self.plan.ys
+        self._slab((xs[0] - 160.0, ys[0] - 160.0, xs[-1] + 160.0, ys[-1] + 160.0), -0.25, self.grass, 8.0)
+        half = self.plan.half_width
+        for i in range(len(xs)):
+            for j in range(len(ys)):
+                x, y = float(xs[i]), float(ys[j])
+                if i + 1 < len(xs):
+                    self._corridor((x + half, y - half, float(xs[i + 1]) - half, y + half), (i, j), (i + 1, j))
+                if j + 1 < len(ys):
+                    self._corridor((x - half, y + half, x + half, float(ys[j + 1]) - half), (i, j), (i, j + 1))
+                neighbours = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
+                crossed = any(self.plan.is_street((i, j), other) for other in neighbours)
+                rectangle = (x - half, y - half, x + half, y + half)
+                self._slab(rectangle, 0.0 if crossed else KERB, self.junction if crossed else self.grass)
+                if crossed:
+                    self._corner_fill(x, y)
+
+    def _corner_fill(self, x: float, y: float) -> None:
+        """Asphalt outside the rounded kerbs at a junction, and a hair lower where it runs below the blocks."""
+        near, reach = self.plan.half_width, self.plan.half_width + ROUNDING
+        for x0, x1 in ((x - reach, x - near), (x + near, x + reach)):
+            for y0, y1 in ((y - reach, y - near), (y + near, y + reach)):
+                self._slab((x0, y0, x1, y1), -0.005, self.junction)
+
+    def _corridor(self, rectangle: Rectangle, a: tuple[int, int], b: tuple[int, int]) -> None:
+        """A stretch of road between two junctions, or the grass that lies there instead."""
+        x0, y0, x1, y1 = rectangle
+        if not self.plan.is_street(a, b):
+            self._slab(rectangle, KERB, self.grass)
+            return
+        if a[1] == b[1]:
+            points, length = self._grid(rectangle, 0.0, 2.0), x1 - x0
+        else:
+            points, length = self._grid((y0, x0, y1, x1), 0.0, 2.0)[..., [1, 0, 2]], y1 - y0
+        rows, columns = points.shape[:2]
+        half = self.plan.half_width
+        v, u = np.meshgrid(np.linspace(-half, half, rows), np.linspace(0.0, length, columns), indexing="ij")
+        self.soup.patch(points, np.stack([u, v], axis=2), self.asphalt)
+
+    def _grid(self, rectangle: Rectangle, z: float, step: float) -> FloatArray:
+        """Vertices over a rectangle about ``step`` metres apart, ``(R, C, 3)``."""
+        x0, y0, x1, y1 = rectangle
+        x = np.linspace(x0, x1, max(1, int((x1 - x0) / step)) + 1)
+        y = np.linspace(y0, y1, max(1, int((y1 - y0) / step)) + 1)
+        gx, gy = np.meshgrid(x, y)
+        return np.stack([gx, gy, np.full_like(gx, z)], axis=2)
+
+    def _slab(self, rectangle: Rectangle, z: float, instance: int, step: float = 3.0) -> None:
+        """A level rectangle, textured by its plan coordinates."""
+        points = self._grid(rectangle, z, step)
+        self.soup.patch(points, points[..., :2], instance)
+
+    def block(self, i: int, j: int) -> None:
+        """One cell of the grid: pavement with kerbs around it, lots inside."""
+        plan, half = self.plan, self.plan.half_width
+        x0, x1 = float(plan.xs[i]) + half, float(plan.xs[i + 1]) - half
+        y0, y1 = float(plan.ys[j]) + half, float(plan.ys[j + 1]) - half
+        sides = (  # south, east, north, west
+            plan.is_street((i, j), (i + 1, j)),
+            plan.is_street((i + 1, j), (i + 1, j + 1)),
+            plan.is_street((i, j + 1), (i + 1, j + 1)),
+            plan.is_street((i, j), (i, j + 1)),
+        )
+        width = self.pavement_width
+        inner = (x0 + width, y0 + width, x1 - width, y1 - width)
+        self._pavement((x0, y0, x1, y1), inner, sides)
+        self._slab(inner, KERB, self.grass if self.rng.random() < 0.7 else self.gravel)
+        corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        for side, street in enumerate(sides):
+            if street:
+                self._furnish(np.array(corners[side]), np.array(corners[(side + 1) % 4]))
+        self._split(inner, inner, sides)
+
+    def _pavement(self, outer: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+        """A ring of paving between a rounded outline and the lots, and the kerb below its edge."""
+        x0, y0, x1, y1 = outer
+        rim: list[FloatArray] = []
+        corners = [np.array(c) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        for k in range(4):
+            here, after, before = corners[k], corners[(k + 1) % 4], corners[k - 1]
+            radius = ROUNDING if sides[k] and sides[k - 1] else 0.01
+            ahead, back = (after - here) / np.linalg.norm(after - here), (before - here) / np.linalg.norm(before - here)
+            for angle in np.linspace(0.0, np.pi / 2.0, 6):
+                rim.append(here + radius * ((1.0 - np.sin(angle)) * back + (1.0 - np.cos(angle)) * ahead))
+            reach = float(np.linalg.norm(after - here)) - ROUNDING - 1.0
+            for along in np.arange(ROUNDING + 2.0, reach, 2.5):
+                rim.append(here + along * ahead)
+        edge = np.stack([*rim, rim[0]])
+        inside = np.clip(edge, [inner[0], inner[1]], [inner[2], inner[3]])
+        ring = np.pad(np.stack([edge, inside]), ((0, 0), (0, 0), (0, 1)), constant_values=KERB)
+        self.soup.patch(ring, ring[..., :2], self.pavement)
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
+        step = ring[[0, 0]].copy()
+        step[0, :, 2] = -0.1
+        self.soup.patch(step, np.stack([np.stack([length] * 2), step[..., 2]], axis=2), self.kerb)
+        lip = ring[[0, 0]].copy()
+        lip[..., 2] += 0.004
+        towards = inside - edge
+        lip[1, :, :2] += 0.16 * towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 0.16)
+        across = np.stack([np.zeros_like(length), np.full_like(length, 0.16)])
+        self.soup.patch(lip, np.stack([np.stack([length] * 2), across], axis=2), self.kerb)
+
+    def _furnish(self, start: FloatArray, end: FloatArray) -> None:
+        """Trees, lamps and signs along one kerb, which has its block on the left, and cars in front of it."""
+        rng = self.rng
+        length = float(np.linalg.norm(end - start))
+        ahead = (end - start) / max(length, 1e-9)
+        inward = np.array([-ahead[1], ahead[0]])
+        angle = float(np.arctan2(ahead[1], ahead[0]))
+        along = 6.0
+        while along < length - 6.0:
+            spot = start + along * ahead + float(rng.uniform(0.55, 1.0)) * inward
+            kind = rng.random()
+            if kind < 0.45 * self.greenery:
+                objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(4.0, 8.0)))
+            elif kind < 0.55:
+                objects.lamp(self.soup, rng, spot[0], spot[1], -inward)
+            elif kind < 0.72:
+                objects.sign(self.soup, rng, spot[0], spot[1], angle)
+            along += float(rng.uniform(4.0, 11.0))
+        along = 6.5
+        while along < length - 6.5:
+            if rng.random() < self.parking:
+                spot = start + along * ahead - 0.95 * inward
+                objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
+            along += float(rng.uniform(5.4, 7.5))
+
+    def _split(self, lot: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
+        """Cut a lot in two until each piece is of the size of a house."""
+        x0, y0, x1, y1 = lot
+        width, depth = x1 - x0, y1 - y0
+        if max(width, depth) > 17.0:
+            cut = float(self.rng.uniform(0.4, 0.6))
+            if width > depth:
+                middle = x0 + cut * width
+                parts: tuple[Rectangle, Rectangle] = ((x0, y0, middle, y1), (middle, y0, x1, y1))
+            else:
+                middle = y0 + cut * depth
+                parts = ((x0, y0, x1, middle), (x0, middle, x1, y1))
+            for part in parts:
+                self._split(part, inner, sides)
+            return
+        touches = (y0 == inner[1], x1 == inner[2], y1 == inner[3], x0 == inner[0])
+        facing = [k for k in range(4) if touches[k] and sides[k]]
+        self._lot(lot, facing)
+
+    def _lot(self, lot: Rectangle, facing: list[int]) -> None:
+        """Build on a lot, or leave it open; ``facing`` lists the sides at a street (south, east, north, west)."""
+        rng, (x0, y0, x1, y1) = self.rng, lot
+        if min(x1 - x0, y1 - y0) > 5.0 and rng.random() < (self.density if facing else 0.3):
+            side = facing[0] if facing else 0
+            front = float(rng.uniform(0.0, 3.0)) if facing else 1.0
+            gap = float(rng.choice([0.02, rng.uniform(0.4, 1.6)]))
+            corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+            width, depth = (x1 - x0, y1 - y0) if side % 2 == 0 else (y1 - y0, x1 - x0)
+            frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.1)
+            frame[3] += gap * frame[0] + front * frame[1]
+            deep = min(depth - front - 0.2, float(rng.uniform(7.0, 14.0)))
+            objects.building(self.soup, rng, frame, width - 2 * gap, deep)
+            if front > 1.4 and rng.random() < 0.5:
+                frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.05)
+                objects.hedge(self.soup, rng, frame, 0.6 * width)
+            return
+        for side in facing:
+            corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+            if rng.random() < 0.6:
+                length = x1 - x0 if side % 2 == 0 else y1 - y0
+                frame = objects.frame_at(*corners[side], side * np.pi / 2.0, KERB - 0.05)
+                objects.hedge(self.soup, rng, frame, length * float(rng.uniform(0.5, 1.0)))
+        for _ in range(int(rng.poisson(3.0 * self.greenery))):
+            x, y = rng.uniform(x0 + 1.5, x1 - 1.5), rng.uniform(y0 + 1.5, y1 - 1.5)
+            objects.tree(self.soup, rng, float(x), float(y), float(rng.uniform(4.0, 10.0)))
+
+    def backdrop(self) -> None:
+        """Trees and houses beyond the edge of town, so that no street ends in the sky."""
+        rng, xs, ys = self.rng, self.plan.xs, self.plan.ys
+        x0, y0, x1, y1 = float(xs[0]), float(ys[0]), float(xs[-1]), float(ys[-1])
+        corners = [np.array(c) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        for side in range(4):
+            start, end = corners[side], corners[(side + 1) % 4]
+            ahead = (end - start) / np.linalg.norm(end - start)
+            outward = np.array([ahead[1], -ahead[0]])
+            for along in np.arange(0.0, float(np.linalg.norm(end - start)), 9.0):
+                spot = start + (along + rng.uniform(-3, 3)) * ahead + rng.uniform(6.0, 25.0) * outward
+                if rng.random() < 0.7:
+                    objects.tree(self.soup, rng, spot[0], spot[1], float(rng.uniform(6.0, 13.0)))
+                else:
+                    frame = objects.frame_at(spot[0], spot[1], side * np.pi / 2.0 + np.pi, -0.3)
+                    objects.building(self.soup, rng, frame, float(rng.uniform(8, 14)), float(rng.uniform(7, 11)))

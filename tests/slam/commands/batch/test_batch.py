@@ -1,0 +1,178 @@
+"""Many drives: manifests, failures apart from results, resumption, workers that die, processes that end with them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from slam.commands.batch.cluster import workers
+from slam.commands.batch.execution import Limits, run_drive, run_drives
+from slam.commands.batch.manifest import Drive, drives_of
+from slam.commands.batch.summary import check_output, write_summary
+from slam.runtime.errors import RunError, SequenceError, SlamError
+
+QUICK = ["--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false"]
+
+UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """No progress bar."""
+
+
+def test_manifests_of_both_kinds_name_the_same_drives(tmp_path: Path) -> None:
+    yaml, table = tmp_path / "a.yaml", tmp_path / "a.csv"
+    yaml.write_text(
+        "drives:\n- {dataset: kitti, sequence: '09', options: '--frames 0:90'}\n"
+        "- {dataset: walk.mp4, camera: c.yaml}\n- {dataset: other/walk.mp4}\n"
+    )
+    table.write_text(
+        "dataset, sequence, camera, options\nkitti,09,,--frames 0:90\nwalk.mp4,,c.yaml,\nother/walk.mp4,,,\n"
+    )
+    found = drives_of(yaml, ["all"], ["--seed", "3"])
+    assert found == drives_of(table, ["all"], ["--seed", "3"])
+    assert [drive.name for drive in found] == ["09", "walk", "walk-2"]
+    assert found[0].arguments == ("--dataset", "kitti", "--sequence", "09", "--seed", "3", "--frames", "0:90")
+    assert {drive.folder for drive in found} == {tmp_path}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("drives: 3", "must hold a list of drives"),
+        ("[]", "names no drive"),
+        ("- {sequence: '09'}", "drive 1: dataset is missing"),
+        ("- {dataset: a, weight: b}", "'weight' is no key"),
+        ("- {dataset: a, options: '--output b'}", "--output is no option of a drive"),
+        ('- {dataset: a, options: "--set \'x"}', "options are not understood"),
+        ("- {dataset: a, name: x}\n- {dataset: b, name: x}", "two drives are named x"),
+        ("- [", "is not YAML"),
+    ],
+)
+def test_a_manifest_that_is_not_understood(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "drives.yaml"
+    path.write_text(text)
+    with pytest.raises(SequenceError, match=said):
+        drives_of(path, ["all"], [])
+
+
+def test_sequences_of_a_data_set(kitti_root: Path) -> None:
+    (drive,) = drives_of(kitti_root, ["all"], [])
+    assert drive.name == "sim" and drive.arguments[:2] == ("--dataset", str(kitti_root.absolute()))
+    with pytest.raises(SequenceError, match="has no sequence 12: it has sim"):
+        drives_of(kitti_root, ["12"], [])
+    with pytest.raises(SequenceError, match=r"no manifest .*none\.yaml: check the path"):
+        drives_of(kitti_root / "none.yaml", ["all"], [])
+
+
+def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    manifest, output = tmp_path / "drives.yaml", tmp_path / "out"
+    manifest.write_text(f"- {{name: good, dataset: '{kitti_root}'}}\n- {{name: bad, dataset: nowhere}}\n")
+    words = [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"]
+    command = [sys.executable, "-m", "slam", "batch", str(manifest), "--output", str(output), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert "1 of 2 drives failed" in ended.stderr and "no data set at nowhere" in ended.stdout
+    with (output / "drives.csv").open() as file:
+        rows = {row["drive"]: row for row in csv.DictReader(file)}
+    assert rows["good"]["status"] == "whole" and rows["good"]["frames"] == "6"
+    assert rows["bad"]["status"] == "failed" and "no data set at nowhere" in rows["bad"]["reason"]
+    assert "no data set at nowhere" in (output / "index.html").read_text()
+    written = (output / "good" / "metrics.json").stat().st_mtime_ns
+
+    options = [*words[:6], "--weights", str(tiny_weights), "--frames", "0:6", "--seed", "0", "--device", "auto"]
+    (good, _) = drives_of(manifest, ["all"], options)
+    assert run_drive(good, output, Limits()).status == "kept"
+    assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
+    metrics = json.loads((output / "good" / "metrics.json").read_text())
+    (output / "good" / "metrics.json").write_text(json.dumps(metrics | {"status": "estimated"}))
+    outcome = run_drive(good, output, Limits(threads=1, memory_gib=0.05))
+    assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
+    write_summary(output, [outcome])
+    assert "0 of 1 drives" in (output / "index.html").read_text()
+    check_output(output)
+
+
+def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
+    kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
+    here, data = tmp_path / "here", tmp_path / "data"
+    shutil.copytree(tiny_weights, here / "mine")
+    shutil.copytree(kitti_root, data / "root")
+    quick = "mapping: {enabled: false}\ngeometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+    (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
+    (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
+    words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(
+        [sys.executable, "-m", "slam", *words, "--output", "out"], cwd=here, env=env, capture_output=True, check=False
+    )
+    assert ended.returncode == 0, ended.stdout.decode() + ended.stderr.decode()
+    assert "frame_stride: 3" in (here / "out/sim/config.yaml").read_text()
+    with (here / "out" / "drives.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["scale"], row["ate_6dof_m"]) == ("none", "") and row["unit"] in UNITS_WITHOUT_METRES
+    assert float(row["ate_7dof_m"]) > 0
+
+
+@pytest.mark.parametrize("name", ["index.html", "drives.csv"])
+def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, name: str) -> None:
+    check_output(tmp_path)
+    (tmp_path / name).write_text("my own")
+    with pytest.raises(RunError, match=f"{name} is none of ours"):
+        check_output(tmp_path)
+    with pytest.raises(RunError, match="is a file: give a folder"):
+        check_output(tmp_path / name)
+
+
+def dies_once(path: Path) -> str:
+    """The first worker that gets this is killed."""
+    if path.name == "1" and not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if path.name == "2":
+        raise ValueError("a drive that fails")
+    return path.name
+
+
+def test_the_drive_of_a_killed_worker_is_run_again(tmp_path: Path) -> None:
+    pytest.importorskip("dask.distributed")
+    with workers(2) as spread:
+        results = dict(spread(dies_once, [tmp_path / str(n) for n in range(5)]))
+    assert isinstance(results.pop(2), ValueError)
+    assert results == {0: "0", 1: "1", 3: "3", 4: "4"}
+
+
+def test_an_error_of_the_engine_is_the_drives_reason(tmp_path: Path) -> None:
+    drive = Drive("a", tmp_path / "gone", ())
+    with workers(1) as spread:
+        (outcome,) = run_drives([drive], tmp_path / "out", Limits(), spread, silent)
+    assert outcome.status == "failed" and outcome.reason.startswith("FileNotFoundError")
+
+
+def test_many_workers_need_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SlamError, match=r"erfsfm-slam\[cluster\]"), workers(2):
+        pass
+
+
+def test_a_drive_ends_with_its_worker(tmp_path: Path) -> None:
+    """Its standard input is closed as by the death of the worker."""
+    output = tmp_path / "run"
+    arguments = [str(tmp_path / "lock"), "run", "--output", str(output)]
+    command = [sys.executable, "-m", "slam.commands.batch.process", *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while not (output / "run.log").exists() and process.poll() is None:
+            time.sleep(0.05)
+        _, said = process.communicate()
+    assert process.returncode == 128 + signal.SIGTERM and "ended by SIGTERM" in said
+    assert json.loads((output / "metrics.json").read_text())["reason"] == "ended by SIGTERM"

@@ -1,0 +1,205 @@
+"""A scene's images, poses and cloud belong together, and missing images are one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.commands.exports.export import export
+from slam.commands.exports.options import R_UP_WORLDS, ExportOptions
+from slam.formats.ply import Ply, read_ply
+from slam.geometry.se3 import invert
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError
+from slam.runtime.imports import import_open3d
+from slam.sequences.catalogue import open_sequence
+
+MakeRecorded = Callable[..., RunFolder]
+
+
+def scene(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "transforms.json").read_text())
+    return content
+
+
+@pytest.mark.parametrize("up", ["y-down", "z"])
+def test_points_project_to_their_pixels(make_recorded: MakeRecorded, sheet: Ply, tmp_path: Path, up: str) -> None:
+    """By the convention of the format alone: x right, y up, z backwards, pixel centres at a half."""
+    folder = make_recorded()
+    written = export(folder, "nerfstudio", tmp_path / "scene", up)
+    content = scene(written)
+    camera = open_sequence(tmp_path / "drive").intrinsics
+    trajectory = folder.trajectory("optimised")
+    assert trajectory is not None and len(content["frames"]) == 8
+    cloud = import_open3d().io.read_point_cloud(str(written / content["ply_file_path"]))
+    points = np.asarray(cloud.points)
+    np.testing.assert_allclose(points, sheet.points @ R_UP_WORLDS[up].T, atol=1e-9)
+    assert sheet.colours is not None
+    np.testing.assert_allclose(np.asarray(cloud.colors) * 255, sheet.colours, atol=1)
+    for k, frame in enumerate(content["frames"]):
+        T_camera_world = np.linalg.inv(np.array(frame["transform_matrix"]))
+        x, y, z = T_camera_world[:3, :3] @ points.T + T_camera_world[:3, 3:]
+        u = content["fl_x"] * x / -z + content["cx"]
+        v = content["fl_y"] * -y / -z + content["cy"]
+        in_camera = sheet.points @ invert(trajectory.T_world_camera[k])[:3, :3].T
+        in_camera += invert(trajectory.T_world_camera[k])[:3, 3]
+        pixels = in_camera @ camera.K.T
+        np.testing.assert_allclose(np.stack([u, v]).T - 0.5, pixels[:, :2] / pixels[:, 2:], atol=1e-6)
+
+
+def test_images_are_those_of_the_recording(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    written = export(make_recorded(), "nerfstudio", tmp_path / "scene")
+    content, sequence = scene(written), open_sequence(tmp_path / "drive")
+    for k, frame in enumerate(content["frames"]):
+        image = cv2.imread(str(written / frame["file_path"]))
+        assert image.shape[:2] == (content["h"], content["w"])
+        np.testing.assert_array_equal(image[..., ::-1], sequence.frame(k).image)
+
+
+def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    camera_file = tmp_path / "drive" / "camera.yaml"
+    camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
+    with pytest.raises(RunError, match="another camera"):
+        export(folder, "nerfstudio", tmp_path / "scene")
+    from slam.loops.places import PLACES, Places
+
+    camera = open_sequence(tmp_path / "drive").intrinsics
+    folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
+    content = scene(export(folder, "nerfstudio", tmp_path / "scene"))
+    assert content["fl_x"] == camera.fx and content["k1"] == 0
+
+
+def test_nothing_of_a_scene_before_stays(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    written = export(folder, "nerfstudio", tmp_path / "scene")
+    (written / "images" / "mine.png").write_text("not of an export")
+    (tmp_path / "drive" / "03.png").write_text("broken")
+    (folder.path / "map_cloud.ply").unlink()
+    export(folder, "nerfstudio", written)
+    names = [Path(frame["file_path"]).name for frame in scene(written)["frames"]]
+    assert sorted(path.name for path in (written / "images").iterdir()) == sorted([*names, "mine.png"])
+    assert len(names) == 7 and not (written / "points.ply").exists()
+
+
+def test_frames_without_a_usable_image_are_left_out(
+    make_recorded: MakeRecorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    written = export(make_recorded(broken=(2,), bridged=(5,)), "nerfstudio", tmp_path / "scene")
+    names = [f"images/{k:06d}.png" for k in (0, 1, 3, 4, 6, 7)]
+    assert [frame["file_path"] for frame in scene(written)["frames"]] == names
+    assert sorted(path.relative_to(written).as_posix() for path in (written / "images").iterdir()) == names
+    assert "2 of 8 frames have no usable image" in caplog.text
+
+
+def test_interpolated_frames_are_no_images_of_a_colmap_model(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    model = export(make_recorded(bridged=(5,)), "colmap", tmp_path / "model")
+    images = [line.split() for line in (model / "images.txt").read_text().splitlines()[1::2]]
+    assert [(row[0], row[-1]) for row in images] == [(str(k + 1), f"{k:06d}.png") for k in range(8) if k != 5]
+
+
+@pytest.mark.parametrize(
+    ("rows", "continued_at", "frames", "numbers", "first_shade"),
+    [(11, 3, None, range(3, 11), 0), (7, 3, "2:6", range(3, 7), 20), (8, 3, None, range(8), 0)],
+    ids=["another recording", "a part of one", "the same, killed and resumed"],
+)
+def test_a_continued_run_has_the_images_of_its_last_part(
+    make_recorded: MakeRecorded,
+    tmp_path: Path,
+    rows: int,
+    continued_at: int,
+    frames: str | None,
+    numbers: range,
+    first_shade: int,
+) -> None:
+    folder = make_recorded()
+    lengthen(folder, rows, continued_at, frames)
+    written = export(folder, "nerfstudio", tmp_path / "scene")
+    names = [frame["file_path"] for frame in scene(written)["frames"]]
+    assert names == [f"images/{k:06d}.png" for k in numbers]
+    shades = [int(cv2.imread(str(written / name))[0, 0, 0]) for name in names]
+    assert shades == [first_shade + 10 * k for k in range(len(numbers))]
+
+
+def test_a_last_part_of_another_length_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    lengthen(folder, 11, 4)
+    with pytest.raises(RunError, match=r"drive has 8 frames, but .* goes on with 7 at frame 4: give the data set"):
+        export(folder, "nerfstudio", tmp_path / "scene")
+
+
+def lengthen(folder: RunFolder, rows: int, continued_at: int, frames: str | None = None) -> None:
+    """The same run with so many frames at 10 Hz, of which those of this recording begin at one."""
+    from slam.formats.trajectory import Trajectory
+
+    poses = np.tile(np.eye(4), (rows, 1, 1))
+    folder.write_trajectory("trajectory_optimised", Trajectory(0.1 * np.arange(rows), poses, True))
+    metrics = folder.metrics()
+    metrics["sequence"] |= {"frames": rows, "continued_at": continued_at}
+    if frames is not None:
+        metrics["provenance"]["recording"]["frames"] = frames
+    folder.write_metrics(metrics)
+
+
+def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    from slam.formats.trajectory import Trajectory
+
+    folder = make_recorded()
+    trajectory = folder.trajectory("optimised")
+    assert trajectory is not None
+    folder.write_trajectory(
+        "trajectory_optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True)
+    )
+    metrics = folder.metrics()
+    metrics["sequence"]["frames"] = 3
+    folder.write_metrics(metrics)
+    written = export(folder, "nerfstudio", tmp_path / "scene")
+    shades = [int(cv2.imread(str(written / frame["file_path"]))[0, 0, 0]) for frame in scene(written)["frames"]]
+    assert shades == [30, 40, 50]
+
+
+def test_without_a_map_there_is_no_cloud(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    (folder.path / "map_cloud.ply").unlink()
+    written = export(folder, "nerfstudio", tmp_path / "scene")
+    assert "ply_file_path" not in scene(written) and not (written / "points.ply").exists()
+
+
+def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
+    make_recorded: MakeRecorded, tmp_path: Path
+) -> None:
+    folder = make_recorded()
+    shutil.move(tmp_path / "drive", tmp_path / "elsewhere")
+    with pytest.raises(RunError, match=r"the images of .* are needed and not found .*; give --dataset ROOT") as caught:
+        export(folder, "nerfstudio", tmp_path / "scene")
+    assert "\n" not in str(caught.value) and not (tmp_path / "scene").exists()
+    moved = ExportOptions(dataset=tmp_path / "elsewhere", voxel=0.5)
+    written = export(folder, "nerfstudio", tmp_path / "scene", "z", moved)
+    assert len(scene(written)["frames"]) == 8 and len(read_ply(written / "points.ply").vertices) < 100
+
+
+def test_a_run_that_does_not_say_where_its_images_are(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    folder.write_metrics(folder.metrics() | {"provenance": {}})
+    with pytest.raises(RunError, match="does not record where its images are: give --dataset ROOT"):
+        export(folder, "nerfstudio", tmp_path / "scene")
+
+
+def test_another_recording_is_refused(make_recorded: MakeRecorded, tmp_path: Path) -> None:
+    folder = make_recorded()
+    from slam.formats.trajectory import Trajectory
+
+    trajectory = folder.trajectory("optimised")
+    assert trajectory is not None
+    folder.write_trajectory(
+        "trajectory_optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True)
+    )
+    with pytest.raises(RunError, match="has no frame at the times of"):
+        export(folder, "nerfstudio", tmp_path / "scene")

@@ -1,0 +1,176 @@
+"""Free road, occupied walls and cars, unknown elsewhere, on a sloping street."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from slam.commands.cli import app
+from slam.commands.exports.export import export
+from slam.commands.exports.ground import ground_along
+from slam.commands.exports.occupancy import occupancy_grid
+from slam.commands.exports.options import ExportOptions
+from slam.formats.ply import Ply, coloured_ply
+from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
+from slam.geometry import se3
+from slam.geometry.se3 import FloatArray
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError
+
+CAMERA_HEIGHT = 1.65
+SLOPE, BANK = 0.06, 0.02
+R_UP_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def road(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of the road: it climbs ahead after 20 m and falls to the right."""
+    return SLOPE * np.clip(y - 20, 0, None) - BANK * x - CAMERA_HEIGHT
+
+
+def sheet_of(points: FloatArray) -> Ply:
+    """A grid of points ``(R, C, 3)`` as a mesh."""
+    rows, columns = points.shape[:2]
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    halves = [[corner, corner + 1, corner + columns], [corner + 1, corner + columns + 1, corner + columns]]
+    flat = points.reshape(-1, 3)
+    shades = np.full(flat.shape, 0.5)
+    triangles = np.concatenate([np.stack(half, axis=1) for half in halves])
+    return coloured_ply(flat, np.zeros(flat.shape), shades, triangles)
+
+
+def together(*meshes: Ply) -> Ply:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    triangles = [mesh.triangles + start for mesh, start in zip(meshes, starts) if mesh.triangles is not None]
+    return Ply(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(triangles))
+
+
+def standing(x: float, y: tuple[float, float], foot: float, top: float) -> Ply:
+    """A wall along the street, from a height above the road to another."""
+    along, up = np.meshgrid(np.arange(y[0], y[1], 0.2), np.arange(foot, top, 0.2), indexing="ij")
+    across = np.full(along.shape, x)
+    return sheet_of(np.stack([across, along, road(across, along) + up], axis=-1))
+
+
+def level(x: tuple[float, float], y: tuple[float, float], above: float) -> Ply:
+    across, along = np.meshgrid(np.arange(x[0], x[1], 0.2), np.arange(y[0], y[1], 0.2), indexing="ij")
+    return sheet_of(np.stack([across, along, road(across, along) + above], axis=-1))
+
+
+@pytest.fixture
+def street() -> tuple[Ply, FloatArray]:
+    """A road with noise, a wall on the left, a kerb on the right, a low car roof, a canopy, and the poses."""
+    ground = level((-7, 7), (-1, 60), 0.0)
+    noise = np.random.default_rng(1).normal(0, 0.03, len(ground.vertices))
+    ground.vertices["z"][:] = ground.vertices["z"] + noise
+    parts = (
+        standing(-8.5, (0, 60), 0.0, 6.0),
+        level((5, 7), (0, 60), 0.15),
+        level((2, 4), (30, 34), 1.4),
+        level((-3, 3), (44, 48), 3.5),
+    )
+    y = np.arange(0, 55, 0.5)
+    poses = np.stack([se3.make(R_UP_CAMERA, np.zeros(3)) for _ in y])
+    poses[:, 1, 3], poses[:, 2, 3] = y, road(np.zeros_like(y), y) + CAMERA_HEIGHT
+    return together(ground, *parts), poses
+
+
+def test_the_ground_follows_slope_and_bank(street: tuple[Ply, FloatArray]) -> None:
+    mesh, poses = street
+    ground = ground_along(mesh.points, poses, 1.5)
+    x, y = (each.ravel() for each in np.meshgrid([-6.0, 0.0, 6.0], [2.0, 10.0, 30.0, 50.0]))
+    np.testing.assert_allclose(ground.heights(np.stack([x, y], axis=1)), road(x, y), atol=0.12)
+    assert np.isnan(ground.heights(np.array([[40.0, 10.0]]))).all()
+
+
+@pytest.mark.parametrize("unit", [1.0, 1 / CAMERA_HEIGHT])
+@pytest.mark.parametrize("resolution", [0.1, 0.25])
+def test_what_is_free_and_what_is_occupied(street: tuple[Ply, FloatArray], resolution: float, unit: float) -> None:
+    mesh, poses = street
+    vertices = mesh.vertices.copy()
+    for axis in "xyz":
+        vertices[axis] *= unit
+    poses = poses.copy()
+    poses[:, :3, 3] *= unit
+    grid = occupancy_grid(Ply(vertices, mesh.triangles), poses, resolution * unit, unit == 1.0)
+    shape, corner, step = grid.cells.shape, np.array(grid.corner) / unit, grid.resolution / unit
+
+    def cells(x: tuple[float, float], y: tuple[float, float]) -> np.ndarray:
+        first, last = (int((value - corner[0]) / step) for value in x)
+        low, high = (shape[0] - 1 - int((value - corner[1]) / step) for value in y)
+        return grid.cells[high : low + 1, first : last + 1]
+
+    assert (cells((-6, 4), (1, 28)) == FREE).mean() > 0.99
+    assert (cells((5.2, 6.8), (1, 50)) == FREE).mean() > 0.99  # the kerb
+    assert (cells((2.2, 3.6), (30.2, 33.6)) == OCCUPIED).mean() > 0.99  # the car
+    assert (cells((-2, 2), (45, 47)) == FREE).mean() > 0.99  # under the canopy
+    assert (cells((-8.5, -8.5), (1, 50)) == OCCUPIED).mean() > 0.99  # the wall
+    assert (cells((-7.9, -7.6), (1, 50)) == UNKNOWN).mean() > 0.9
+    assert (grid.cells == OCCUPIED).sum() * step**2 == pytest.approx(2 * 4 + 60 * step, rel=0.15)
+
+
+def test_narrow_gaps_of_the_road_are_closed_and_wide_ones_unknown(street: tuple[Ply, FloatArray]) -> None:
+    _, poses = street
+    parts = [level((-3, 3.2), along, 0.0) for along in ((-1, 10), (10.2, 20), (21.5, 60))]
+    grid = occupancy_grid(together(*parts), poses, 0.1, True)
+    # the last rows of the parts lie at 9.8, 19.8 and 59.8
+    of_y = {y: grid.cells[grid.cells.shape[0] - 1 - round((y + 1) / 0.1), 20:40] for y in (9.9, 10.1, 20.6, 30.0)}
+    assert {y: set(row.tolist()) for y, row in of_y.items()} == {
+        9.9: {FREE},
+        10.1: {FREE},
+        20.6: {UNKNOWN},
+        30.0: {FREE},
+    }
+
+
+def test_a_map_without_ground_is_refused(street: tuple[Ply, FloatArray]) -> None:
+    _, poses = street
+    with pytest.raises(RunError, match="no ground below the cameras"):
+        occupancy_grid(level((-3, 3), (0, 50), 5.0), poses, 0.2, True)
+
+
+def test_files_are_those_of_the_map_server(tmp_path: Path) -> None:
+    cells = np.full((5, 4), UNKNOWN, np.uint8)
+    cells[0, 3], cells[4, 0] = OCCUPIED, FREE
+    write_ros_map(tmp_path / "a: map.yaml", cells, (-1.5, 2.25), 0.05, "metres")
+    described = yaml.safe_load((tmp_path / "a: map.yaml").read_text())
+    assert described == {
+        "image": "a: map.pgm",
+        "resolution": 0.05,
+        "origin": [-1.5, 2.25, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    image = cv2.imread(str(tmp_path / described["image"]), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(image, cells)
+    occupied = (255 - image.astype(float)) / 255  # as map_server reads a pixel
+    assert (occupied > described["occupied_thresh"]).sum() == 1 and (occupied < described["free_thresh"]).sum() == 1
+
+
+@pytest.mark.parametrize("name", ["map.yaml", "map.pgm"])
+def test_the_grid_of_a_run(make_recorded: Callable[..., RunFolder], tmp_path: Path, name: str) -> None:
+    written = export(make_recorded(), "occupancy", tmp_path / "new" / name, "z", ExportOptions(resolution=0.2))
+    assert sorted(path.name for path in written.parent.iterdir()) == ["map.pgm", "map.yaml"]
+    assert written.name == "map.yaml" and yaml.safe_load(written.read_text())["origin"] == [0.0, 2.0, 0.0]
+    cells = cv2.imread(str(tmp_path / "new" / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    assert cells.shape == (15, 10) and (cells == FREE).mean() > 0.9
+
+
+def test_a_grid_without_metres_says_so(
+    make_recorded: Callable[..., RunFolder], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, output = make_recorded(), tmp_path / "map.yaml"
+    words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
+    for unit, note in (("camera heights", True), ("metres", False)):
+        folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "value": 9.8, "unit": unit}})
+        app(words, standalone_mode=False)
+        assert ("not in metres" in capsys.readouterr().out) == note
+        assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(output.read_text())
+    folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "unit": "the networks' own unit"}})
+    with pytest.raises(RunError, match="need metres or camera heights"):
+        export(folder, "occupancy", output)

@@ -1,0 +1,391 @@
+"""Live runs: a folder being filled, a video at its own speed, sources that stall or die or are too fast."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam import run_slam
+from slam.commands.live.messages import emitters
+from slam.commands.live.reader import Reader
+from slam.commands.live.run import LiveRequest, run_live
+from slam.commands.live.sequence import calibration_of
+from slam.commands.live.source import FolderSource, VideoSource, open_source
+from slam.frames import Image
+from slam.results.comparison import unit_notes
+from slam.runtime.errors import SequenceError, SlamError
+
+SETTINGS = ("mapping.enabled=false", "output.report=false")
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of a simulated street and their ``camera.yaml``."""
+    folder = tmp_path_factory.mktemp("street")
+    images = sorted((kitti_root / "sequences" / "sim" / "image_2").glob("*.png"))[:FRAMES]
+    (folder / "images").mkdir()
+    for path in images:
+        shutil.copy(path, folder / "images" / path.name)
+    camera, no_lens = (kitti_root / "camera.yaml").read_text(), "model: opencv\ndistortion: [0, 0, 0, 0]"
+    (folder / "camera.yaml").write_text(camera.replace("model: pinhole", no_lens))
+    return folder
+
+
+def fill(source: Path, target: Path, messages: list[dict[str, Any]]) -> Thread:
+    """Put an image into a folder each time the one before was answered."""
+    names = sorted(path.name for path in source.iterdir())
+
+    def run() -> None:
+        for number, name in enumerate(names):
+            while len(messages) < number:
+                time.sleep(0.01)
+            partial = target / f".{name}.partial"
+            shutil.copy(source / name, partial)
+            partial.rename(target / name)
+
+    thread = Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    folder = run_live(request, messages.append)
+    offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
+    for name in ("trajectory_optimised.kitti.txt", "trajectory_odometry.tum.txt", "graph.g2o", "loops.json"):
+        assert (folder.path / name).read_bytes() == (offline.path / name).read_bytes()
+    *poses, last = messages
+    assert [message["frame"] for message in poses] == list(range(FRAMES))
+    assert all(message["dropped"] == 0 and message["latency_ms"] > 0 for message in poses)
+    assert {message["state"] for message in poses} <= {"starting", "tracking"} and poses[-1]["state"] == "tracking"
+    assert poses[-1]["unit"] == "m" and poses[-1]["scale"] > 0
+    corrected = np.array(last["T_world_camera"])
+    np.testing.assert_allclose(corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6)
+    assert last["ended"] == "nothing came for 1.5 s" and last["dropped"] == 0
+    assert folder.metrics()["status"] == "ok"
+
+
+@pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
+def test_without_a_road_there_are_no_metres_and_no_camera_heights(
+    street: Path, tiny_weights: Path, tmp_path: Path, mode: str, unit: str | None
+) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
+    settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
+    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    folder = run_live(request, messages.append)
+    recorded = folder.metrics()["scale"]
+    assert (recorded["unit"], recorded["value"]) == ("the networks' own unit", None)
+    *poses, last = messages
+    assert last["unit"] == unit
+    starting, known = ("starting", None, False), ("tracking", unit, True)
+    said = [(each["state"], each["unit"], each["scale"] is not None) for each in poses]
+    assert set(said) == ({starting} if unit is None else {starting, known})
+    assert ["networks' own unit" in note for note in unit_notes(folder.metrics())] == [True]
+
+
+def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
+    street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    contents = [path.read_bytes() for path in sorted((street / "images").iterdir())]
+    contents[5] = contents[5][:2000]
+    contents[8] = cv2.imencode(".png", np.zeros((20, 30, 3), np.uint8))[1].tobytes()
+
+    def fill_and_vanish() -> None:
+        answered = 0
+        for number, content in enumerate(contents):
+            (target / ".partial").write_bytes(content)
+            (target / ".partial").rename(target / f"{number:06d}.png")
+            answered += number not in (5, 8)
+            while len(messages) < answered:
+                time.sleep(0.01)
+        target.rename(tmp_path / "unplugged")
+
+    Thread(target=fill_and_vanish, daemon=True).start()
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=30)
+    folder = run_live(request, messages.append)
+    *poses, last = messages
+    used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
+    assert [message["stamp"] for message in poses] == pytest.approx(used) == last["stamps"]
+    assert last["ended"].startswith("the source died") and "cannot be read any more" in last["ended"]
+    assert folder.metrics()["status"] == "ok" and folder.metrics()["sequence"]["frames"] == len(used)
+    said = caplog.text
+    assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (("scale.mode=camera-height",), "scale mode camera-height needs a known height; images has none"),
+        (
+            ("scale.mode=known", "scale.known_m=1", "scale.known_between=[0,1]"),
+            "known needs frames of a whole sequence",
+        ),
+        (("lidar.factors=true",), r"lidar\.factors=true needs LiDAR scans of neighbouring frames"),
+    ],
+)
+def test_what_the_settings_need_is_asked_before_the_first_frame(
+    street: Path, tiny_weights: Path, tmp_path: Path, settings: tuple[str, ...], words: str
+) -> None:
+    """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
+    settings = (*SETTINGS, *settings)
+    images, messages = str(street / "images"), []
+    request = LiveRequest(images, Path("fov=70"), str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    with pytest.raises(SlamError, match=words):
+        run_live(request, messages.append)
+    assert messages == [] and not (tmp_path / "live").exists()
+
+
+@pytest.mark.parametrize("frames", [2, 9])
+def test_a_drive_that_fails_leaves_the_poses_that_it_had(
+    street: Path, tiny_weights: Path, tmp_path: Path, frames: int
+) -> None:
+    """After the last of two frames, which are too few, and at the ninth, which nobody listens to."""
+    taken, target, messages = tmp_path / "taken", tmp_path / "images", []
+    taken.mkdir()
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    for path in sorted((street / "images").iterdir())[:frames]:
+        shutil.copy(path, taken)
+    fill(taken, target, messages)
+
+    def listen(message: dict[str, Any]) -> None:
+        messages.append(message)
+        if len(messages) == 9:
+            raise SlamError("nobody listens")
+
+    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    with pytest.raises(SlamError, match="nobody listens" if frames == 9 else "usable frames"):
+        run_live(request, listen)
+    metrics = json.loads((tmp_path / "live" / "metrics.json").read_text())
+    assert metrics["status"] == "failed" and metrics["reason"]
+    left = np.loadtxt(tmp_path / "live" / "trajectory_odometry.kitti.txt")  # said poses were corrected since
+    np.testing.assert_allclose(left[0], messages[0]["T_world_camera"])
+    assert (np.linalg.norm(np.diff(left[:, 3::4], axis=0), axis=1) > 0).all() == (frames == 9)
+    stamps = np.loadtxt(tmp_path / "live" / "trajectory_odometry.tum.txt")[:, 0]
+    np.testing.assert_allclose(stamps, [message["stamp"] for message in messages])
+    assert not (tmp_path / "live" / "trajectory_optimised.tum.txt").exists()
+
+
+class Scripted:
+    """A source of small images that does what its script says: waits, or dies."""
+
+    width, height, fps = 8, 6, 10.0
+
+    def __init__(self, waits_s: list[float], dies: bool = False) -> None:
+        self._waits_s, self._dies = waits_s, dies
+
+    def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
+        for number, wait_s in enumerate(self._waits_s):
+            time.sleep(wait_s)
+            yield 0.1 * number, np.full((6, 8, 3), number, np.uint8)
+        if self._dies:
+            raise SequenceError("the cable was pulled")
+
+
+def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
+    reader = Reader(Scripted([0.0] * 50 + [0.3]), 5.0, lambda image: image)
+    taken = []
+    for arrival in reader:
+        taken.append(int(arrival.image[0, 0, 0]))
+        time.sleep(0.1)
+    assert taken[-1] == 50 and taken == sorted(taken) and len(taken) <= 4
+    assert reader.dropped == 51 - len(taken) and reader.ended == "the source ended"
+
+
+def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:
+    stalls = Reader(Scripted([0.0, 3.0]), 0.2, lambda image: image)
+    assert len(list(stalls)) == 1 and stalls.ended == "nothing came for 0.2 s"
+    dies = Reader(Scripted([0.05, 0.05], dies=True), 5.0, lambda image: image)
+    assert len(list(dies)) == 2 and dies.ended == "the source died: the cable was pulled"
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Eight images, each brighter by 30 than the one before, at 20 Hz."""
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (32, 24))
+    for number in range(8):
+        writer.write(np.full((24, 32, 3), 30 * number, np.uint8))
+    writer.release()
+    return path
+
+
+@contextmanager
+def piped(video: Path) -> Iterator[str]:
+    pipe = video.with_name("pipe")
+    os.mkfifo(pipe)
+    thread = Thread(target=lambda: pipe.write_bytes(video.read_bytes()), daemon=True)
+    thread.start()
+    yield str(pipe)
+    thread.join()
+
+
+@contextmanager
+def written(video: Path) -> Iterator[str]:
+    """A pipe with the whole video in it, whose writer is gone."""
+    pipe = video.with_name("pipe")
+    os.mkfifo(pipe)
+    held = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    pipe.write_bytes(video.read_bytes())
+    yield str(pipe)
+    os.close(held)
+
+
+@contextmanager
+def served(video: Path) -> Iterator[str]:
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(video.parent))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/{video.name}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("opened", [piped, written, served])
+def test_a_pipe_and_an_address_give_images_as_they_arrive(
+    video: Path, opened: Callable[[Path], AbstractContextManager[str]]
+) -> None:
+    with opened(video) as name:
+        stamps, images = zip(*open_source(name, 5.0).images(Event()), strict=True)
+    assert [round(float(image.mean()) / 30) for image in images] == list(range(8))
+    assert (np.diff(stamps) > 0).all() and stamps[-1] < 5.0, "seconds since the first"
+
+
+def test_the_viewer_is_shown_the_drive(
+    street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it would show goes to a file, as it does without a screen."""
+    rerun = pytest.importorskip("rerun", reason="the extra rerun is not installed")
+    shown, target, messages = tmp_path / "shown.rrd", tmp_path / "images", []
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda stream: stream.save(shown))
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    settings, output = SETTINGS[1:], tmp_path / "run"  # keyframes are kept for the map
+    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, output, wait_s=1.5, view=True)
+    run_live(request, messages.append)
+    content = shown.read_bytes()
+    assert content[:3] == b"RRF"
+    for place in (b"/world/path", b"/world/camera", b"/world/camera/image", b"/depth", b"/world/map/"):
+        assert place in content, place
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".m4v"])
+def test_a_video_plays_at_its_own_speed(video: Path, suffix: str) -> None:
+    video = video.rename(video.with_suffix(suffix))
+    source = VideoSource(str(video), 1.0)
+    assert calibration_of(str(video), Path("fov=70"), source).fps == 20.0
+    with pytest.raises(SequenceError, match=r"give --calibration camera\.yaml or fov=70; no camera\.yaml is in"):
+        calibration_of(str(video), None, source)
+    stamps = [stamp for stamp, _ in source.images(Event())]
+    np.testing.assert_allclose(stamps, np.arange(8) / 20.0)
+    assert (source.width, source.height) == (32, 24)
+
+
+def test_a_folder_is_read_in_natural_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Numbers without zeros in front; hidden files are no images, and one that comes too late is named."""
+
+    def take(number: int) -> None:
+        cv2.imwrite(str(tmp_path / f"frame_{number}.png"), np.full((20, 30, 3), number, np.uint8))
+
+    (tmp_path / "._frame_0.png").write_bytes(b"of another system")
+    take(8)
+    images = (int(image[0, 0, 0]) for _, image in FolderSource(tmp_path, 0.1).images(Event()))
+    assert next(images) == 8
+    for number in (10, 7, 9):
+        take(number)
+    assert [next(images), next(images)] == [9, 10]
+    assert "frame_7.png came after frame_8.png, before which its name belongs; it is left out" in caplog.text
+
+
+def test_a_broken_first_image_is_left_out(street: Path, tmp_path: Path) -> None:
+    (tmp_path / "000000.png").write_bytes(b"damaged")
+    shutil.copy(street / "images" / "000001.png", tmp_path)
+    source, stopped = FolderSource(tmp_path, 5.0), Event()
+    for stamp, image in source.images(stopped):
+        assert (stamp, image.shape) == (0.1, (source.height, source.width, 3))
+        stopped.set()
+
+
+def test_sources_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="no image comes from"):
+        VideoSource(str(tmp_path / "none.mp4"), 1.0)
+    with pytest.raises(SequenceError, match="no image comes from 99: check the camera"):
+        open_source("99", 0.1)
+    with pytest.raises(SequenceError, match=r"no image came to .* within 0\.1 s"):
+        FolderSource(tmp_path, 0.1)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(SequenceError, match=r"pipe: it is a pipe that nothing was written to for 0\.1 s"):
+        open_source(str(tmp_path / "pipe"), 0.1)
+
+
+def test_messages_are_published(tmp_path: Path) -> None:
+    zmq = pytest.importorskip("zmq")
+    stream, address = io.StringIO(), f"ipc://{tmp_path}/poses"
+    with emitters(stream, address) as emit, zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.connect(address)
+        socket.subscribe("")
+        while not socket.poll(20):  # until the subscription has arrived
+            emit({"type": "pose", "frame": 7})
+        assert socket.recv_json() == {"type": "pose", "frame": 7}
+    assert json.loads(stream.getvalue().splitlines()[0]) == {"type": "pose", "frame": 7}
+
+
+def test_a_port_that_does_not_exist_is_refused() -> None:
+    pytest.importorskip("zmq")
+    with pytest.raises(SlamError, match="ports end at 65535"), emitters(io.StringIO(), "tcp://127.0.0.1:99999"):
+        pass
+
+
+def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    output, target, messages = tmp_path / "run", tmp_path / "images", []
+    target.mkdir()
+    fill(street / "images", target, messages)
+    command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "60"]
+    command += ["--calibration", str(street / "camera.yaml")]
+    command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for _ in range(FRAMES):
+            messages.append(json.loads(process.stdout.readline()))
+        process.send_signal(signal.SIGINT)
+        rest, said = process.communicate()
+    assert process.returncode == 0, said
+    last = json.loads(rest.splitlines()[-1])
+    assert last["type"] == "trajectory" and last["ended"] == "it was interrupted"
+    assert len(last["stamps"]) == FRAMES == messages[-1]["frame"] + 1
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["status"] == "ok"
+    recording = {"dataset": str(target), "camera": str(street / "camera.yaml")}
+    assert metrics["provenance"]["recording"] == recording

@@ -1,0 +1,255 @@
+"""Whole runs from a data set and weights to a run folder, with untrained networks."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import slam.commands.run.run
+import slam.results.metrics
+from erfsfm.common.signals import Terminated
+from slam import run_slam
+from slam.config.sections import PoseGraphConfig
+from slam.graph.pose_graph import PoseGraph
+from slam.pipeline.batch import SlamPipeline
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError, SlamError
+from slam.simulation.street import SimulatedStreet, SimulationOptions
+
+CheckRun = Callable[[Path], dict[str, Any]]
+CopyRoot = Callable[[], Path]
+
+NO_REPORT = "output.report=false"
+
+
+@pytest.fixture(scope="module")
+def run(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """One whole run with everything on. Not to be changed."""
+    output = tmp_path_factory.mktemp("runs") / "run"
+    return run_slam(kitti_root, "sim", weights=tiny_weights, output=output, seed=3, command="erfsfm-slam run ...")
+
+
+@pytest.fixture
+def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any]:
+    """Arguments of a run of a second: networks and graph alone."""
+    overrides = ["mapping.enabled=false", "geometry.enabled=false", f"output.root={tmp_path / 'results'}", NO_REPORT]
+    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:6"}
+
+
+@pytest.fixture
+def reported(quick: dict[str, Any]) -> dict[str, Any]:
+    """The same with the report."""
+    return quick | {"overrides": quick["overrides"][:-1]}
+
+
+def test_every_file_and_every_number(run: RunFolder, check_run: CheckRun) -> None:
+    metrics = check_run(run.path)
+    provenance = metrics["provenance"]
+    assert (provenance["seed"], provenance["device"]) == (3, "cpu")
+    assert provenance["command"] == "erfsfm-slam run ..." and provenance["weights_licence"] == "none, untrained"
+    assert re.fullmatch("[0-9a-f]{64}", provenance["weights_sha256"])
+    assert provenance["trained_on"] == ["simulated/17"] and provenance["leak"] is False
+    sequence = metrics["sequence"]
+    assert (sequence["name"], sequence["frames"], sequence["fps"]) == ("sim", 14, pytest.approx(10.0))
+    assert 9 < sequence["length_m"] < 18
+    assert sum(metrics["timing"]["stages"].values()) <= metrics["timing"]["seconds_total"]
+    assert metrics["trajectories"]["lidar"] is None
+    for name in ("network", "odometry", "optimised"):
+        assert metrics["trajectories"][name]["snippet5"]["count"] == 10
+        assert metrics["trajectories"][name]["evo"]["difference"] < 1e-6
+        assert "100 m" in metrics["trajectories"][name]["align"]["7dof"]["t_rel_percent_reason"]
+
+
+def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
+    report = (run.path / "report.html").read_text()
+    assert "none, untrained" in report and ">FAILED<" not in report and ">LEAK<" not in report
+    assert not re.search(r"(src|href)=['\"]https?:", report)
+    assert "slam.graph.pose_graph: pose graph" in (run.path / "run.log").read_text()
+    assert all(not isinstance(handler, logging.FileHandler) for handler in logging.getLogger("slam").handlers)
+
+
+def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> None:
+    """Cut from the chain they would be other numbers: poses of an untrained network are inconsistent."""
+    numbers = run.metrics()["trajectories"]
+    assert numbers["network"]["snippet5"]["ate_mean"] != numbers["odometry"]["snippet5"]["ate_mean"]
+    assert numbers["network"]["snippet5"]["ate_mean"] > 0
+
+
+def test_weights_that_saw_the_sequence_are_stamped(reported: dict[str, Any], leaky_weights: Path) -> None:
+    folder = run_slam(**reported | {"weights": leaky_weights})
+    assert folder.metrics()["provenance"]["leak"] is True
+    assert ">LEAK<" in (folder.path / "report.html").read_text()
+
+
+def test_runs_get_a_stamp_a_name_and_a_link(quick: dict[str, Any], tmp_path: Path) -> None:
+    first, second = run_slam(**quick), run_slam(**quick)
+    assert re.fullmatch(r"\d{8}-\d{6}(-\d+)?_sim", first.path.name) and first.path != second.path
+    assert (tmp_path / "results" / "latest").resolve() == second.path.resolve()
+
+
+def test_two_runs_with_one_seed_give_one_trajectory(quick: dict[str, Any]) -> None:
+    first, second = (run_slam(**quick | {"overrides": quick["overrides"][:1] + quick["overrides"][2:]}) for _ in "ab")
+    for name in ("trajectory_network.tum.txt", "trajectory_optimised.kitti.txt", "graph.g2o"):
+        assert (first.path / name).read_bytes() == (second.path / name).read_bytes()
+
+
+def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
+    output = tmp_path / "mine"
+    run_slam(**quick, output=output)
+    (output / "map_mesh.ply").write_text("of an older run")
+    (output / "notes.txt").write_text("what I saw")
+    run_slam(**quick | {"frames": "0:7"}, output=output)
+    assert RunFolder.open(output).metrics()["sequence"]["frames"] == 7
+    assert not (output / "map_mesh.ply").exists()
+    assert (output / "notes.txt").read_text() == "what I saw"
+    assert not (tmp_path / "results").exists() and not (output / "unfinished").exists()
+
+
+def test_without_map_and_truth_the_reasons_are_written(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    (root / "poses" / "sim.txt").unlink()
+    metrics = check_run(run_slam(**reported | {"dataset": root}).path)
+    assert "mapping.enabled" in metrics["map"]["triangles_reason"]
+    assert "no true poses" in metrics["sequence"]["length_m_reason"]
+    assert metrics["graph"]["coverage"] is None
+    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m_reason"]
+
+
+def test_a_run_that_fails_says_why_and_keeps_what_it_has(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
+) -> None:
+    root = copy_of_kitti_root()
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
+        image.write_bytes(image.read_bytes()[:200])
+    output = tmp_path / "failed"
+    with pytest.raises(SlamError, match=r"no 5 usable frames in a row among 14: .*000003\.png is truncated"):
+        run_slam(**reported | {"dataset": root, "frames": None}, output=output)
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["status"] == "failed" and "000003.png is truncated" in metrics["reason"]
+    assert metrics["provenance"]["weights_licence"] == "none, untrained"
+    report = (output / "report.html").read_text()
+    assert ">FAILED<" in report and "000003.png is truncated" in report
+    assert "the run failed" in (output / "run.log").read_text()
+    assert yaml.safe_load((output / "config.yaml").read_text())["mapping"]["enabled"] is False
+
+
+def test_an_unreadable_image_is_bridged_and_reported(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    image = root / "sequences" / "sim" / "image_2" / "000006.png"
+    image.write_bytes(image.read_bytes()[:200])
+    folder = run_slam(**reported | {"dataset": root, "frames": None})
+    (gap,) = check_run(folder.path)["sequence"]["bridged"]
+    assert (gap["first"], gap["last"]) == (6, 6) and "000006.png is truncated" in gap["reason"]
+    assert folder.metrics()["sequence"]["bridged_frames"] == 1
+    for name in ("report.html", "run.log"):
+        assert "000006.png is truncated" in (folder.path / name).read_text()
+
+
+def test_unreadable_scans_are_left_out_and_reported(
+    reported: dict[str, Any], copy_of_kitti_root: CopyRoot, check_run: CheckRun
+) -> None:
+    root = copy_of_kitti_root()
+    scans = root / "sequences/sim/velodyne"
+    scans.mkdir()
+    street = SimulatedStreet(SimulationOptions(route="straight", frames=14, seed=1001))
+    for k in range(4, 8):
+        street.scan(k).astype("<f4").tofile(scans / f"{k:06d}.bin")
+    (scans / "000006.bin").write_bytes(b"12345")
+    folder = run_slam(**reported | {"dataset": root, "frames": None})
+    (gap,) = check_run(folder.path)["sequence"]["unreadable_scans"]
+    assert (gap["first"], gap["last"]) == (6, 6) and "000006.bin is no Velodyne scan" in gap["reason"]
+    for name in ("report.html", "run.log"):
+        assert "000006.bin is no Velodyne scan" in (folder.path / name).read_text()
+    for scan in scans.iterdir():
+        scan.write_bytes(b"12345")
+    metrics = check_run(run_slam(**reported | {"dataset": root, "frames": None}).path)
+    assert metrics["trajectories"]["lidar_reason"].startswith("4 of 4 LiDAR scans cannot be read")
+
+
+@pytest.mark.parametrize(
+    "error", [Terminated(15), KeyboardInterrupt(), MemoryError(), ValueError("a bug"), RunError("x")]
+)
+def test_however_a_run_ends_its_folder_has_the_reason(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def stop(self: SlamPipeline, *_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(SlamPipeline, "estimate", stop)
+    with pytest.raises(type(error)):
+        run_slam(**quick, output=tmp_path / "ended")
+    metrics = RunFolder.open(tmp_path / "ended").metrics()
+    known = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
+    wanted = known.get(type(error).__name__, type(error).__name__)
+    assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
+
+
+def test_an_untrained_pose_network_with_two_sources_runs(
+    reported: dict[str, Any], tmp_path: Path, write_weights: Callable[..., Path], check_run: CheckRun
+) -> None:
+    metrics = check_run(run_slam(**reported | {"weights": write_weights(tmp_path / "three", sources=2)}).path)
+    assert metrics["trajectories"]["network"]["snippet5"]["count"] == 2
+
+
+def test_impossible_runs_make_no_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+    for wish in ({"sequence": "09"}, {"frames": "0:99"}, {"overrides": ["map.enabled=false"]}):
+        with pytest.raises(SlamError):
+            run_slam(**quick | wish, output=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_outside_a_checkout_or_without_git_there_is_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert slam.commands.run.run.commit() == ""
+
+
+def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: RunFolder) -> None:
+    class Result:
+        optimised = run.trajectory("network")
+        reference = run.trajectory("reference")
+        graph = PoseGraph(PoseGraphConfig())
+
+    assert Result.optimised is not None
+    Result.optimised.T_world_camera[:] = np.eye(4)
+    graph = slam.results.metrics._graph(Result)  # type: ignore[arg-type]
+    assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
+
+
+@pytest.mark.slow
+def test_a_run_from_the_cache_measures_nothing_again_and_leaves_the_same_bytes(
+    kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("a network was run, or an image measured")
+
+    def run(name: str, *overrides: str, cache: Path | None = tmp_path / "cache") -> RunFolder:
+        # not cached: refinement, which depends on the poses, and the test of images, which is short
+        given = [NO_REPORT, "depth.refine=none", "gaps.enabled=false", *overrides]
+        return run_slam(kitti_root, "sim", weights="sim", overrides=given, output=tmp_path / name, cache=cache)
+
+    plain, cold = run("plain", cache=None), run("cold")
+    for name in ("disparity", "poses"):
+        monkeypatch.setattr(slam.commands.run.run.DepthPosePredictor, name, forbidden)
+    for name in ("calcOpticalFlowPyrLK", "goodFeaturesToTrack", "findEssentialMat"):
+        monkeypatch.setattr(cv2, name, forbidden)
+    warm = run("warm")
+    names = sorted(path.name for path in plain.path.iterdir())
+    assert names == sorted(path.name for path in warm.path.iterdir())
+    for name in set(names) - {"metrics.json", "run.log", "drive.zip"}:  # these hold times
+        assert len({(run.path / name).read_bytes() for run in (plain, cold, warm)}) == 1, name
+    assert run("other", "pose_graph.kernel=none").metrics()["status"] == "ok"
+    with pytest.raises(AssertionError, match="an image measured"):
+        run("changed", "geometry.max_corners=150")

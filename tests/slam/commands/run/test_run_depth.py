@@ -1,0 +1,237 @@
+"""Whole runs with depth from elsewhere: another network, arrays, pictures; and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import slam.commands.cli
+from slam import Slam, run_slam
+from slam.commands.localisation.localiser import localise
+from slam.config.sections import load_config
+from slam.loops.places import PLACES, Places
+from slam.pipeline.checkpoint import KEYFRAMES, read_keyframes
+from slam.results.folder import RunFolder
+from slam.runtime.errors import SlamError
+from slam.sequences.catalogue import open_sequence
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+
+CheckRun = Callable[[Path], dict[str, Any]]
+PLAIN = ["output.report=false", "mapping.enabled=false"]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """24 frames of a simulated street, with exact depth as pictures. Not to be changed."""
+    root = tmp_path_factory.mktemp("depth") / "world"
+    options = SimulationOptions(route="straight", frames=24, seed=1002)
+    write_kitti_root(SimulatedStreet(options), root, depth=True)
+    return root
+
+
+def exact(world: Path) -> Path:
+    return world / "sequences" / "sim" / "depth_2"
+
+
+@pytest.fixture(scope="module")
+def arrays(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same depth as arrays of half the size, in thirds of a metre; the sky is NaN."""
+    folder = tmp_path_factory.mktemp("arrays")
+    for path in sorted(exact(world).glob("*.png")):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::2, ::2].astype(np.float32) / 256
+        np.save(folder / f"{path.stem}.npy", np.where(depth > 0, 3 * depth, np.nan))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(tiny_weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("onnxruntime")
+    from erfsfm.checkpoint import load_model
+    from erfsfm.export import export_onnx
+
+    path = tmp_path_factory.mktemp("onnx") / "net.onnx"
+    export_onnx(load_model(tiny_weights), path)
+    return path
+
+
+def positions(run: RunFolder, name: str = "optimised") -> np.ndarray:
+    trajectory = run.trajectory(name)
+    assert trajectory is not None
+    return trajectory.positions
+
+
+def run(world: Path, output: Path, source: str, *overrides: str, **options: Any) -> RunFolder:
+    given = [*PLAIN, f"depth.source={source}", *overrides]
+    return run_slam(world, "sim", overrides=given, output=output, **{"weights": "sim", **options})
+
+
+def test_our_exported_network_gives_the_run_of_our_weights(
+    world: Path, tiny_weights: Path, exported: Path, tmp_path: Path, check_run: CheckRun
+) -> None:
+    options = {"weights": tiny_weights, "frames": "0:9"}
+    own = run(world, tmp_path / "own", "network", "output.report=true", **options)
+    other = run(world, tmp_path / "other", f"onnx:{exported}", "output.report=true", **options)
+    for name in ("network", "odometry", "optimised"):
+        length = np.linalg.norm(positions(own, name)[-1])
+        np.testing.assert_allclose(positions(other, name), positions(own, name), atol=2e-3 * length)
+    provenance = check_run(other.path)["provenance"]
+    assert provenance["depth_source"] == f"onnx:{exported}" and len(provenance["depth_sha256"]) == 64
+    assert provenance["depth_sha256"] != provenance["weights_sha256"]
+    before = check_run(own.path)["provenance"]
+    assert (before["depth_source"], before["depth_sha256"]) == ("network", before["weights_sha256"])
+
+
+def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
+    world: Path, arrays: Path, tmp_path: Path, check_run: CheckRun
+) -> None:
+    pictures = run(world, tmp_path / "png", f"png:{exact(world)}", "mapping.enabled=true", "output.report=true")
+    metrics = check_run(pictures.path)
+    assert metrics["scale"]["value"] == pytest.approx(1.0, abs=0.06)
+    aligned = metrics["trajectories"]["optimised"]["align"]
+    assert aligned["7dof"]["scale"] == pytest.approx(1.0, abs=0.06) and aligned["7dof"]["ate_rmse_m"] < 0.3
+    assert metrics["map"]["triangles"] > 0
+    assert f"png:{exact(world)}" in (pictures.path / "report.html").read_text()
+    thirds = run(world, tmp_path / "npy", f"npy:{arrays}")
+    assert thirds.metrics()["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
+    length = float(np.linalg.norm(positions(pictures)[-1]))
+    np.testing.assert_allclose(positions(thirds), positions(pictures), atol=0.03 * length)
+    (place,) = localise(world / "sequences/sim/image_2/000012.png", pictures)
+    assert place.T_world_camera is None or place.nearest_frame is not None
+
+
+def test_a_range_of_frames_and_a_blank_one(
+    world: Path, arrays: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = shutil.copytree(arrays, tmp_path / "arrays")
+    np.save(folder / "000016.npy", np.full((64, 208), np.nan, np.float32))
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics()
+    assert metrics["status"] == "ok" and "frame 10 has no known depth" in caplog.text
+    assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
+
+
+def test_depth_of_distorted_images_is_undistorted_with_them(world: Path, tmp_path: Path) -> None:
+    depth, camera = exact(world) / "000000.png", tmp_path / "camera.yaml"
+    lens: dict[str, Any] = {"width": 416, "height": 128, "fx": 240, "fy": 240, "cx": 207, "cy": 60, "fps": 10}
+    camera.write_text(yaml.safe_dump(lens | {"model": "opencv", "distortion": [-0.2, 0.03, 0, 0]}))
+    chosen = ["mapping.enabled=true", "output.keep=keyframes"]
+    finished = run(world, tmp_path / "run", f"png:{exact(world)}", *chosen, camera=camera, frames="0:7")
+    pinhole = Places.read(finished.path / PLACES).intrinsics
+    K, coefficients = np.array([[240, 0, 207], [0, 240, 60], [0, 0, 1.0]]), np.array([-0.2, 0.03, 0, 0])
+    maps = cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), pinhole.K, (416, 128), cv2.CV_32FC1)
+    stored = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
+    wanted = cv2.remap(stored, *maps, cv2.INTER_NEAREST)
+    kept = next(read_keyframes(finished.path / KEYFRAMES))
+    both = (wanted > 0) & np.isfinite(kept.depth_unscaled)
+    assert np.quantile(np.abs(kept.depth_unscaled / wanted - 1)[both], 0.9) < 0.04  # half a pixel of the road
+    np.testing.assert_array_equal(np.isfinite(kept.depth_unscaled), wanted > 0)
+
+
+def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "relative"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for path in sorted(exact(world).glob("*.png")):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 256
+        disparity = np.where(depth > 0, 1 / np.maximum(depth, 0.1), 0)
+        np.save(folder / f"{path.stem}.npy", rng.uniform(3, 30) * (disparity + 0.02).astype(np.float32))
+    chosen = ["depth.kind=disparity", "depth.align=affine"]
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", *chosen).metrics()
+    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["scale"] == pytest.approx(1.0, abs=0.08)
+    assert metrics["scale"]["spread"] < 0.15
+
+
+@pytest.mark.slow
+def test_a_drive_is_continued_with_the_same_source_alone(world: Path, arrays: Path, tmp_path: Path) -> None:
+    first = run(world, tmp_path / "first", f"npy:{arrays}", frames="0:12")
+    whole = run(world, tmp_path / "whole", f"npy:{arrays}")
+    following = {"weights": "sim", "frames": "12:", "continues": first.path}
+    rest = run_slam(world, "sim", output=tmp_path / "rest", **following)
+    np.testing.assert_array_equal(positions(rest), positions(whole))
+    part = tmp_path / "part"
+    part.mkdir()
+    for path in sorted(arrays.glob("*.npy"))[12:]:
+        shutil.copy(path, part)
+    others = {"output": tmp_path / "other", "overrides": [f"depth.source=npy:{part}"]}
+    assert run_slam(world, "sim", **following, **others).metrics()["sequence"]["frames"] == 24
+    for override, message in {
+        "depth.source=network": "other weights or another depth source",
+        f"depth.source=png:{exact(world)}": "other weights or another depth source",
+        "depth.align=scale": "depth cannot be changed",
+    }.items():
+        with pytest.raises(SlamError, match=message):
+            run_slam(world, "sim", **following, overrides=[override], output=tmp_path / "no")
+
+
+def test_live_sessions_take_a_network_and_refuse_folders(
+    world: Path, tiny_weights: Path, exported: Path, arrays: Path
+) -> None:
+    sequence = open_sequence(world, "sim")
+    config = load_config(None, [f"depth.source=onnx:{exported}"])
+    with Slam.from_weights(tiny_weights, sequence.intrinsics, config, sequence.camera_height_m) as session:
+        for k in range(6):
+            session.add_frame(sequence.frame(k).image, 0.1 * k)
+        assert len(session.trajectory()) == 6
+    config = load_config(None, [f"depth.source=npy:{arrays}"])
+    with pytest.raises(SlamError, match=r"npy:.* needs a whole sequence.*: choose network or onnx:FILE"):
+        Slam.from_weights(tiny_weights, sequence.intrinsics, config)
+
+
+def test_a_cache_keeps_outputs_of_the_network(world: Path, exported: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    from slam.prediction.onnx_depth import OnnxDepth
+
+    def forbidden(*_: object) -> None:
+        raise AssertionError("the network was run")
+
+    options = {"weights": tiny_weights, "frames": "0:7", "cache": tmp_path / "cache"}
+    cold = run(world, tmp_path / "cold", f"onnx:{exported}", **options)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OnnxDepth, "infer", forbidden)
+        warm = run(world, tmp_path / "warm", f"onnx:{exported}", **options)
+    np.testing.assert_array_equal(positions(cold), positions(warm))
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("onnx", "'depth.source' in --set depth.source=onnx should be network, onnx:FILE, npy:FOLDER or png:FOLDER"),
+        ("tiff:depth", "should be network, onnx:FILE, npy:FOLDER or png:FOLDER; got 'tiff:depth'"),
+        ("onnx:gone.onnx", "cannot read gone.onnx"),
+        ("npy:gone", "no depth folder gone"),
+        ("npy:short", "short has 23 frames of .npy"),
+        ("npy:pickled", "pickled/000005.npy holds Python objects, which are not loaded"),
+        ("npy:unknown", "frames 0 to 4 have no known depth in npy:unknown"),
+        ("onnx:damaged.onnx", "damaged.onnx is damaged or no ONNX file"),
+    ],
+)
+def test_bad_sources_are_one_line_and_exit_1(
+    world: Path,
+    arrays: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    source: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (shutil.copytree(arrays, tmp_path / "short") / "000023.npy").unlink()
+    np.save(shutil.copytree(arrays, tmp_path / "pickled") / "000005.npy", np.array([[print]]), allow_pickle=True)
+    (tmp_path / "unknown").mkdir()
+    for k in range(24):
+        np.save(tmp_path / "unknown" / f"{k}.npy", np.full((64, 208), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32))
+    (tmp_path / "damaged.onnx").write_bytes(b"\x08\x07" * 99)
+    words = ["run", "--dataset", str(world), "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
+    monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
+    with pytest.raises(SystemExit) as ended:
+        slam.commands.cli.main()
+    lines = capsys.readouterr().err.strip().splitlines()
+    (line,) = [each for each in lines if not each.startswith("WARNING")]
+    assert ended.value.code == 1 and message in line
+    assert (tmp_path / "out").exists() == (source == "npy:unknown"), "all else is found before the run begins"

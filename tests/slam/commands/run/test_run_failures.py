@@ -1,0 +1,287 @@
+"""However a run ends, no whole run is lost, and what it left can be used."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from erfsfm.common.errors import BusyError
+from erfsfm.common.signals import Terminated
+from slam import run_slam
+from slam.commands.cli import main
+from slam.commands.run.run import RunOptions, RunRequest
+from slam.formats.ply import read_ply
+from slam.formats.trajectory import read_trajectory
+from slam.pipeline.batch import SlamPipeline
+from slam.results.folder import RunFolder
+from slam.runtime.errors import RunError, SlamError
+
+CopyRoot = Callable[[], Path]
+
+
+@pytest.fixture
+def quick(kitti_root: Path, tiny_weights: Path) -> dict[str, Any]:
+    """Arguments of a run of a second: networks and graph alone."""
+    overrides = ["geometry.enabled=false", "mapping.enabled=false", "output.report=false"]
+    return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:8"}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def call(*arguments: object) -> int:
+    """Exit code of ``erfsfm-slam ARGUMENTS``."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:
+        patch.setattr(sys, "argv", ["erfsfm-slam", *map(str, arguments)])
+        main()
+    return int(stopped.value.code or 0)
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Every write beyond ``size`` bytes of a file fails, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_every_option_has_a_type_and_a_default() -> None:
+    assert {"dataset", "sequence", *RunOptions.__annotations__} == {field.name for field in fields(RunRequest)}
+    with pytest.raises(TypeError, match="sped"):
+        run_slam(**{"sped": 3})  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"seed": -1},
+        {"seed": 2**31},
+        {"frames": 8},
+        {"overrides": "mapping.enabled=false"},
+        {"progress": 5},
+    ],
+)
+def test_an_argument_of_another_kind_is_named(quick: dict[str, Any], option: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=f"run_slam: {next(iter(option))}: "):
+        run_slam(**quick | {"output": tmp_path / "run"} | option)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_link_to_nothing_is_no_place_for_a_run(quick: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "run").symlink_to(tmp_path / "unmounted")
+    with pytest.raises(RunError, match=r"run is a link to .*unmounted, which is not there"):
+        run_slam(**quick, output=tmp_path / "run")
+
+
+@pytest.mark.parametrize("content", [{"config.yaml": "mine"}, {"metrics.json": '{"loss": 1}', "config.yaml": "mine"}])
+def test_a_folder_of_another_program_is_refused_before_any_work(
+    quick: dict[str, Any], tmp_path: Path, content: dict[str, str]
+) -> None:
+    for name, text in content.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(RunError, match="not empty and holds no run"):
+        run_slam(**quick | {"weights": tmp_path / "nowhere"}, output=tmp_path)
+    assert contents(tmp_path) == {name: text.encode() for name, text in content.items()}
+
+
+def test_a_data_set_is_no_place_for_a_run(quick: dict[str, Any], copy_of_kitti_root: CopyRoot) -> None:
+    root = copy_of_kitti_root()
+    before = contents(root)
+    with pytest.raises(RunError, match="not empty and holds no run"):
+        run_slam(**quick | {"dataset": root}, output=root)
+    assert contents(root) == before
+
+
+def test_a_run_that_cannot_begin_leaves_an_earlier_one_as_it_is(quick: dict[str, Any], tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    run_slam(**quick, output=output)
+    before = contents(output)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "model.yaml").write_text("{")
+    for wish in (
+        {"frames": "0:2"},
+        {"overrides": ["scale.mode=lidar"]},
+        {"weights": tmp_path / "weights"},
+        {"dataset": tmp_path / "nowhere"},
+        {"overrides": ["map.nope=1"]},
+    ):
+        with pytest.raises(Exception, match=r".") as raised:
+            run_slam(**quick | wish, output=output)
+        assert "\n" not in str(raised.value)
+        assert contents(output) == before
+
+
+def test_a_run_that_breaks_off_leaves_an_earlier_one_and_stays_beside_it(
+    quick: dict[str, Any], copy_of_kitti_root: CopyRoot, tmp_path: Path
+) -> None:
+    output, root = tmp_path / "run", copy_of_kitti_root()
+    run_slam(**quick, output=output)
+    before = contents(output)
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
+        image.write_bytes(b"no image")
+    with pytest.raises(SlamError, match=r"000003\.png.*run keeps its earlier run, this one is in .*unfinished"):
+        run_slam(**quick | {"dataset": root}, output=output)
+    after = contents(output)
+    assert {name: content for name, content in after.items() if "/" not in name} == before
+    broken = json.loads(after["unfinished/metrics.json"])
+    assert broken["status"] == "failed" and "000003.png" in broken["reason"]
+    assert b"the run failed" in after["unfinished/run.log"]
+    assert run_slam(**quick | {"frames": "0:9"}, output=output).metrics()["sequence"]["frames"] == 9
+    assert set(contents(output)) == set(before)
+
+
+def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    overrides = ["geometry.enabled=false", "output.report=false", "output.keep=nothing", "loops.enabled=false"]
+    overrides += ["mapping.voxel_size_m=0.1", "mapping.submap_m=3", "depth.refine=none"]  # a map larger than its parts
+    arguments = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:7"]
+    arguments += [word for override in overrides for word in ("--set", override)]
+    whole, full = tmp_path / "whole", tmp_path / "full"
+    assert call(*arguments, "--output", whole) == 0
+    size = (whole / "map_mesh.ply").stat().st_size
+    capfd.readouterr()
+    with largest_file(size - 1):
+        assert call(*arguments, "--output", full) == 1
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert "the map cannot be kept in" in err and "(File too large): make room" in err
+    metrics = json.loads((full / "metrics.json").read_text())
+    assert metrics["status"] == "failed" and "the map cannot be kept" in metrics["reason"]
+    assert metrics["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    assert len(read_trajectory(full / "trajectory_optimised.tum.txt")) == 7
+    assert not any(path.name.startswith(".") or path.suffix == ".ply" for path in full.iterdir())
+    assert call("export", full, "--what", "mesh", "--output", tmp_path / "saved.ply") == 0  # of the finished submaps
+    saved, mesh = read_ply(tmp_path / "saved.ply"), read_ply(whole / "map_mesh.ply")
+    np.testing.assert_array_equal(saved.vertices, mesh.vertices)
+    assert not (whole / "submaps").exists()
+    capfd.readouterr()
+    with largest_file(size - 1):
+        assert call("export", whole, "--what", "mesh", "--up", "z", "--output", tmp_path / "up.ply") == 1
+    assert capfd.readouterr().err.count("\n") == 1 and not (tmp_path / "up.ply").exists()
+    assert call("export", whole, "--what", "mesh", "--up", "z", "--output", tmp_path / "up.ply") == 0
+    assert len(read_ply(tmp_path / "up.ply").vertices) == len(read_ply(whole / "map_mesh.ply").vertices)
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_terminated_run_has_its_reason(
+    quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def terminated(self: SlamPipeline, *_: object) -> None:
+        os.kill(os.getpid(), getattr(signal, name))
+
+    monkeypatch.setattr(SlamPipeline, "fuse", terminated)
+    with pytest.raises(Terminated) as raised:
+        run_slam(**quick, output=tmp_path / "run")
+    assert raised.value.code == 128 + getattr(signal, name)
+    metrics = RunFolder.open(tmp_path / "run").metrics()
+    assert (metrics["status"], metrics["reason"]) == ("failed", f"ended by {name}")
+    assert metrics["trajectories"]["optimised"]["align"] and metrics["map"] is None
+
+
+def test_the_command_line_says_which_signal_ended_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def terminated(*_: object, **__: object) -> None:
+        raise Terminated(15)
+
+    monkeypatch.setattr("slam.commands.run.run.run_slam", terminated)
+    assert call("run") == 143
+    assert capsys.readouterr().err == "erfsfm-slam: ended by SIGTERM; what was written stays\n"
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from slam import run_slam
+from slam.pipeline.batch import SlamPipeline
+
+def kill(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+SlamPipeline.fuse = kill
+root, weights, output = sys.argv[1:]
+run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overrides=["geometry.enabled=false"])
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
+    quick: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    output = tmp_path / "run"
+    arguments = [str(quick["dataset"]), str(quick["weights"]), str(output)]
+    assert subprocess.run([sys.executable, "-c", KILLED, *arguments], check=False).returncode == -signal.SIGKILL
+    assert RunFolder.open(output).metrics()["status"] == "estimated"
+    images = quick["dataset"] / "sequences" / "sim" / "image_2"
+    run = ("run", "--dataset", quick["dataset"], "--weights", quick["weights"], "--set", "mapping.enabled=false")
+    for numbers in ("estimated", "running", "absent"):
+        if numbers == "running":
+            (output / "metrics.json").write_text(
+                '{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}'
+            )
+        elif numbers == "absent":
+            (output / "metrics.json").unlink()
+        caplog.clear()
+        assert call("export", output, "--what", "trajectory", "--output", tmp_path / "path.tum") == 0
+        assert caplog.text.count("\n") == 1 and "files that are there are whole" in caplog.text
+        capsys.readouterr()
+        assert call("evaluate", output, "--json") == 0
+        (entry,) = json.loads(capsys.readouterr().out)
+        assert entry["status"] != "ok" and entry["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] > 0
+    assert call("localize", images / "000003.png", "--map", output) == 0
+    assert call(*run, "--continue", output, "--frames", "8:10", "--output", tmp_path / "on") == 0
+    (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
+    assert call(*run, "--frames", "0:8", "--output", output) == 0
+    assert RunFolder.open(output).metrics()["status"] == "ok"
+
+
+def test_a_run_that_fails_after_its_folder_is_made_prints_one_line(
+    copy_of_kitti_root: CopyRoot, tiny_weights: Path, tmp_path: Path
+) -> None:
+    root, output = copy_of_kitti_root(), tmp_path / "run"
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
+        image.write_bytes(b"no image")
+    arguments = ["run", "--dataset", root, "--weights", tiny_weights, "--output", output]
+    finished = subprocess.run(
+        [sys.executable, "-m", "slam", *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    assert (finished.returncode, finished.stdout, finished.stderr.count("\n")) == (1, "", 1)
+    assert finished.stderr.startswith("erfsfm-slam: no 5 usable frames") and "000003.png" in finished.stderr
+    assert {path.name for path in output.iterdir()} == {"config.yaml", "metrics.json", "report.html", "run.log"}
+
+
+def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None:
+    """Also of one that goes on in its own folder while it runs."""
+    output, refused = tmp_path / "run", []
+
+    def second(*_: object) -> None:
+        if not refused:
+            for other in ({"output": output}, {"dataset": None, "sequence": None, "frames": None, "continues": output}):
+                with pytest.raises(BusyError, match="another process writes to") as error:
+                    run_slam(**quick | other)
+                refused.append(error)
+
+    run_slam(**quick, output=output, progress=second)
+    assert len(refused) == 2 and RunFolder.open(output).metrics()["status"] == "ok"
+    assert run_slam(**quick, output=output).metrics()["status"] == "ok"
+
+
+def test_a_whole_run_does_not_go_on_by_itself(quick: dict[str, Any], tmp_path: Path) -> None:
+    run_slam(**quick, output=tmp_path / "run")
+    with pytest.raises(RunError, match="name the frames that follow those of"):
+        run_slam(continues=tmp_path / "run", weights=quick["weights"])

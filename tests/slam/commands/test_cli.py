@@ -1,0 +1,353 @@
+"""The command line: light help, one line for an error, results on stdout."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import typer
+
+import slam
+import slam.commands.run.run
+from slam.commands.cli import app, main
+from slam.evaluation.trajectory import trajectory_metrics
+from slam.formats.trajectory import read_trajectory
+from slam.results.folder import RunFolder
+from slam.runtime.errors import SlamError
+
+Call = Callable[..., tuple[int, str, str]]
+MakeRun = Callable[..., RunFolder]
+
+VERBS = {"run", "evaluate", "export", "simulate", "plot", "localize", "config", "doctor"}
+QUICK = ("--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false")
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
+    """Exit code, stdout and stderr of ``erfsfm-slam ARGUMENTS`` in this process, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("KITTI_ODOMETRY", raising=False)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        out, err = capsys.readouterr()
+        return int(stopped.value.code or 0), out, err
+
+    return run
+
+
+HELP = """
+import sys, typer
+from typer.testing import CliRunner
+from slam.commands.cli import app
+
+verbs = typer.main.get_command(app).commands
+assert CliRunner().invoke(app, ["--help"]).exit_code == 0
+for verb in verbs:
+    result = CliRunner().invoke(app, [verb, "--help"])
+    assert result.exit_code == 0 and "Example: erfsfm-slam " + verb in result.output, (verb, result.output)
+    print(verb)
+libraries = {"torch", "lightning", "cv2", "gtsam", "open3d", "evo", "matplotlib", "scipy", "numpy", "rich"}
+heavy = libraries & set(sys.modules)
+assert not heavy, heavy
+"""
+
+
+def test_help_of_every_verb_is_light() -> None:
+    finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert set(finished.stdout.split()) >= VERBS
+
+
+def verbs() -> dict[str, Any]:
+    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("typed", "wanted"), [("erfsfm-slam ev", "evaluate"), ("erfsfm-slam run --wei", "--weights")])
+def test_shells_complete(typed: str, wanted: str) -> None:
+    words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1)}
+    finished = subprocess.run(
+        [sys.executable, "-m", "slam"],
+        env=os.environ | words | {"_ERFSFM_SLAM_COMPLETE": "complete_bash"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert finished.stdout.split() == [wanted], finished.stderr
+
+
+def in_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        f"{shlex.quote(sys.executable)} -m slam {arguments}",
+        shell=True,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(Path(slam.__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("arguments", ["config", "evaluate estimate.txt estimate.txt", "evaluate --help"])
+@pytest.mark.parametrize("end", ["| true", ">&-"])
+def test_a_closed_stdout_is_no_traceback(tmp_path: Path, arguments: str, end: str) -> None:
+    (tmp_path / "estimate.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    finished = in_shell(f"{arguments} {end}", tmp_path)
+    assert finished.stderr == "" and finished.stdout == ""
+
+
+def test_a_closed_stderr_stops_nothing(tmp_path: Path) -> None:
+    finished = in_shell("simulate world --route straight --frames 5 --width 104 --height 32 2>&-", tmp_path)
+    assert finished.returncode == 0 and "5 frames in world" in finished.stdout
+
+
+def test_an_error_of_several_lines_is_printed_as_one(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**_: Any) -> None:
+        raise SlamError("first line\nsecond line")
+
+    monkeypatch.setattr(slam.commands.run.run, "run_slam", fail)
+    assert call("run") == (1, "", "erfsfm-slam: first line second line\n")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["run", "--sped", "3"],
+        ["run", "--seed", "-1"],
+        ["run", "--device", "tpu"],
+        ["evaluate"],
+        ["evaluate", "one.txt"],
+        ["evaluate", "a.txt", "b.txt", "c.txt"],
+        ["evaluate", "a.txt", "b.txt", "--format", "euroc"],
+        ["evaluate", ".", "--fail-over", "ate_rmse_m=1"],
+        ["export", "."],
+        ["simulate", "world", "--frames", "many"],
+    ],
+)
+def test_wrong_usage_exits_with_2(call: Call, arguments: list[str]) -> None:
+    code, out, err = call(*arguments)
+    assert code == 2 and "Usage:" in out + err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "--dataset", "nowhere"], "no data set at nowhere"),
+        (["run", "--sequence", "09"], "KITTI_ODOMETRY"),
+        (["run", "--weights", "nowhere"], "no weights 'nowhere'"),
+        (["run", "--set", "mapping.voxel=1"], "mapping.voxel"),
+        (["run", "--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["run", "--camera", "camera.yaml"], "--dataset"),
+        (["run", "--frames", "9:3"], "A must come before B"),
+        (["evaluate", "a.txt", "b.txt"], "a.txt: no such file"),
+        (["evaluate", "."], "not a run folder"),
+        (["export", "nowhere", "--what", "mesh", "--output", "m.ply"], "nowhere is not a run folder"),
+        (["export", "nowhere", "--what", "mesh", "--output", "m.ply", "--crop", "1,2"], "x0,x1,y0,y1,z0,z1"),
+        (["export", "nowhere", "--what", "raster", "--output", "r", "--origin", "north"], "LAT,LON,HEADING"),
+        (["plot", "nowhere"], "nowhere is not a run folder"),
+        (["simulate", "world", "--route", "maze"], "maze"),
+        (["simulate", "world", "--frames", "20"], "a loop closes within 250"),
+        (["simulate", "world", "--hazards", "snow"], "snow"),
+    ],
+)
+def test_a_known_error_is_one_line_and_exits_with_1(
+    call: Call, arguments: list[str], words: str, tmp_path: Path
+) -> None:
+    code, out, err = call(*arguments)
+    assert code == 1 and out == ""
+    assert err.startswith("erfsfm-slam: ") and err.count("\n") == 1 and words in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
+    arguments = ["run", "--dataset", kitti_root, "-s", "sim", "--weights", tiny_weights, "--frames", "0:6", *QUICK]
+    code, out, err = call(*arguments, "--output", "my run", "--set", "scale.mode=none", "--seed", 5)
+    assert (code, err) == (0, "")
+    for name in ("network", "odometry", "optimised"):
+        assert re.search(rf"^\s*{name}\s+[\d.]+", out, re.MULTILINE)
+    assert "sim, scale none" in out and "networks' own unit" in out
+    assert "none, untrained" in out and "LEAK" not in out
+    assert "6 frames in" in out and "my run" in out and "report.html" not in out
+    metrics = RunFolder.open(Path("my run")).metrics()
+    assert metrics["provenance"]["seed"] == 5
+    assert shlex.split(metrics["provenance"]["command"]) == [
+        "erfsfm-slam",
+        *map(str, arguments),
+        *["--output", "my run", "--set", "scale.mode=none", "--seed", "5"],
+    ]
+    named = {"dataset": str(kitti_root.absolute()), "sequence": "sim", "frames": "0:6"}
+    assert metrics["provenance"]["recording"] == named
+    code, out, err = call("export", "my run", "--what", "nerfstudio", "--output", "scene")
+    assert code == 0 and "scene" in out and len(list(Path("scene/images").iterdir())) == 6, err
+
+
+def test_run_prints_interpolated_gaps(call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path) -> None:
+    root = copy_of_kitti_root()
+    (root / "sequences" / "sim" / "image_2" / "000007.png").write_bytes(b"no image")
+    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
+    assert code == 0 and re.search(r"^INTERPOLATED: frames 7 to 7: .*000007\.png", out, re.MULTILINE)
+
+
+def test_a_run_without_truth_has_no_table_of_dashes(
+    call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
+) -> None:
+    root = copy_of_kitti_root()
+    (root / "poses" / "sim.txt").unlink()
+    code, out, _ = call("run", "--dataset", root, "--weights", tiny_weights, "--set", "mapping.enabled=false")
+    assert code == 0 and "sim, scale camera-height: no errors, for the sequence has no true poses" in out
+    assert "–" not in out and "14 frames in" in out
+
+
+def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_weights: Path) -> None:
+    arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6", *QUICK]
+    assert "LEAK" in call(*arguments)[1]
+    code, out, _ = call(*arguments, "--json", "--output", "again")
+    assert code == 0 and json.loads(out) == RunFolder.open(Path("again")).metrics()
+    assert Path("results/latest").resolve().name.endswith("_sim")
+
+
+def test_a_run_that_breaks_off_is_one_line_and_a_failed_folder(
+    call: Call, copy_of_kitti_root: Callable[[], Path], tiny_weights: Path
+) -> None:
+    root = copy_of_kitti_root()
+    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[4:]:
+        image.write_bytes(b"no image")
+    code, out, err = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
+    assert code == 1 and out == "" and err.startswith("erfsfm-slam: ") and "000004.png" in err
+    assert err.count("\n") == 1
+    assert RunFolder.open(Path("run")).metrics()["status"] == "failed"
+
+
+def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(slam.commands.run.run, "run_slam", interrupt)
+    code, _, err = call("run")
+    assert code == 130 and "interrupted; what was written stays" in err and "Traceback" not in err
+
+
+def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
+    return run.path / f"trajectory_optimised.{kind}.txt", run.path / f"reference.{kind}.txt"
+
+
+@pytest.mark.parametrize("kind", ["tum", "kitti"])
+def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
+    estimate, reference = files_of(make_run(), kind)
+    code, out, _ = call("evaluate", estimate, reference, "--json")
+    expected = trajectory_metrics(read_trajectory(estimate, kind), read_trajectory(reference, kind))
+    assert code == 0 and json.loads(out) == expected
+    code, table, _ = call("evaluate", estimate, reference, "--format", kind)
+    assert code == 0
+    assert f"{expected['align']['7dof']['ate_rmse_m']:.3f}" in table
+    assert f"evo_ape {kind} " in table and "--align --correct_scale" in table
+
+
+def test_fail_over(call: Call, make_run: MakeRun) -> None:
+    files = files_of(make_run())
+    assert call("evaluate", *files, "--fail-over", "ate_rmse_m=1000")[0] == 0
+    code, out, err = call("evaluate", *files, "--json", "--fail-over", "ate_rmse_m=0", "--fail-over", "rpe_rot_deg=99")
+    assert code == 1 and "align.7dof.ate_rmse_m is " in err and "over the limit 0" in err and "rpe_rot_deg" not in err
+    assert json.loads(out)["align"]
+    assert call("evaluate", *files, "--fail-over", "beauty=1")[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("what", "output", "start"),
+    [
+        ("mesh", "a/map.ply", "ply"),
+        ("cloud", "map.ply", "ply"),
+        ("trajectory", "poses.txt", "1.0"),
+        ("trajectory", "poses.tum", "# timestamp"),
+        ("graph", "graph.g2o", "VERTEX_SE3:QUAT 0"),
+        ("mesh", "map.obj", "# erfsfm-slam"),
+        ("mesh", "map.gltf", '{"asset"'),
+    ],
+)
+def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: str) -> None:
+    run = make_run()
+    code, out, _ = call("export", run.path, "--what", what, "--output", output)
+    assert code == 0 and output in out and Path(output).read_text().startswith(start)
+
+
+def test_export_of_a_part(call: Call, make_run: MakeRun) -> None:
+    """A box may begin with a minus."""
+    run = make_run()
+    box = ("--crop", "-1,2,-3,1,0,2")
+    assert call("export", run.path, "--what", "mesh", "--output", "a.glb", *box, "--voxel", 0.1)[0] == 0
+    code, _, err = call("export", run.path, "--what", "mesh", "--output", "b.glb", "--crop", "5,6,5,6,5,6")
+    assert code == 1 and err.count("\n") == 1 and "nothing of the map lies inside" in err
+    assert call("export", run.path, "--what", "raster", "--output", "raster", "--resolution", 0.5)[0] == 0
+    assert Path("raster/raster.yaml").is_file() and not Path("b.glb").exists()
+
+
+def test_export_with_z_up(call: Call, make_run: MakeRun) -> None:
+    """The mesh read by Open3D is rotated: y down becomes z up."""
+    assert call("export", make_run().path, "--what", "mesh", "--output", "up.ply", "--up", "z")[0] == 0
+    from slam.runtime.imports import import_open3d
+
+    vertices = np.asarray(import_open3d().io.read_triangle_mesh("up.ply").vertices)
+    np.testing.assert_allclose(vertices, [[0, 1, 0], [1, 1, 0], [0, 1, 2]], atol=1e-6)
+
+
+def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
+    run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
+    assert call(*run)[0] == 0
+    images = kitti_root / "sequences" / "sim" / "image_2"
+    code, out, err = call("localize", images, "--map", "run")
+    assert (code, err) == (0, "") and "of 14 images found" in out and re.search(r"^\s*000013\.png ", out, re.MULTILINE)
+    code, out, _ = call("localize", images / "000003.png", "--map", "run", "--json")
+    assert code == 0 and [entry["image"] for entry in json.loads(out)] == ["000003.png"]
+    assert call("localize", images, "--map", images)[0] == 1
+    reference = Path("run/reference.tum.txt").read_bytes()
+    code, _, err = call("localize", images, "--map", "run", "--output", "run/reference.tum.txt")
+    assert code == 1 and "is a file of a run" in err and Path("run/reference.tum.txt").read_bytes() == reference
+
+
+def test_simulate_writes_a_root_that_runs(call: Call, tiny_weights: Path) -> None:
+    size = ("--width", 104, "--height", 32, "--frames", 8, "--route", "straight", "--seed", 1003)
+    code, out, err = call("simulate", "world", *size, "--depth", "--lidar", "--hazards", "rain,exposure")
+    assert (code, err) == (0, "") and "--dataset world" in out
+    sequence = Path("world/sequences/sim")
+    assert len(list((sequence / "image_2").glob("*.png"))) == 8
+    depth = cv2.imread(str(sequence / "depth_2" / "000003.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16 and depth.shape == (32, 104) and 2 < np.median(depth[20:] / 256) < 40
+    assert np.fromfile(sequence / "velodyne" / "000003.bin", np.float32).reshape(-1, 4).shape[0] > 1000
+    assert np.loadtxt("world/poses/sim.txt").shape == (8, 12)
+    assert call("simulate", "world", *size)[0] == 1  # never over what is there
+    assert call("run", "--dataset", "world", "--weights", tiny_weights, *QUICK)[0] == 0
+
+
+def test_doctor(call: Call, kitti_root: Path) -> None:
+    code, out, _ = call("doctor", "--dataset", kitti_root)
+    assert code == 0
+    assert all(line.split()[0] in ("ok", "missing") for line in out.splitlines())
+    assert "sequence sim: 14 frames" in out
+
+
+def test_a_continued_run_prints_its_numbers_of_frames(
+    call: Call, kitti_root: Path, tiny_weights: Path, tmp_path: Path
+) -> None:
+    run = ("run", "--dataset", kitti_root, "--sequence", "sim", "--weights", tiny_weights)
+    assert call(*run, *QUICK, "--frames", "0:6", "--output", "begun")[0] == 0
+    code, out, _ = call(*run, "--continue", "begun", "--frames", "6:8", "--output", "on")
+    assert code == 0 and "2 more frames, 8 in all, in " in out
+    assert len((tmp_path / "on" / "trajectory_optimised.kitti.txt").read_text().splitlines()) == 8
+    code, out, err = call(*run, "--continue", "nowhere", "--output", "off")
+    assert (code, out, err.count("\n")) == (1, "", 1) and "nowhere is not a run folder" in err
+    assert not (tmp_path / "off").exists()

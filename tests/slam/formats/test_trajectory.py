@@ -1,0 +1,187 @@
+"""Trajectory files in and out, what is wrong with them in one line, and the matching of two."""
+
+import logging
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slam.formats.trajectory import (
+    Trajectory,
+    associate,
+    matching_tolerance_s,
+    nearest_stamps,
+    read_trajectory,
+    write_kitti,
+    write_tum,
+)
+from slam.geometry import se3
+from slam.runtime.errors import TrajectoryError
+
+KITTI = "1 0 0 1.5 0 1 0 2.5 0 0 1 3.5"
+TUM = "0.1 1.5 2.5 3.5 0 0 0 1"
+
+
+def wander(count: int, period: float = 0.1, seed: int = 0) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    T_world_camera = se3.make(Rotation.random(count, rng=rng).as_matrix(), rng.normal(scale=100, size=(count, 3)))
+    return Trajectory(period * np.arange(count, dtype=np.float64), T_world_camera)
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "poses.txt"
+    path.write_text(text)
+    return path
+
+
+def test_length_and_rebasing() -> None:
+    places = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 4.0], [1.0, 5.0, 4.0]])
+    turn = Rotation.from_rotvec([0.0, np.pi / 2, 0.0]).as_matrix()
+    trajectory = Trajectory(np.array([0.0, 1.0, 2.0]), se3.make(np.tile(turn, (3, 1, 1)), places))
+    assert trajectory.length_m == pytest.approx(7.0)
+    rebased = trajectory.rebased()
+    np.testing.assert_allclose(rebased.T_world_camera[0], np.eye(4), atol=1e-15)
+    np.testing.assert_allclose(rebased.positions, [[0, 0, 0], [-3, 0, 0], [-3, 4, 0]], atol=1e-14)
+    assert rebased.length_m == pytest.approx(7.0)
+    assert len(trajectory.select(np.array([0, 2]))) == 2
+
+
+def test_stamps_must_increase() -> None:
+    for stamps in ([0.0, 0.0], [1.0, 0.0], [0.0, np.nan]):
+        with pytest.raises(ValueError, match="stamps must be finite and increase"):
+            Trajectory(np.array(stamps), np.stack([np.eye(4)] * 2))
+
+
+@pytest.mark.parametrize("format", ["auto", "kitti"])
+def test_kitti_round_trip(tmp_path: Path, format: str) -> None:
+    trajectory = wander(7)
+    write_kitti(tmp_path / "new" / "poses.txt", trajectory)
+    back = read_trajectory(tmp_path / "new" / "poses.txt", format)
+    np.testing.assert_allclose(back.T_world_camera, trajectory.T_world_camera, rtol=1e-9, atol=1e-8)
+    np.testing.assert_array_equal(back.stamps, np.arange(7))
+    assert not back.timed
+
+
+@pytest.mark.parametrize("format", ["auto", "tum"])
+def test_tum_round_trip_keeps_every_digit_of_a_stamp(tmp_path: Path, format: str) -> None:
+    trajectory = wander(7)
+    stamps = 1311868164.3631 + 0.1037 * np.arange(7, dtype=np.float64)
+    write_tum(tmp_path / "poses.txt", Trajectory(stamps, trajectory.T_world_camera))
+    back = read_trajectory(tmp_path / "poses.txt", format)
+    np.testing.assert_allclose(back.T_world_camera, trajectory.T_world_camera, rtol=1e-8, atol=1e-8)
+    np.testing.assert_array_equal(back.stamps, stamps)
+    assert back.timed
+
+
+def test_files_look_as_their_formats_say(tmp_path: Path) -> None:
+    one = Trajectory(np.array([0.1]), read_trajectory(written(tmp_path, KITTI)).T_world_camera)
+    write_kitti(tmp_path / "kitti.txt", one)
+    row = (tmp_path / "kitti.txt").read_text()
+    assert row.startswith("1.000000000e+00 0.000000000e+00 ")
+    assert row.endswith(" 3.500000000e+00\n")
+    assert len(row.split(" ")) == 12
+    write_tum(tmp_path / "tum.txt", one)
+    comment, row = (tmp_path / "tum.txt").read_text().splitlines()
+    assert comment.startswith("#")
+    assert row.split(" ")[0] == "0.100000000"
+    assert row.split(" ")[7] == "1.000000000e+00"
+
+
+def test_comments_blank_lines_and_windows_files(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(b"\xef\xbb\xbf# stamp tx ...\r\n\r\n0 0 0 0 0 0 0 1\r\n 1 0 0 1 0 0 0 1 \r\n")
+    np.testing.assert_array_equal(read_trajectory(path).stamps, [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "format", "words"),
+    [
+        ("", "auto", "no pose"),
+        ("# only a comment\n", "auto", "no pose"),
+        ("1 2 3\n", "auto", "line 1: 3 columns; a KITTI row has 12, a TUM row 8"),
+        (f"{KITTI}\n{KITTI} 7\n", "auto", "line 2: 13 columns where KITTI has 12"),
+        (f"{TUM}\n\n0.2 1 2\n", "auto", "line 3: 3 columns where TUM has 8"),
+        (f"{KITTI}\n{TUM}\n", "auto", "line 2: 8 columns where KITTI has 12; this looks like a TUM row"),
+        (TUM, "kitti", "line 1: 8 columns where KITTI has 12; this looks like a TUM row"),
+        (KITTI, "tum", "line 1: 12 columns where TUM has 8; this looks like a KITTI row"),
+        (f"{KITTI}\n{KITTI.replace('2.5', 'two')}\n", "auto", "line 2: not a number: 'two'"),
+        (f"{TUM}\n{TUM.replace('2.5', 'nan')}\n", "auto", "line 2: a number is not finite"),
+        (f"{KITTI}\n{KITTI.replace('2.5', '-inf')}\n", "auto", "line 2: a number is not finite"),
+        (f"{KITTI}\n1 0 0 0 0 1 0 0 0 0 1.1 0\n", "auto", "line 2: the 3x3 part is not a rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0", "auto", "line 1: the 3x3 part is not a rotation"),
+        ("1e200 1e200 0 0 -1e200 1e200 0 0 0 0 1 0", "auto", "line 1: the 3x3 part is not a rotation"),
+        ("0 0 0 0 0 0 0 0", "auto", "line 1: the quaternion does not have length 1"),
+        (f"{TUM}\n{TUM}\n", "auto", "line 2: time stamps must increase"),
+        (TUM, "euroc", "unknown trajectory format 'euroc'"),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words: str) -> None:
+    with pytest.raises(TrajectoryError, match=words.replace("(", r"\(")) as error:
+        read_trajectory(written(tmp_path, text), format)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_text_file(tmp_path: Path) -> None:
+    with pytest.raises(TrajectoryError, match="no such file"):
+        read_trajectory(tmp_path / "missing.txt")
+    with pytest.raises(TrajectoryError, match="folder"):
+        read_trajectory(tmp_path)
+    (tmp_path / "poses.npy").write_bytes(b"\x93NUMPY\xff\xfe\x00")
+    with pytest.raises(TrajectoryError, match="not a text file"):
+        read_trajectory(tmp_path / "poses.npy")
+
+
+def test_writing_is_atomic_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    write_kitti(path, wander(3))
+    write_kitti(path, wander(5))
+    assert len(read_trajectory(path)) == 5
+    assert [each.name for each in tmp_path.iterdir()] == ["poses.txt"]
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(TrajectoryError, match="cannot be written"):
+        write_tum(tmp_path / "folder", wander(3))
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["folder", "poses.txt"]
+    with pytest.raises(TrajectoryError, match="cannot be written"):
+        write_tum(path / "below.txt", wander(3))
+
+
+def test_untimed_trajectories_match_row_by_row() -> None:
+    timed = wander(4)
+    untimed = Trajectory(10 * timed.stamps, timed.T_world_camera, timed=False)
+    assert associate(untimed, timed) == (untimed, timed)
+    with pytest.raises(TrajectoryError, match=r"4 poses and the reference 5.*TUM files") as error:
+        associate(untimed, wander(5))
+    assert "\n" not in str(error.value)
+
+
+def test_stamps_match_one_to_one_within_half_a_period() -> None:
+    reference = wander(50)
+    stamps = reference.stamps[10:40:2] + 0.03
+    estimate, matched = associate(Trajectory(stamps, reference.T_world_camera[10:40:2]), reference)
+    np.testing.assert_array_equal(matched.stamps, reference.stamps[10:40:2])
+    np.testing.assert_array_equal(estimate.T_world_camera, matched.T_world_camera)
+    assert matching_tolerance_s(estimate, reference) == pytest.approx(0.05)
+
+
+def test_other_clocks_are_an_error_and_gaps_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    reference = wander(20)
+    with pytest.raises(TrajectoryError, match=r"1000\.000 to 1001\.900 s and the reference 0\.000 to 1\.900 s"):
+        associate(Trajectory(reference.stamps + 1000.0, reference.T_world_camera), reference)
+    with caplog.at_level(logging.WARNING):
+        ours, _ = associate(Trajectory(reference.stamps + 1.0, reference.T_world_camera), reference)
+    assert len(ours) == 10
+    assert "10 of 20" in caplog.text
+
+
+def test_scans_of_a_long_drive_are_matched_in_little_memory() -> None:
+    """Half an hour of both at 10 Hz; each with each would take 2.6 GB."""
+    frames = 0.1 * np.arange(18_000)
+    tracemalloc.start()
+    try:
+        nearest = nearest_stamps(frames + 0.04, frames)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(nearest, np.arange(18_000))

@@ -1,0 +1,201 @@
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from slam.config.sections import PoseGraphConfig
+from slam.frames import RelativePose
+from slam.geometry import se3
+from slam.graph.pose_graph import LOOP_SOURCE, PoseGraph, whitened_squared
+from slam.runtime.errors import SlamError
+
+ROTATION, TRANSLATION = 0.003, 0.03
+
+
+def circle(count: int, rounds: float = 2.0, radius: float = 30.0) -> np.ndarray:
+    angle = np.linspace(0.0, 2 * np.pi * rounds, count)
+    turn = se3.from_rotation_vector(np.stack([0 * angle, angle, 0 * angle], axis=1), np.zeros((count, 3)))
+    turn[:, :3, 3] = radius * np.stack([-np.cos(angle), 0.02 * angle, np.sin(angle)], axis=1)
+    return se3.invert(turn[0]) @ turn
+
+
+def edge(T, i, j, rng=None, source="network", loosen=1.0) -> RelativePose:
+    T_i_j = se3.invert(T[i]) @ T[j]
+    sigmas = loosen * np.repeat([ROTATION, TRANSLATION], 3)
+    if rng is not None:
+        noise = sigmas * rng.normal(size=6)
+        T_i_j = T_i_j @ se3.from_rotation_vector(noise[:3], noise[3:])
+    return RelativePose(i, j, T_i_j, sigmas, source)
+
+
+def noisy_problem(seed: int = 0, count: int = 200):
+    rng = np.random.default_rng(seed)
+    truth = circle(count)
+    odometry = [edge(truth, k, k + 1, rng) for k in range(count - 1)]
+    skips = [edge(truth, k, k + 2, rng, loosen=1.5) for k in range(count - 2)]
+    half = count // 2
+    loops = [edge(truth, k, k + half, rng, LOOP_SOURCE, 2.0) for k in range(0, half, 5)]
+    initial = se3.chain(np.stack([e.T_from_to for e in odometry]))
+    return truth, odometry, skips, loops, initial
+
+
+def ate(estimate, truth) -> float:
+    return float(np.sqrt(((estimate[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
+def solve(edges, initial, **config):
+    graph = PoseGraph(PoseGraphConfig(**config))
+    graph.add_relative(*edges)
+    return graph, graph.optimise(initial)
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber"])
+def test_exact_factors_recover_the_chain_from_a_bent_start(kernel):
+    truth = circle(40, rounds=0.8)
+    exact = [edge(truth, k, k + 1) for k in range(39)] + [edge(truth, k + 2, k) for k in range(38)]
+    bent = truth.copy()
+    bent[1:, :3, 3] += np.random.default_rng(0).normal(scale=0.5, size=(39, 3))
+    graph, solved = solve(exact, bent, kernel=kernel)
+    np.testing.assert_allclose(solved, truth, atol=1e-5)
+    assert graph.errors.max() < 1e-6
+    assert se3.is_se3(solved)
+
+
+def test_loops_cut_the_drift():
+    truth, odometry, skips, loops, initial = noisy_problem()
+    _, without = solve(odometry + skips, initial)
+    _, solved = solve(odometry + skips + loops, initial)
+    assert ate(without, truth) < ate(initial, truth) * 1.05
+    assert ate(solved, truth) < 0.5 * ate(initial, truth)
+    np.testing.assert_array_equal(solved[0], initial[0])
+
+
+def test_the_robust_kernel_survives_gross_outliers():
+    truth, odometry, skips, loops, initial = noisy_problem()
+    rng = np.random.default_rng(1)
+    false = []
+    for k in range(6):
+        wrong = se3.from_rotation_vector(rng.normal(size=3), 10 * rng.normal(size=3))
+        false.append(RelativePose(10 * k, 190 - 10 * k, wrong, loops[0].sigmas, LOOP_SOURCE))
+    edges = odometry + skips + loops + false
+    _, plain = solve(edges, initial, kernel="none")
+    graph, robust = solve(edges, initial, kernel="huber")
+    assert ate(robust, truth) < ate(initial, truth)
+    assert ate(robust, truth) < 0.2 * ate(plain, truth)
+    errors = graph.errors
+    assert errors[-len(false) :].min() > 1000 > np.quantile(errors[: -len(false)], 0.95)
+
+
+def test_direction_of_a_factor():
+    # from 0 to 1: one unit ahead of camera 0, which looks along z
+    T_0_1 = se3.from_rotation_vector(np.array([0.0, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]))
+    measured = RelativePose(0, 1, T_0_1, np.full(6, 0.1), "network")
+    _, solved = solve([measured], np.tile(np.eye(4), (2, 1, 1)))
+    np.testing.assert_allclose(solved[1], T_0_1, atol=1e-6)
+
+
+def test_world_stays_at_the_first_pose():
+    truth = circle(20)
+    moved = se3.from_rotation_vector(np.array([0.3, -0.2, 0.1]), np.array([5.0, 6.0, 7.0])) @ truth
+    _, solved = solve([edge(truth, k, k + 1) for k in range(19)], moved)
+    np.testing.assert_allclose(solved, moved, atol=1e-5)
+
+
+def test_correlated_sigmas_weigh_a_chain_against_a_loop_and_leave_sigmas_as_they_are():
+    """The graph uses ``correlated_sigmas``; the sigmas of single factors stay."""
+    truth, edges, _, loops, initial = noisy_problem()
+    chained = [replace(each, correlated_sigmas=4.0 * each.sigmas) for each in edges]
+    looser = [replace(each, sigmas=4.0 * each.sigmas) for each in edges]
+    solved, solved_looser, stiff = (solve([*each, *loops], initial)[1] for each in (chained, looser, edges))
+    np.testing.assert_array_equal(solved, solved_looser)
+    assert np.abs(solved - stiff).max() > 1e-3
+    np.testing.assert_array_equal(*(whitened_squared(each, truth) for each in (chained, edges)))
+    with pytest.raises(SlamError, match="six positive sigmas"):
+        PoseGraph(PoseGraphConfig()).add_relative(replace(edges[0], correlated_sigmas=np.zeros(6)))
+
+
+def test_whitened_residual_by_hand():
+    sigmas = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+    measured = RelativePose(0, 1, np.eye(4), sigmas, "network")
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, :3, 3] = [1.0, 2.0, 6.0]
+    assert whitened_squared([measured], T)[0] == pytest.approx(1 + 1 + 4)
+    T[1] = se3.from_rotation_vector(np.array([0.0, 0.2, 0.0]), np.zeros(3))
+    assert whitened_squared([measured], T)[0] == pytest.approx(1)
+
+
+def test_g2o_round_trip_through_gtsam(tmp_path):
+    _, odometry, _, loops, initial = noisy_problem(count=50)
+    sigmas = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+    edges = [RelativePose(e.from_index, e.to_index, e.T_from_to, sigmas, e.source) for e in odometry + loops]
+    graph, solved = solve(edges, initial)
+    path = tmp_path / "graph.g2o"
+    graph.write_g2o(path)
+    read, values = gtsam.readG2o(str(path), True)
+    assert values.size() == 50
+    for k in range(50):
+        np.testing.assert_allclose(values.atPose3(k).matrix(), solved[k], atol=1e-12)
+    between = [read.at(k) for k in range(read.size()) if isinstance(read.at(k), gtsam.BetweenFactorPose3)]
+    assert len(between) == len(edges)
+    for factor, e in zip(between, edges, strict=True):
+        assert factor.keys() == [e.from_index, e.to_index]
+        np.testing.assert_allclose(factor.measured().matrix(), e.T_from_to, atol=1e-12)
+        np.testing.assert_allclose(factor.noiseModel().sigmas(), sigmas, rtol=1e-9)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_wrong_input_is_refused_with_its_name():
+    truth = circle(5)
+    good = edge(truth, 0, 1)
+    graph = PoseGraph(PoseGraphConfig())
+    with pytest.raises(SlamError, match="not been optimised"):
+        graph.write_g2o("x")
+    broken = good.T_from_to.copy()
+    broken[0, 0] = np.nan
+    wrong = [
+        RelativePose(0, 1, broken, good.sigmas, "network"),
+        RelativePose(0, 1, 2 * np.eye(4), good.sigmas, "network"),
+        RelativePose(1, 1, good.T_from_to, good.sigmas, "network"),
+        RelativePose(0, 1, good.T_from_to, np.zeros(6), "network"),
+    ]
+    for relative_pose in wrong:
+        with pytest.raises(SlamError, match="factor"):
+            graph.add_relative(relative_pose)
+    assert graph.relative_poses == ()
+    graph.add_relative(good, edge(truth, 1, 2), edge(truth, 3, 4))
+    with pytest.raises(SlamError, match=r"2 of 5 frames are not connected.*frame 3"):
+        graph.optimise(truth)
+    with pytest.raises(SlamError, match=r"frame 4.*3 frames"):
+        graph.optimise(truth[:3])
+
+
+def test_newest_loops_are_dropped_when_the_system_is_singular(monkeypatch):
+    _, odometry, _, loops, initial = noisy_problem(count=40)
+    graph = PoseGraph(PoseGraphConfig())
+    graph.add_relative(*odometry, *loops[:3])
+    solve_for_real = graph._solve
+
+    def fails_with_more_than_one_loop(start):
+        if len(graph.relative_poses) > len(odometry) + 1:
+            raise RuntimeError("Indeterminant linear system\nlong explanation")
+        return solve_for_real(start)
+
+    monkeypatch.setattr(graph, "_solve", fails_with_more_than_one_loop)
+    graph.optimise(initial)
+    assert graph.dropped == (loops[2], loops[1])
+    monkeypatch.setattr(graph, "_solve", lambda start: (_ for _ in ()).throw(RuntimeError("singular")))
+    with pytest.raises(SlamError, match=r"singular$"):
+        graph.optimise(initial)
+
+
+def test_a_loop_contradicted_by_the_rest_is_dropped():
+    truth, odometry, skips, loops, initial = noisy_problem()
+    wrong = truth[0] @ truth[100] @ se3.from_rotation_vector(np.zeros(3), np.array([30.0, 0.0, 0.0]))
+    false = RelativePose(20, 120, wrong, loops[0].sigmas, LOOP_SOURCE)
+    graph = PoseGraph(PoseGraphConfig())
+    graph.add_relative(*odometry, *skips, *loops, false)
+    graph.optimise(initial)
+    assert graph.drop_contradicted_loops() == (false,) == graph.dropped
+    graph.optimise(initial)
+    assert graph.drop_contradicted_loops() == () and len(graph.relative_poses) == len(odometry + skips + loops)

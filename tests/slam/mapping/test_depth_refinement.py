@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam.frames import Intrinsics
+from slam.mapping.depth_refinement import DepthRefiner
+
+CAMERA = Intrinsics(64, 32, 50.0, 50.0, 31.5, 15.5)
+DEPTH = np.full((32, 64), 10.0, np.float32)
+
+
+def refiner(distances: np.ndarray, read: list[int]) -> DepthRefiner:
+    T_world_camera = np.tile(np.eye(4), (len(distances), 1, 1))
+    T_world_camera[:, 2, 3] = distances
+    rng = np.random.default_rng(0)
+
+    def image(n: int) -> np.ndarray:
+        read.append(n)
+        return rng.integers(0, 255, (32, 64, 3), dtype=np.uint8)
+
+    return DepthRefiner(CAMERA, range(len(distances)), T_world_camera, image)
+
+
+@pytest.mark.parametrize(("step_m", "expected"), [(1.0, {9, 10, 11, 12}), (0.1, {10, 3, 17, 30})])
+def test_neighbours_are_chosen_by_their_distance(step_m: float, expected: set[int]) -> None:
+    read: list[int] = []
+    offset = 20 if step_m < 1 else 0
+    n = 10 + offset
+    assert refiner(np.arange(80) * step_m, read).refine(n, DEPTH, None) is not None
+    assert {k - offset for k in read} == expected
+
+
+def test_the_last_keyframe_has_its_neighbours_before_it() -> None:
+    read: list[int] = []
+    assert refiner(np.arange(20.0), read).refine(19, DEPTH, None) is not None
+    assert set(read) == {17, 18, 19}
+
+
+def test_a_standing_camera_has_no_neighbours() -> None:
+    assert refiner(np.zeros(20), []).refine(10, DEPTH, None) is None
+
+
+def test_what_is_unknown_begins_with_its_neighbours_and_is_not_believed_unmeasured() -> None:
+    holes = DEPTH.copy()
+    holes[10:20, 20:40] = 0
+    holes[0, 0], holes[0, 1] = np.nan, np.inf
+    refined = refiner(np.arange(20.0), []).refine(10, holes, None)
+    assert refined is not None and np.isfinite(refined.depth).all() and (refined.depth > 0).all()
+    unmeasured = ~(np.isfinite(holes) & (holes > 0)) & ~refined.measured
+    assert unmeasured.any() and np.isinf(refined.relative_sigma[unmeasured]).all()
+    assert np.isfinite(refined.relative_sigma[~unmeasured]).all()
+
+
+def test_depth_that_is_unknown_everywhere_is_not_refined() -> None:
+    assert refiner(np.arange(20.0), []).refine(10, np.zeros_like(DEPTH), None) is None

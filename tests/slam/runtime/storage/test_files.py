@@ -1,0 +1,63 @@
+"""A file appears whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slam.runtime.errors import RunError, SlamError
+from slam.runtime.storage.files import write_atomically
+
+
+def test_makes_folders_and_replaces_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "b" / "map.ply"
+    for text in ("old", "new"):
+        write_atomically(path, lambda partial, text=text: partial.write_text(text))
+        assert path.read_text() == text
+    assert [p.name for p in path.parent.iterdir()] == ["map.ply"]
+
+
+def test_the_writer_sees_the_suffix_beside_the_place(tmp_path: Path) -> None:
+    seen: list[Path] = []
+
+    def fill(partial: Path) -> None:
+        seen.append(partial)
+        partial.write_text("x")
+
+    write_atomically(tmp_path / "map.ply", fill)
+    assert seen[0].suffix == ".ply" and seen[0].parent == tmp_path and seen[0].name.startswith(".")
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RunError("empty"), KeyboardInterrupt()])
+def test_after_any_failure_the_old_file_stays_and_no_partial_file(tmp_path: Path, failure: BaseException) -> None:
+    path = tmp_path / "run.log"
+    path.write_text("old")
+
+    def fill(partial: Path) -> None:
+        partial.write_text("half")
+        raise failure
+
+    wanted = SlamError if isinstance(failure, OSError) else type(failure)
+    with pytest.raises(wanted):
+        write_atomically(path, fill)
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["run.log"]
+
+
+def test_the_error_is_of_the_given_kind_and_names_file_and_cause(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"file/x\.txt: cannot be written \(.+\)"):
+        write_atomically(tmp_path / "file" / "x.txt", lambda partial: partial.write_text("x"), RunError)
+
+
+def test_content_that_the_disk_loses_after_the_writer_gets_no_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(SlamError, match=r"map\.ply: cannot be written \(No space left on device\)"):
+        write_atomically(tmp_path / "map.ply", lambda partial: partial.write_text("x"))
+    assert list(tmp_path.iterdir()) == []

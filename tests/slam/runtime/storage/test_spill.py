@@ -1,0 +1,50 @@
+"""Spilled arrays are read back unchanged, and a full disk is one clear error."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slam.runtime.errors import SlamError
+from slam.runtime.storage.spill import SpillFile
+
+
+def test_arrays_come_back_in_any_order() -> None:
+    rng = np.random.default_rng(0)
+    arrays = [rng.integers(0, 255, (4, 5, 3), np.uint8), rng.normal(size=(4, 5)).astype(np.float32)[:, ::2], np.eye(4)]
+    spill_file = SpillFile()
+    kept = [spill_file.put(array) for array in arrays]
+    kept[0].read()
+    kept.append(spill_file.put(arrays[0]))
+    for array, each in reversed(list(zip([*arrays, arrays[0]], kept, strict=True))):
+        np.testing.assert_array_equal(each.read(), array)
+        assert each.read().dtype == array.dtype
+
+
+def test_threads_read_while_others_write() -> None:
+    spill_file = SpillFile()
+
+    def write_and_read(number: int) -> bool:
+        kept = [spill_file.put(np.full(2000, 1000 * number + k)) for k in range(50)]
+        return all((each.read() == 1000 * number + k).all() for k, each in enumerate(kept))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(write_and_read, range(40)))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda: Path("/dev/full").open("wb"))  # noqa: SIM115
+    with pytest.raises(SlamError, match=r"keyframes cannot be kept in .*No space left.*set TMPDIR"):
+        SpillFile().put(np.zeros(100_000))
+
+
+def test_a_file_that_was_cut_short_is_an_error_and_no_garbage() -> None:
+    spill_file = SpillFile()
+    kept = spill_file.put(np.ones((100, 100)))
+    spill_file._file.truncate(5000)
+    with pytest.raises(SlamError, match="cut short \\(5000 of 80000 bytes\\)"):
+        kept.read()

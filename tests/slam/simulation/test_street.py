@@ -1,0 +1,257 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from slam.geometry import se3
+from slam.runtime.errors import SequenceError
+from slam.simulation.street import SimulatedStreet, SimulationOptions, parse_options, write_kitti_root
+
+SMALL = {"width": 208, "height": 64}
+
+
+@pytest.fixture(scope="module")
+def straight() -> SimulatedStreet:
+    return SimulatedStreet(SimulationOptions("straight", 40, 700))
+
+
+@pytest.fixture(scope="module")
+def traffic() -> SimulatedStreet:
+    return SimulatedStreet(SimulationOptions("straight", 60, 701, hazards=("moving-cars",), **SMALL))
+
+
+def path_of(street: SimulatedStreet) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions on the ground ``(N, 2)``, distance travelled and heading in radians ``(N,)``."""
+    ground = street.T_world_camera[:, [0, 2], 3]
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground, axis=0), axis=1))])
+    forward = street.T_world_camera[:, [0, 2], 2]
+    return ground, travelled, np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
+
+
+def revisited(street: SimulatedStreet, within_m: float = 3.0) -> tuple[float, float]:
+    """Metres driven again, in the same and in the opposite direction."""
+    ground, travelled, heading = path_of(street)
+    same = opposite = 0.0
+    for k in range(1, len(ground)):
+        past = travelled[:k] < travelled[k] - 40.0
+        near = past & (np.linalg.norm(ground[:k] - ground[k], axis=1) < within_m)
+        aligned = np.cos(heading[:k] - heading[k])[near]
+        step = travelled[k] - travelled[k - 1]
+        same += step * bool((aligned > 0.7).any())
+        opposite += step * bool((aligned < -0.7).any())
+    return same, opposite
+
+
+def warp_error(street: SimulatedStreet, target: int, source: int) -> tuple[float, float]:
+    """Median photometric error of the source warped to the target by ground truth, and without a warp."""
+    a, b = street.render(target), street.render(source)
+    height, width = a.depth.shape
+    v, u = np.mgrid[0:height, 0:width]
+    pixels = np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+    points = np.linalg.inv(street.K) @ pixels * a.depth.ravel()
+    T_source_target = se3.invert(b.T_world_camera) @ a.T_world_camera
+    moved = street.K @ (T_source_target[:3, :3] @ points + T_source_target[:3, 3:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = (moved[:2] / moved[2]).reshape(2, height, width).astype(np.float32)
+    warped = cv2.remap(b.image, at[0], at[1], cv2.INTER_LINEAR)
+    inside = (at[0] >= 0) & (at[0] <= width - 1) & (at[1] >= 0) & (at[1] <= height - 1) & (a.depth > 0)
+    error = np.abs(warped.astype(float) - a.image).mean(axis=2)[inside]
+    unmoved = np.abs(b.image.astype(float) - a.image).mean(axis=2)[inside]
+    return float(np.median(error)), float(np.median(unmoved))
+
+
+@pytest.mark.parametrize("route", ["loop", "grid", "straight"])
+def test_poses_are_rigid_and_start_at_the_world(route: str) -> None:
+    street = SimulatedStreet(parse_options(route, 300, 702, 208, 64, ""))
+    assert len(street) == 300 and street.T_world_camera.shape == (300, 4, 4)
+    assert np.array_equal(street.T_world_camera[0], np.eye(4))
+    assert se3.is_se3(street.T_world_camera, 1e-9)
+    step = np.linalg.norm(np.diff(street.T_world_camera[:, :3, 3], axis=0), axis=1)
+    assert step.min() > 0.45 and step.max() < 1.5 and 0.6 < step.mean() < 1.2
+    turn = se3.rotation_angle(se3.invert(street.T_world_camera[:-1])[:, :3, :3] @ street.T_world_camera[1:, :3, :3])
+    assert np.rad2deg(turn.max()) < 7.0
+    assert street.T_world_camera[5, 2, 3] > 2.0  # forward is z
+    assert 1.5 <= street.camera_height_m <= 1.8
+
+
+@pytest.mark.parametrize("frames", [250, 300, 800])
+@pytest.mark.parametrize("seed", [703, 704])
+def test_loop_revisits_its_start_and_turns_left_and_right(frames: int, seed: int) -> None:
+    street = SimulatedStreet(SimulationOptions("loop", frames, seed))
+    assert revisited(street)[0] >= 60.0
+    ground, travelled, heading = path_of(street)
+    turn = heading[20:] - heading[:-20]
+    assert turn.max() > 0.8 and turn.min() < -0.8
+    assert np.linalg.norm(ground - ground[0], axis=1)[travelled > 60].min() < 1.0
+
+
+def test_grid_is_revisited_in_both_directions() -> None:
+    again = np.array([revisited(SimulatedStreet(SimulationOptions("grid", 800, s)), 5.5) for s in (705, 706)])
+    assert (again[:, 0] > 20.0).all() and (again[:, 1] > 20.0).all()
+
+
+def test_straight_never_comes_back() -> None:
+    street = SimulatedStreet(SimulationOptions("straight", 600, 707))
+    assert revisited(street, 20.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("route", ["loop", "grid", "straight"])
+def test_camera_keeps_clear_of_everything_and_above_the_road(route: str) -> None:
+    street = SimulatedStreet(parse_options(route, 300, 708, 208, 64, ""))
+    positions = street.T_world_camera[:, :3, 3]
+    assert street.distance_to_surface(positions).min() > 0.25
+    below = positions + street.camera_height_m * street.T_world_camera[:, :3, 1]
+    assert np.median(street.distance_to_surface(below)) < 0.04
+
+
+def test_truth_explains_the_next_image(straight: SimulatedStreet) -> None:
+    for k in (3, 20):
+        error, unmoved = warp_error(straight, k, k + 1)
+        assert error < 5.0 and error < 0.6 * unmoved
+
+
+def test_depth_is_the_distance_to_the_surface(straight: SimulatedStreet) -> None:
+    frame = straight.render(7)
+    assert frame.depth.dtype == np.float32 and frame.depth.max() <= 200.0
+    assert 0.02 < (frame.depth == 0).mean() < 0.6  # the sky
+    v, u = np.nonzero(frame.depth)
+    rays = np.linalg.inv(straight.K) @ np.stack([u, v, np.ones_like(u)])
+    points = se3.apply(frame.T_world_camera, (rays * frame.depth[v, u]).T)[::37]
+    assert np.quantile(straight.distance_to_surface(points), 0.99) < 1e-3
+
+
+def test_images_have_texture_everywhere(straight: SimulatedStreet) -> None:
+    image = straight.render(11).image
+    assert image.shape == (128, 416, 3) and image.dtype == np.uint8
+    road = image[100:, 100:300].astype(float).mean(axis=2)
+    assert np.abs(np.diff(road, axis=1)).mean() > 1.0
+    assert 50 < image.mean() < 190
+
+
+def test_camera_is_kittis_resized() -> None:
+    full = SimulatedStreet(SimulationOptions("straight", 5, 0, 1241, 376)).K
+    small = SimulatedStreet(SimulationOptions("straight", 5, 0)).K
+    assert full == pytest.approx(np.array([[718.856, 0, 607.1928], [0, 718.856, 185.2157], [0, 0, 1]]))
+    assert np.round([small[0, 0], small[1, 1], small[0, 2], small[1, 2]]) == pytest.approx([241, 245, 203, 63])
+
+
+def test_same_options_give_the_same_bytes_and_other_seeds_another_world(straight: SimulatedStreet) -> None:
+    again = SimulatedStreet(straight.options)
+    assert np.array_equal(again.T_world_camera, straight.T_world_camera)
+    assert np.array_equal(again.render(9).image, straight.render(9).image)
+    assert np.array_equal(again.render(9).depth, straight.render(9).depth)
+    assert np.array_equal(again.scan(9), straight.scan(9))
+    other = SimulatedStreet(SimulationOptions("straight", 40, 709))
+    assert np.abs(other.render(9).image.astype(float) - straight.render(9).image).mean() > 10
+
+
+def test_stop_stands_still_for_thirty_frames() -> None:
+    street = SimulatedStreet(SimulationOptions("loop", 300, 710, hazards=("stop",)))
+    still = [np.array_equal(a, b) for a, b in zip(street.T_world_camera[:-1], street.T_world_camera[1:])]
+    assert sum(still) == 30 and 90 < np.argmax(still) < 180
+    assert all(still[int(np.argmax(still)) :][:30])
+    assert revisited(street)[0] >= 60.0
+
+
+def test_moving_cars_are_seen_and_have_depth(traffic: SimulatedStreet) -> None:
+    empty = SimulatedStreet(SimulationOptions("straight", 60, 701, **SMALL))
+    for k in (5, 25):
+        with_cars, without = traffic.render(k), empty.render(k)
+        changed = (with_cars.depth != without.depth) & (with_cars.depth > 0)
+        assert changed.mean() > 0.002
+        background = np.where(without.depth > 0, without.depth, np.inf)
+        assert (with_cars.depth[changed] < background[changed]).all()
+        assert np.array_equal(with_cars.T_world_camera, without.T_world_camera)
+
+
+def test_hazards_change_the_image_but_not_the_truth() -> None:
+    plain = SimulatedStreet(SimulationOptions("straight", 60, 711, **SMALL))
+    reference = plain.render(30)
+    for hazard in ("exposure", "blur", "rain"):
+        frame = SimulatedStreet(SimulationOptions("straight", 60, 711, hazards=(hazard,), **SMALL)).render(30)
+        assert np.abs(frame.image.astype(float) - reference.image).mean() > 1.0, hazard
+        assert np.array_equal(frame.depth, reference.depth), hazard
+
+
+def test_scans_lie_on_surfaces_and_spin_freely(straight: SimulatedStreet) -> None:
+    scan, following = straight.scan(4), straight.scan(5)
+    assert scan.dtype == np.float32 and scan.shape[1] == 4 and 20_000 < len(scan) < 60_000
+    assert scan[:, 3].min() >= 0.0 and scan[:, 3].max() <= 1.0
+    T_world_lidar = straight.T_world_camera[4] @ straight.T_camera_lidar
+    points_world = se3.apply(T_world_lidar, scan[::23, :3].astype(np.float64))
+    assert np.quantile(straight.distance_to_surface(points_world), 0.99) < 0.1
+    assert abs(np.median(scan[scan[:, 2] < -1.0, 2]) + straight.camera_height_m + 0.08) < 0.15
+    spacing = 2 * np.pi / 850
+    phases = [np.angle(np.exp(2j * np.pi * np.arctan2(s[:, 1], s[:, 0]) / spacing).mean()) for s in (scan, following)]
+    assert abs(np.exp(1j * phases[0]) - np.exp(1j * phases[1])) > 0.01
+
+
+def test_kiss_icp_follows_the_scans(straight: SimulatedStreet) -> None:
+    config = pytest.importorskip("kiss_icp.config").load_config(None)
+    odometry = pytest.importorskip("kiss_icp.kiss_icp").KissICP(config)
+    for k in range(15):
+        odometry.register_frame(straight.scan(k)[:, :3].astype(np.float64), np.array([]))
+    truth = np.linalg.norm(straight.T_world_camera[14, :3, 3] - straight.T_world_camera[0, :3, 3])
+    assert np.linalg.norm(odometry.last_pose[:3, 3]) == pytest.approx(truth, rel=0.03)
+
+
+def test_kitti_root_holds_what_was_rendered(tmp_path: Path) -> None:
+    street = SimulatedStreet(SimulationOptions("straight", 3, 712, **SMALL))
+    root, written = tmp_path / "deep" / "world", []
+    write_kitti_root(street, root, depth=True, lidar=True, progress=written.append)
+    assert written == [1, 2, 3]
+    assert sorted(p.name for p in root.iterdir()) == ["camera.yaml", "poses", "sequences", "simulation.json"]
+    sequence, frame = root / "sequences" / "sim", street.render(2)
+    assert np.array_equal(cv2.imread(str(sequence / "image_2" / "000002.png"))[..., ::-1], frame.image)
+    encoded = cv2.imread(str(sequence / "depth_2" / "000002.png"), cv2.IMREAD_UNCHANGED)
+    assert encoded.dtype == np.uint16 and ((encoded == 0) == (frame.depth == 0)).all()
+    assert np.abs(encoded / 256.0 - frame.depth).max() <= 0.5 / 256 + 1e-6
+    scan = np.fromfile(sequence / "velodyne" / "000001.bin", np.float32).reshape(-1, 4)
+    assert np.array_equal(scan, street.scan(1))
+    assert np.loadtxt(sequence / "times.txt") == pytest.approx([0.0, 0.1, 0.2])
+    assert np.loadtxt(root / "poses" / "sim.txt").reshape(3, 3, 4) == pytest.approx(street.T_world_camera[:, :3])
+    rows = dict(line.split(": ") for line in (sequence / "calib.txt").read_text().splitlines())
+    assert list(rows) == ["P0", "P1", "P2", "P3", "Tr"] and rows["P0"] == rows["P2"]
+    assert np.fromstring(rows["P2"], sep=" ").reshape(3, 4)[:, :3] == pytest.approx(street.K)
+    assert np.fromstring(rows["Tr"], sep=" ").reshape(3, 4) == pytest.approx(street.T_camera_lidar[:3])
+    camera = yaml.safe_load((root / "camera.yaml").read_text())
+    assert (camera["width"], camera["height"], camera["model"]) == (208, 64, "pinhole")
+    assert camera["camera_height_m"] == pytest.approx(street.camera_height_m)
+    assert json.loads((root / "simulation.json").read_text())["seed"] == 712
+    with pytest.raises(SequenceError, match="not empty"):
+        write_kitti_root(street, root)
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
+    def interrupt(_: int) -> None:
+        raise KeyboardInterrupt
+
+    street = SimulatedStreet(SimulationOptions("straight", 3, 712, **SMALL))
+    with pytest.raises(KeyboardInterrupt):
+        write_kitti_root(street, tmp_path / "world", progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"route": "circle"}, "route must be one of loop, grid, straight"),
+        ({"hazards": "snow"}, "got 'snow'"),
+        ({"frames": 249}, "250"),
+        ({"seed": -1}, "seed"),
+        ({"width": 4}, "8 x 8"),
+        ({"route": "straight", "frames": 1}, "at least 2"),
+    ],
+)
+def test_invalid_options_are_refused(change: dict[str, object], says: str) -> None:
+    options = {"route": "loop", "frames": 300, "seed": 0, "width": 416, "height": 128, "hazards": ""} | change
+    with pytest.raises(SequenceError, match=says):
+        SimulatedStreet(parse_options(**options))  # type: ignore[arg-type]
+
+
+def test_frames_outside_the_drive_are_refused(straight: SimulatedStreet) -> None:
+    with pytest.raises(IndexError, match="0 to 39"):
+        straight.render(40)

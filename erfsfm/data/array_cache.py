@@ -1,4 +1,4 @@
-"""Arrays of one shape, kept within a number of bytes."""
+"""Arrays of one shape, and decoded frames of one size, kept within a number of bytes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from erfsfm.data.recordings import Recording
 
 _BLOCK = 128  # arrays
 
@@ -51,3 +53,21 @@ class ArrayCache:
             arrays = min(_BLOCK, self._capacity - slot)
             self._blocks.append(np.empty((arrays, *self._shape), self._dtype))
         return np.asarray(self._blocks[block][row])
+
+
+class ImageCache:
+    """Least-recently-used cache of decoded frames, up to a size in bytes.
+
+    Args:
+        limit_mb: memory for images; 0 keeps none.
+        height: of every image.
+        width: of every image.
+    """
+
+    def __init__(self, limit_mb: int, height: int, width: int) -> None:
+        self._size = (height, width)
+        self._images = ArrayCache(limit_mb, (height, width, 3), np.uint8)
+
+    def image(self, recording: Recording, index: int) -> NDArray[np.uint8]:
+        """One frame ``(H, W, 3)``, decoded at most once while it stays in the cache."""
+        return self._images.get((id(recording), index), lambda: recording.image(index, *self._size))

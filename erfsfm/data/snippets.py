@@ -18,8 +18,8 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
+from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
-from erfsfm.data.image_cache import ImageCache
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, training_sample

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
-from erfsfm.data.image_cache import ImageCache
+from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.recordings import Recording
 
 logger = logging.getLogger(__name__)

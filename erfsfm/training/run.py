@@ -14,6 +14,7 @@ from typing import Any
 
 import lightning
 import torch
+from lightning.fabric.plugins.environments import LightningEnvironment, SLURMEnvironment, TorchElasticEnvironment
 from lightning.pytorch.callbacks import ModelCheckpoint, Timer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
@@ -28,7 +29,7 @@ from erfsfm.common.files import write_atomically
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import single_threaded_opencv
-from erfsfm.config import ExperimentConfig
+from erfsfm.config import ExperimentConfig, TrainingConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
@@ -39,7 +40,6 @@ from erfsfm.training.keeper import WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import OutputFolder
-from erfsfm.training.processes import rank_of
 from erfsfm.training.progress import ProgressLine
 from erfsfm.training.supervision import measured_views
 
@@ -106,6 +106,21 @@ def train(
         sys.exit()
     keeper.save(module, trainer.global_step)
     return output
+
+
+def rank_of(training: TrainingConfig) -> int:
+    """Number of this process among those of all nodes, as Lightning will count it.
+
+    With several devices Lightning starts the program again for each further one of its node. On every node it is
+    started once, with the environment that Lightning, torchrun or SLURM reads.
+    """
+    if training.processes == 1:
+        return 0
+    for started in (TorchElasticEnvironment, SLURMEnvironment):
+        if started.detect():
+            return int(started().global_rank())
+    own = LightningEnvironment()
+    return int(own.node_rank() * training.devices + own.local_rank())
 
 
 def _require_devices(wanted: int, device: str) -> None:

@@ -87,6 +87,7 @@ def estimate_metrics(
             "graph": _graph(result),
             "loops": result.loops.summary(),
             **_tracking(result),
+            **_depth_error(result),
             **null("depth", "the run ended before its map was whole"),
             **null("map", "the run ended before its map was whole"),
         }
@@ -111,6 +112,15 @@ def _tracking(result: Estimate) -> dict[str, Any]:
             "events": [asdict(event) for event in drive.events],
         }
     }
+
+
+def _depth_error(result: Estimate) -> dict[str, Any]:
+    """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
+    curve, unit = result.state.odometry.depth_error.curve(), float(np.median(result.scale.per_frame))
+    if not curve:
+        return null("depth_error", "no step triangulated corners with learned depth")
+    keys = ("depth", "bias", "sigma", "corners")
+    return {"depth_error": [dict(zip(keys, (unit * depth, *rest), strict=True)) for depth, *rest in curve]}
 
 
 def whole_metrics(

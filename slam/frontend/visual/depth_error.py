@@ -75,6 +75,12 @@ class DepthError:
         np.add.at(corners, (_nearest(np.log2(learned[known]), np.log2(_DEPTHS)), _nearest(logarithms, _LOGARITHMS)), 1)
         return type(self)(corners)
 
+    def curve(self) -> list[tuple[float, float, float, float]]:
+        """Learned depth, its bias (logarithm), its relative sigma and the corners seen there, where there are many."""
+        corners = self.corners.sum(axis=1)
+        rows = zip(_DEPTHS, self.bias, self._spread, corners, strict=True)
+        return [(float(d), float(b), float(s), float(n)) for d, b, s, n in rows if n > _PRIOR_CORNERS]
+
     @cached_property
     def bias(self) -> FloatArray:
         """Log of learned over true depth at each of ``_DEPTHS`` ``(D,)``, zero on the average of all information."""

@@ -121,6 +121,7 @@ def write_report(
         no_errors=report_tables.no_errors(metrics),
         error_pictures=list(_error_pictures(trajectories)),
         depth=_depth_picture(examples),
+        depth_error=report_tables.depth_error(metrics),
         map_picture=_map_picture(views),
         driver=_driver_picture(views),
         viewer=None if views is None else views.viewer,

@@ -49,6 +49,14 @@ def test_the_bias_over_distance_is_found_and_taken_out() -> None:
     np.testing.assert_allclose(ratio / ratio[0], 1.0, atol=0.1)
 
 
+def test_the_curve_has_the_distances_that_were_seen() -> None:
+    assert DepthError().curve() == []
+    error, _ = after_steps(80, far=400, near=200)
+    depths, biases, sigmas, corners = zip(*error.curve(), strict=True)
+    assert 4.0 <= min(depths) < 8.0 and 32.0 <= max(depths) <= 64.0
+    assert biases[0] - min(biases) > 0.3 and max(sigmas) < 0.3 and min(corners) > 40
+
+
 def test_the_length_does_not_depend_on_how_many_corners_are_far() -> None:
     """A road with trees, then a plain: the network's own bias would shorten the steps by a third."""
     for far, near in ((50, 400), (500, 60)):

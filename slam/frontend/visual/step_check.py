@@ -21,6 +21,8 @@ from slam.frontend.visual.two_view import Matches, TwoViewEstimate
 # largest log of a length over the same by the road or by triangulated points
 _AGREEMENT = 0.25
 _LEAST_ROAD_CORNERS = 8
+# least sigma of the direction of motion, radians
+_AXIS_SIGMA = float(np.deg2rad(8.0))
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def _votes(
     """1 for, -1 against, by each measurement that there is."""
     speed = step.speed(height_unscaled, seconds)
     votes = [history.is_possible_speed(speed, seconds), _fits_ratio(step, speed, seconds, history)]
-    votes.append(_fits_road(step, matches, height_unscaled))
+    votes += [_fits_road(step, matches, height_unscaled), _fits_axis(step, history)]
     return [1 if vote else -1 for vote in votes if vote is not None]
 
 
@@ -73,6 +75,15 @@ def _fits_ratio(step: Step, speed: float, seconds: float, history: MotionHistory
         return None
     ratio, _ = step.motion.length_ratio
     return bool(abs(np.log(speed / history.speeds[-1]) - ratio) < _AGREEMENT)
+
+
+def _fits_axis(step: Step, history: MotionHistory) -> bool | None:
+    """Whether the direction is about the median of the last hundred steps, which a few wrong ones do not change."""
+    prior = history.prior(_AXIS_SIGMA)
+    if not np.isfinite(prior.axis_sigma):
+        return None
+    cosine = abs(float(prior.axis @ step.two_view.unit_pose.direction))
+    return bool(np.arccos(min(cosine, 1.0)) < 3.0 * prior.axis_sigma)
 
 
 def _fits_road(step: Step, matches: Matches, height_unscaled: float | None) -> bool | None:

@@ -8,7 +8,7 @@ usual direction of motion.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,8 @@ _CONVERGED = 1e-5
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0
+# corners of a motion over those of the best one, from which on it may be the right one
+_COMPARABLE_SUPPORT = 0.6
 # inlier bound along the epipolar line, sigmas
 _ALONG_SIGMAS = 2.5
 # parallax of a corner that is an inlier against its learned depth, in sigmas of the corners' noise: triangulated to a
@@ -109,7 +111,8 @@ class TwoViewEstimator:
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         proposed = self._by_essential(first, second)
         if history.last is None and proposed is not None:
-            matches = self._with_first_sigma(matches, proposed)
+            by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
+            matches = self._with_first_sigma(matches, [proposed, by_points])
         prior = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
         candidates = [self._refined(matches, proposed, prior)]
         if candidates[0] is None or candidates[0].agreeing.mean() < _EARLY_EXIT_INLIER_RATIO:
@@ -251,13 +254,13 @@ class TwoViewEstimator:
         moving = moving_corners(pixels, matches.on_road, agreeing, contradicting, expected_px, seen_px)
         return agreeing, agreeing | (contradicting & ~moving & (seen_px > parallax_px))
 
-    def _with_first_sigma(self, matches: Matches, proposed: UnitRelativePose) -> Matches:
-        """Before the drive has told the error of learned depth, it is that under the motion by corners alone."""
-        ratios, _ = self._ratios(matches, proposed, self._residuals(matches))
-        if len(ratios) < _LEAST_POINTS:
-            return matches
-        logarithms = np.log(ratios)
-        error = mad_sigma(logarithms - np.median(logarithms))
+    def _with_first_sigma(self, matches: Matches, motions: Sequence[UnitRelativePose | None]) -> Matches:
+        """Until the drive has told the error of learned depth, it is the least under a motion that most corners fit."""
+        residuals = self._residuals(matches)
+        ratios = [self._ratios(matches, motion, residuals)[0] for motion in motions if motion is not None]
+        least = max(_LEAST_POINTS, _COMPARABLE_SUPPORT * max(map(len, ratios), default=0))
+        logarithms = [np.log(each) for each in ratios if len(each) >= least]
+        error = min((mad_sigma(each - np.median(each)) for each in logarithms), default=0.0)
         return replace(matches, depth_sigma=np.maximum(matches.depth_sigma, error))
 
     def _length(self, matches: Matches, unit_pose: UnitRelativePose, residuals: Residuals) -> float | None:

@@ -19,7 +19,7 @@ from erfsfm.common.memory import require_memory
 from erfsfm.common.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
-_LOADING_BYTES = 256 * 2**20  # of NumPy and SciPy: OpenBLAS waits for ever for memory that it cannot have
+_LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
 # what they would say of a file is said in our own line; twice the pixels of the largest camera that is read
 _OPENCV = {
     "OPENCV_LOG_LEVEL": "SILENT",

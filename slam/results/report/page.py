@@ -121,7 +121,7 @@ def write_report(
         no_errors=report_tables.no_errors(metrics),
         error_pictures=list(_error_pictures(trajectories)),
         depth=_depth_picture(examples),
-        depth_error=report_tables.depth_error(metrics),
+        depth_error=_depth_error(metrics),
         map_picture=_map_picture(views),
         driver=_driver_picture(views),
         viewer=None if views is None else views.viewer,
@@ -166,6 +166,20 @@ def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]
     yield _drawn(lambda: errors_figure(trajectories), "Position error over distance travelled", caption)
     caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
     yield _drawn(lambda: drift_figure(trajectories), "Drift over segment length", caption)
+
+
+def _depth_error(metrics: Mapping[str, Any]) -> Table | None:
+    """Error of learned depth over distance; None where it was not measured."""
+    rows, _ = lookup(metrics, "depth_error")
+    if not rows:
+        return None
+    words = (
+        "Learned depth against depth triangulated on the drive. The bias is taken out of learned depth before it is "
+        "compared with image geometry. It is zero on average, for its scale is measured step by step."
+    )
+    head = ("learned depth", "bias", "relative sigma", "corners")
+    cells = [(f"{r['depth']:.1f}", f"{r['bias']:+.2f}", f"{r['sigma']:.2f}", f"{r['corners']:.0f}") for r in rows]
+    return Table(head, [[Cell(text) for text in row] for row in cells], notes=[words])
 
 
 def _depth_picture(examples: Sequence[DepthExample]) -> Picture | None:

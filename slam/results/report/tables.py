@@ -251,20 +251,6 @@ def graph(metrics: Metrics) -> dict[str, Any] | None:
     return size | {"coverage": Table(("factors", "fraction"), rows, "words", [words]), "reasons": []}
 
 
-def depth_error(metrics: Metrics) -> Table | None:
-    """Error of learned depth over distance; None where it was not measured."""
-    rows, _ = lookup(metrics, "depth_error")
-    if not rows:
-        return None
-    words = (
-        "Learned depth against depth triangulated on the drive. The bias is taken out of learned depth before it is "
-        "compared with image geometry. It is zero on average, for its scale is measured step by step."
-    )
-    head = ("learned depth", "bias", "relative sigma", "corners")
-    cells = [(f"{r['depth']:.1f}", f"{r['bias']:+.2f}", f"{r['sigma']:.2f}", f"{r['corners']:.0f}") for r in rows]
-    return Table(head, _texts(cells), notes=[words])
-
-
 def timing(metrics: Metrics) -> Table | None:
     """Seconds by stage, the longest first; None where nothing was timed."""
     stages, _ = lookup(metrics, "timing", "stages")

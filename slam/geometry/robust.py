@@ -1,4 +1,4 @@
-"""Robust statistics: scale by the median absolute deviation, and medians with weights."""
+"""Robust statistics: scale by the median absolute deviation, medians with weights, running medians."""
 
 from __future__ import annotations
 
@@ -28,3 +28,13 @@ def weighted_median(values: FloatArray, weights: FloatArray) -> float:
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def running_median(values: FloatArray, window: int) -> FloatArray:
+    """Median of the known ones among the ``window`` values ``(N,)`` around each ``(N,)``; NaN where none is known."""
+    padded = np.pad(values, window // 2, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, window)
+    known = np.isfinite(around).any(axis=1)
+    medians = np.full(len(values), np.nan)
+    medians[known] = np.nanmedian(around[known], axis=1)
+    return medians

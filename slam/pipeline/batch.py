@@ -32,7 +32,7 @@ from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
+from slam.pipeline.doubts import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
 from slam.pipeline.keyframe_tracking import decided
@@ -162,6 +162,7 @@ class SlamPipeline:
         config, by_lidar = self._config, lidar_steps(lidar) if isinstance(lidar, LidarPath) else []
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
+        warn_of_contradicted_steps(scale)
         factors = make_factors(drive, scale, self._noise, config.frontend, config.geometry)
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(chain_odometry(factors, T_network, scale))
@@ -205,8 +206,8 @@ class SlamPipeline:
         intrinsics = self._sequence.intrinsics.resized(width, height)
         T_world_camera = estimate.optimised.T_world_camera
         config = self._config
-        scales = estimate.scale.per_frame
-        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, intrinsics, config.depth)
+        scales, error = estimate.scale.per_frame, estimate.state.odometry.depth_error
+        depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, config.depth)
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
         moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)

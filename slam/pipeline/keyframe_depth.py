@@ -12,6 +12,7 @@ from slam.config.sections import DepthConfig, MappingConfig
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
 
@@ -23,18 +24,19 @@ _STREET_DEPTH_M = 15.0  # median depth of a street
 class KeyframeDepth:
     """A keyframe's image ``(H, W, 3)``, the network's depth ``(H, W)`` in the unit of the trajectory, and that refined.
 
-    ``refined`` is None where refinement is switched off or no neighbour is at a useful distance.
+    ``unbiased`` is the network's depth without the bias that was measured on the drive. ``refined`` is None where refinement is switched off or no neighbour is at a useful distance.
     """
 
     index: int
     image: Image
     depth: DepthMap
+    unbiased: DepthMap
     refined: RefinedDepth | None
 
     @property
     def best(self) -> DepthMap:
         """The depth to fuse: refined where it was."""
-        return self.depth if self.refined is None else self.refined.depth
+        return self.unbiased if self.refined is None else self.refined.depth
 
     @property
     def relative_sigma(self) -> DepthMap | None:
@@ -50,6 +52,7 @@ class KeyframeDepths:
         drive: Drive,
         scale_per_frame: FloatArray,
         T_world_camera: FloatArray,
+        error: DepthError,
         intrinsics: Intrinsics,
         config: DepthConfig,
     ) -> None:
@@ -59,12 +62,14 @@ class KeyframeDepths:
             drive: with at least one keyframe.
             scale_per_frame: factor ``(N,)`` on unscaled depth.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
+            error: of learned depth on this drive.
             intrinsics: of the keyframes.
             config: whether to refine.
         """
         self._keyframes: Sequence[Keyframe] = drive.keyframes
         self._roads = drive.roads
         self._scale = scale_per_frame
+        self._error = error
         self._refiner: DepthRefiner | None = None
         if config.refine == "multiview":
             indices = [keyframe.index for keyframe in self._keyframes]
@@ -85,13 +90,14 @@ class KeyframeDepths:
     def at(self, n: int) -> KeyframeDepth:
         """The n-th keyframe."""
         keyframe = self._keyframes[n]
-        scale, depth = float(self._scale[keyframe.index]), self._of_network(keyframe)
+        scale, learned = float(self._scale[keyframe.index]), keyframe.depth_unscaled
+        depth, unbiased = learned * np.float32(scale), (self._error.corrected(learned) * scale).astype(np.float32)
         refined = None
         if self._refiner is not None:
             plane = self._roads[keyframe.index]
             road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
-            refined = self._refiner.refine(n, depth, road)
-        return KeyframeDepth(keyframe.index, keyframe.image, depth, refined)
+            refined = self._refiner.refine(n, unbiased, road)
+        return KeyframeDepth(keyframe.index, keyframe.image, depth, unbiased, refined)
 
     def _of_network(self, keyframe: Keyframe) -> DepthMap:
         return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

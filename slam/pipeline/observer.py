@@ -269,7 +269,7 @@ class Observer:
     def _learn(self, frame: Frame, depth: DepthMap) -> None:
         """Everything that the depth ``(H, W)`` of a frame gives."""
         with self._stopwatch.stage("road"):
-            self._drive.roads[frame.index] = road = self._plane.fit(depth)
+            self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state().depth_error)
         self._keyframes.learn(frame, depth)
         height = self._remember(frame, depth, road)
         if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
@@ -282,7 +282,7 @@ class Observer:
         if recent.depth is not None:
             return recent.depth, recent.height
         depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
-        return depth, self._remember(recent.frame, depth, self._plane.fit(depth))
+        return depth, self._remember(recent.frame, depth, self._plane.fit(depth, self._odometry.state().depth_error))
 
     def _remember(self, frame: Frame, depth: DepthMap, road: GroundPlane | MeasurementFailure) -> float | None:
         """Keep the depth of a recent frame, and the camera height that is returned."""

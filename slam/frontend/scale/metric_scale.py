@@ -52,6 +52,7 @@ class Scale:
     per_frame: FloatArray
     lengths: Mapping[Ends, StepLength]
     unit: LengthUnit
+    contradicted: Sequence[Ends] = ()
 
     @property
     def is_metric(self) -> bool:
@@ -104,7 +105,7 @@ def find_scale(
     else:
         prior_unit = scale_track(drive.roads, height, by_planes)
     steps = links(motions, frames)
-    evidence = gather_evidence(steps, motions, absolute, prior_unit)
+    evidence = gather_evidence(steps, motions, absolute, prior_unit, unit)
     if not isinstance(by_planes, MeasurementFailure):
         # a car ahead taken for the road for seconds would outweigh all other measurements
         evidence = evidence.without_contradicted(_MAX_CONTRADICTION)
@@ -125,7 +126,8 @@ def find_scale(
     if mode == "lidar" and not is_metric:
         estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
         logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)
-    return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame), named)
+    contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
+    return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame), named, contradicted)
 
 
 def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: FloatArray) -> dict[Ends, StepLength]:

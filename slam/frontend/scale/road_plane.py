@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from slam.config.sections import ScaleConfig
 from slam.frames import DepthMap, Intrinsics
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 
 _POINTS = 1500
@@ -44,9 +45,13 @@ class GroundPlaneFitter:
         self._seed = seed
         self._rows, self._columns, self._rays = _trapezoid(intrinsics, config)
 
-    def fit(self, depth_unscaled: DepthMap) -> GroundPlane | MeasurementFailure:
-        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics; unknown depth is left out."""
-        inverse_depth = 1.0 / np.maximum(depth_unscaled[self._rows, self._columns].astype(np.float64), 1e-9)
+    def fit(self, depth_unscaled: DepthMap, error: DepthError) -> GroundPlane | MeasurementFailure:
+        """The plane of learned z-depth ``(H, W)`` at the size of the intrinsics, without the bias by its ``error``.
+
+        Unknown depth is left out.
+        """
+        depth = error.corrected(depth_unscaled[self._rows, self._columns].astype(np.float64))
+        inverse_depth = 1.0 / np.maximum(depth, 1e-9)
         usable = (inverse_depth > 0) & (inverse_depth < 1e8)  # false for NaN
         if usable.sum() < _LEAST_POINTS:
             return MeasurementFailure("the depth in front of the car is not usable")

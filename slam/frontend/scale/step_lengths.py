@@ -2,9 +2,11 @@
 
 A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
 that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
-it in a unit that drifts. In logarithms all of them are linear in the lengths ``x`` and the unit's deviation ``b``:
+it in a unit that drifts. A vehicle's acceleration bounds the change of speed. In logarithms all of them are linear in the
+lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a step:
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
+    x_k - x_{k-1} = log(t_k / t_{k-1})
 
 solved for the whole drive by robust sparse least squares (``docs/design/scale-and-lengths.md``).
 """
@@ -15,12 +17,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import spsolve
 
 from slam.config.sections import LengthConfig
 from slam.frames import Ends
 from slam.frontend.visual.motion import Motion
+from slam.geometry.robust import running_median
 from slam.geometry.se3 import FloatArray
 
 _ITERATIONS = 20
@@ -30,6 +34,10 @@ _MOST_CORRELATED = 0.999
 _RATIO_WIDENING = 1.5  # factor on the sigma of a ratio measured by triangulated points
 _UNIT_WALK_SIGMA = 0.003  # sigma per step of the random walk of learned depth's scale
 _UNIT_SIGMA = 0.2  # sigma of that scale by the learned ground plane
+_ACCELERATION_SIGMA = 3.0  # of a vehicle, in camera heights: 5 m/s2 at 1.65 m
+_SPEED_STEPS = 11  # window over which the speed is averaged that a change is compared with
+_LENGTH_SIGMA = 0.05  # of a single length where it is compared with the one before
+_CONTRADICTION_SIGMAS = 5.0
 _CORRELATED_WIDENING = 1.5  # factor on the sigmas in the pose graph, for errors correlated along the road
 
 
@@ -38,7 +46,8 @@ class StepEvidence:
     """Measurements of S steps, logarithms and their sigmas ``(S,)`` each, NaN where there is none.
 
     ``ratio`` is the length over that of the step before; ``absolute`` the length in the mode's unit; ``learned``
-    the length by learned depth, already in the prior unit of the networks.
+    the length by learned depth, already in the prior unit of the networks; ``steady`` the length over that of
+    the step before at constant speed, with the sigma that a vehicle's acceleration gives it.
     """
 
     ratio: FloatArray
@@ -46,11 +55,13 @@ class StepEvidence:
     absolute: FloatArray
     absolute_sigma: FloatArray
     learned: FloatArray
+    steady: FloatArray
+    steady_sigma: FloatArray
 
     @classmethod
     def empty(cls, steps: int) -> StepEvidence:
         """Without a measurement."""
-        return cls(*(np.full(steps, np.nan) for _ in range(5)))
+        return cls(*(np.full(steps, np.nan) for _ in range(7)))
 
     def without_contradicted(self, factor: float) -> StepEvidence:
         """The same without absolute lengths that differ from learned ones by more than ``factor``."""
@@ -64,13 +75,15 @@ class StepLengths:
 
     Steps linked by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
     would add up along the drive as those do. ``unit_correction`` ``(S,)`` times the prior unit of learned depth is its
-    unit near that step.
+    unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or changes from
+    the step before as no vehicle's does.
     """
 
     length: FloatArray
     relative_sigma: FloatArray
     relative_correlated_sigma: FloatArray
     unit_correction: FloatArray
+    contradicted: NDArray[np.bool_]
 
 
 def gather_evidence(
@@ -78,6 +91,7 @@ def gather_evidence(
     motions: Mapping[Ends, Motion],
     absolute: Mapping[Ends, tuple[float, float]],
     prior_unit: FloatArray,
+    camera_height: float = 1.0,
 ) -> StepEvidence:
     """All measurements of the lengths of a drive's steps, one row a link.
 
@@ -86,12 +100,15 @@ def gather_evidence(
         motions: the triangulated ones.
         absolute: length in the mode's unit, and its relative sigma.
         prior_unit: that unit per unscaled length near each frame ``(N,)``.
+        camera_height: in that unit.
     """
     evidence = StepEvidence.empty(len(links))
+    seconds = np.full(len(links), np.nan)
     before: Motion | None = None
     for row, ends in enumerate(links):
         motion = motions.get(ends)
         if motion is not None:
+            seconds[row] = motion.seconds
             evidence.learned[row] = np.log(motion.length_unscaled * prior_unit[ends[0]])
             if ends in absolute:
                 length, evidence.absolute_sigma[row] = absolute[ends]
@@ -99,6 +116,10 @@ def gather_evidence(
             if before is not None and motion.length_ratio is not None:
                 evidence.ratio[row], evidence.ratio_sigma[row] = motion.length_ratio
         before = motion
+    evidence.steady[1:] = np.log(seconds[1:] / seconds[:-1])
+    speed = np.exp(running_median(evidence.learned - np.log(seconds), _SPEED_STEPS))
+    changes = _ACCELERATION_SIGMA * camera_height * 0.5 * (seconds[1:] + seconds[:-1])
+    evidence.steady_sigma[1:] = changes / speed[1:]
     return evidence
 
 
@@ -112,6 +133,7 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
         _Rows(lengths[1:], lengths[:-1], evidence.ratio[1:], ratio_sigma[1:]),
         _Rows(lengths, None, evidence.absolute, evidence.absolute_sigma),
         _Rows(lengths, units, evidence.learned, config.learned_sigma * ones),
+        _Rows(lengths[1:], lengths[:-1], evidence.steady[1:], evidence.steady_sigma[1:]),
         _Rows(units[1:], units[:-1], 0.0 * ones[1:], _UNIT_WALK_SIGMA * ones[1:]),
         # one prior on the unit of the whole drive, divided among its steps
         _Rows(units, None, 0.0 * ones, _UNIT_SIGMA * np.sqrt(steps) * ones),
@@ -132,7 +154,11 @@ def solve_lengths(evidence: StepEvidence, config: LengthConfig) -> StepLengths:
     known = np.where(measured, 1.0, np.nan)
     sigmas, correlations = marginals(information, steps)
     correlated_sigmas = _CORRELATED_WIDENING * sigmas * np.sqrt((1.0 + correlations) / (1.0 - correlations))
-    return StepLengths(known * np.exp(state[:steps]), known * sigmas, known * correlated_sigmas, np.exp(state[steps:]))
+    sigmas, correlated_sigmas = known * sigmas, known * correlated_sigmas
+    by_learned = (evidence.learned + state[steps:] - state[:steps]) / config.learned_sigma
+    by_speed = (np.diff(state[:steps], prepend=np.nan) - evidence.steady) / (evidence.steady_sigma + _LENGTH_SIGMA)
+    contradicted = (np.abs(by_learned) > _CONTRADICTION_SIGMAS) | (np.abs(by_speed) > _CONTRADICTION_SIGMAS)
+    return StepLengths(known * np.exp(state[:steps]), sigmas, correlated_sigmas, np.exp(state[steps:]), contradicted)
 
 
 def marginals(information: csc_array, steps: int) -> tuple[FloatArray, FloatArray]:

@@ -19,12 +19,13 @@ class Motion:
 
     Where corners alone gave rotation and direction, ``direction_sigmas`` ``(3,)`` are the noise of the direction in the
     later camera, radians, and ``length_ratio`` is the log of the length over that of the step before, by points that
-    both triangulated, with its sigma; else None.
+    both triangulated, with its sigma; else None. ``seconds`` passed between the frames.
     """
 
     relative_pose: RelativePose
     direction_sigmas: FloatArray | None = None
     length_ratio: tuple[float, float] | None = None
+    seconds: float = np.nan
 
     @property
     def ends(self) -> Ends:

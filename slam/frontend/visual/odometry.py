@@ -225,7 +225,7 @@ class VisualOdometry:
             two_view = self._two_views.estimate(corners, before)
             if two_view is None or two_view.inliers.sum() < self._config.min_inliers:
                 return None
-            return self._triangulated(ends, tracks, corners, self._trusted(learned, height), two_view)
+            return self._triangulated(ends, seconds, tracks, corners, self._trusted(learned, height), two_view)
 
         usual = step(matches, history)
         if usual is None:
@@ -258,7 +258,13 @@ class VisualOdometry:
         )
 
     def _triangulated(
-        self, ends: Ends, tracks: Tracks, matches: Matches, depth: FloatArray, two_view: TwoViewEstimate
+        self,
+        ends: Ends,
+        seconds: float,
+        tracks: Tracks,
+        matches: Matches,
+        depth: FloatArray,
+        two_view: TwoViewEstimate,
     ) -> Step | None:
         """The step with its length by learned depth, None with too few points for that."""
         rays_previous, rays_current = matches.rays_previous, matches.rays_current
@@ -285,7 +291,7 @@ class VisualOdometry:
         is_next = last is not None and last.is_triangulated and last.ends[1] == ends[0]
         ratio = triangulated.length_ratio(earlier) if is_next and earlier is not None else None
         sigmas = pose_sigmas(T_previous_current, rotation, direction, max(spread, _LEARNED_LENGTH_RELATIVE_SIGMA))
-        motion = Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio)
+        motion = Motion(RelativePose(*ends, T_previous_current, sigmas, ESSENTIAL_SOURCE), direction, ratio, seconds)
         return Step(motion, two_view, triangulated)
 
     def _essential_sigmas(self, two_view: TwoViewEstimate) -> tuple[FloatArray, FloatArray]:

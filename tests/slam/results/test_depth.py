@@ -24,7 +24,7 @@ def keyframe(refined: bool = True) -> KeyframeDepth:
     sigma = np.full_like(DEPTH, 0.1)
     sigma[0] = 0.3
     found = RefinedDepth(DEPTH * 1.1, sigma, np.ones_like(DEPTH, bool)) if refined else None
-    return KeyframeDepth(2, image, DEPTH, found)
+    return KeyframeDepth(2, image, DEPTH, DEPTH, found)
 
 
 def with_depth(tmp_path) -> RecordedSequence:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 from scipy.sparse import csc_array
 
@@ -17,8 +19,11 @@ RATIO_WIDENING, CORRELATED_WIDENING = 1.5, 1.5  # of the sigmas of ratios, and o
 TRUE = 1.0 + 0.3 * np.sin(np.arange(STEPS) / 15.0)
 
 
+EVIDENCE = [field.name for field in fields(StepEvidence)]
+
+
 def evidence(**measured: np.ndarray) -> StepEvidence:
-    empty = {name: np.full(STEPS, np.nan) for name in ("ratio", "ratio_sigma", "absolute", "absolute_sigma", "learned")}
+    empty = {name: np.full(STEPS, np.nan) for name in EVIDENCE}
     return StepEvidence(**(empty | measured))
 
 
@@ -93,10 +98,10 @@ def test_steps_that_nothing_measured_have_no_length():
     np.testing.assert_array_equal(nothing.unit_correction, 1.0)
 
 
-def motion(ends: Ends, metres: float, unit: float, ratio: float) -> Motion:
+def motion(ends: Ends, metres: float, unit: float, ratio: float, seconds: float = np.nan) -> Motion:
     """A step, whose ratio to the one before is measured."""
     T = from_rotation_vector(np.zeros(3), np.array([0.0, 0.0, unit * metres]))
-    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.zeros(3), (np.log(ratio), 0.01))
+    return Motion(RelativePose(*ends, T, np.full(6, 0.01), "essential"), np.zeros(3), (np.log(ratio), 0.01), seconds)
 
 
 def test_evidence_has_a_row_a_link_also_where_steps_skip_frames() -> None:
@@ -194,3 +199,32 @@ def test_a_step_that_nothing_measured_has_no_sigma() -> None:
     solved = solve_lengths(evidence(absolute=road, absolute_sigma=np.full(STEPS, 0.06)), CONFIG)
     np.testing.assert_array_equal(np.isnan(solved.relative_sigma), np.isnan(solved.length))
     assert np.isnan(solved.length[50:60]).all() and np.isfinite(solved.length[:50]).all()
+
+
+def driven(metres: np.ndarray) -> StepEvidence:
+    """Steps of a tenth of a second, their lengths by learned depth alone."""
+    links = [(k, k + 1) for k in range(len(metres))]
+    motions = {ends: motion(ends, metres[ends[0]], 0.1, 1.0, seconds=0.1) for ends in links}
+    motions = {ends: replace(step, length_ratio=None) for ends, step in motions.items()}
+    return gather_evidence(links, motions, {}, np.full(len(metres) + 1, 10.0), camera_height=1.65)
+
+
+def test_a_step_of_half_a_metre_between_metres_is_an_outlier() -> None:
+    solved = solve_lengths(driven(np.where(np.arange(60) == 30, 0.5, 1.0)), CONFIG)
+    assert np.flatnonzero(solved.contradicted).tolist() == [30]
+    np.testing.assert_allclose(solved.length, 1.0, rtol=0.1)
+
+
+def test_a_stretch_of_half_metres_is_said() -> None:
+    """Learned depth alone cannot be overruled for ten steps, but no vehicle changes its speed so."""
+    solved = solve_lengths(driven(np.where((np.arange(60) >= 30) & (np.arange(60) < 40), 0.5, 1.0)), CONFIG)
+    said = np.flatnonzero(solved.contradicted)
+    assert len(said) and set(said) <= set(range(28, 43))
+
+
+def test_a_car_may_brake() -> None:
+    """From 20 m/s at 8 m/s2 to 1 m/s."""
+    metres = 0.1 * np.maximum(20.0 - 0.8 * np.arange(30), 1.0)
+    solved = solve_lengths(driven(metres), CONFIG)
+    assert not solved.contradicted.any()
+    np.testing.assert_allclose(solved.length[1:-1], metres[1:-1], rtol=0.1)

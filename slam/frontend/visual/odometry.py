@@ -39,6 +39,7 @@ from slam.frontend.visual.two_view import (
     TwoViewEstimate,
     TwoViewEstimator,
 )
+from slam.frontend.visual.working_size import WorkingSize
 from slam.geometry.resection import consensus, refine
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
@@ -92,7 +93,8 @@ class VisualOdometry:
     ) -> None:
         """Prepare for the first frames, or resume from a ``state``; ``seed`` is that of RANSAC."""
         self._config = config
-        self._intrinsics = intrinsics
+        self._working = WorkingSize(intrinsics)
+        self._intrinsics = intrinsics = self._working.camera
         self._seed = seed
         self._tracker = CornerTracker(config, get_or_compute, None if state is None else state.tracker)
         self._two_views = TwoViewEstimator(config, intrinsics.fx, get_or_compute, seed)
@@ -123,6 +125,8 @@ class VisualOdometry:
             height_unscaled: camera height in the same unit; where known, farther depths than
                 ``max_depth_heights`` of it are not trusted.
         """
+        previous, current = self._working.frame(previous), self._working.frame(current)
+        depth_previous_unscaled = self._working.depth(depth_previous_unscaled)
         flow = self._predicted_flow(previous, current, depth_previous_unscaled)
         tracks = self._tracker.track(previous, current, flow)
         if len(tracks) < self._config.min_inliers:
@@ -156,6 +160,8 @@ class VisualOdometry:
         known = _unit_pose_and_length(T_first_last)
         if known is None:
             return lambda: None
+        first, last = self._working.frame(first), self._working.frame(last)
+        depth_first_unscaled = self._working.depth(depth_first_unscaled)
         find = self._tracker.track_across(first, last, PredictedFlow(*known, depth_first_unscaled, self._intrinsics))
         mask, error = self._state.dynamic_mask, self._state.depth_error
 

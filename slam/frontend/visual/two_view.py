@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,15 +110,15 @@ class TwoViewEstimator:
         """Rotation and direction of the next motion; None without a consensus."""
         reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
+        depth = matches.depth_previous[reliable]
+        by_points = cache(lambda: self._by_pnp(first, second, depth))
         proposed = self._by_essential(first, second)
         if history.last is None and proposed is not None:
-            by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
-            matches = self._with_first_sigma(matches, [proposed, by_points])
+            matches = self._with_first_sigma(matches, [proposed, by_points()])
         prior = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
         candidates = [self._refined(matches, proposed, prior)]
         if candidates[0] is None or candidates[0].agreeing.mean() < _EARLY_EXIT_INLIER_RATIO:
-            by_points = self._by_pnp(first, second, matches.depth_previous[reliable])
-            candidates += [self._refined(matches, other, prior) for other in (by_points, history.last)]
+            candidates += [self._refined(matches, other, prior) for other in (by_points(), history.last)]
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
             return None

@@ -83,9 +83,13 @@ class DepthError:
 
     @cached_property
     def bias(self) -> FloatArray:
-        """Log of learned over true depth at each of ``_DEPTHS`` ``(D,)``, zero on the average of all information."""
+        """Log of learned over true depth at each of ``_DEPTHS`` ``(D,)``.
+
+        It is zero on the average of what corners tell of a length, which they do by the square of their parallax: near
+        depth, as that of the road, keeps its unit.
+        """
         median = self._quantile(0.5)
-        weights = self.corners.sum(axis=1) / self._spread**2
+        weights = self.corners.sum(axis=1) / (self._spread * _DEPTHS) ** 2
         return median - (weights @ median / weights.sum() if weights.any() else 0.0)
 
     @cached_property

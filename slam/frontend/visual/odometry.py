@@ -42,7 +42,6 @@ from slam.frontend.visual.two_view import (
 from slam.geometry.resection import consensus, refine
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
-from slam.runtime.storage.cache import GetOrCompute, without_cache
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_SOURCE = "essential"
@@ -86,7 +85,6 @@ class VisualOdometry:
         self,
         config: GeometryConfig,
         intrinsics: Intrinsics,
-        get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
         state: OdometryState | None = None,
     ) -> None:
@@ -94,8 +92,8 @@ class VisualOdometry:
         self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
-        self._tracker = CornerTracker(config, get_or_compute, None if state is None else state.tracker)
-        self._two_views = TwoViewEstimator(config, intrinsics.fx, get_or_compute, seed)
+        self._tracker = CornerTracker(config, None if state is None else state.tracker)
+        self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
         self._state = state or OdometryState(
             self._tracker.state(),
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),

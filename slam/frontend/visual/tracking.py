@@ -17,7 +17,6 @@ from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Grey
 from slam.frontend.visual.predicted_flow import Pixels, PredictedFlow
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
@@ -63,14 +62,8 @@ class TrackerState:
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(
-        self,
-        config: GeometryConfig,
-        get_or_compute: GetOrCompute = without_cache,
-        state: TrackerState | None = None,
-    ) -> None:
+    def __init__(self, config: GeometryConfig, state: TrackerState | None = None) -> None:
         self._config = config
-        self._get_or_compute = get_or_compute
         self._state = state or TrackerState({})
         self._frames_kept = config.rotation_baseline_steps + 2
 
@@ -101,15 +94,10 @@ class CornerTracker:
         tracked = np.isin(corners.track_ids, self._state.corners[following].track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
-        def flow() -> Answer:
+        def find() -> Tracks:
             target = _warped(current.grey, _WINDOW_PX, predicted_flow)
             found = self._first_flow(previous.grey, current.grey, points, [target])
-            return found.pixels, found.kept
-
-        def find() -> Tracks:
-            settings = repr((_WINDOW_PX, _FORWARD_BACKWARD_PX))
-            given = previous, current, points, settings, *predicted_flow.given
-            pixels, kept = self._get_or_compute("flow across a baseline", given, flow)
+            pixels, kept = found.pixels, found.kept
             return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), track_ids[kept])
 
         return find
@@ -118,22 +106,12 @@ class CornerTracker:
         self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
-        config = self._config
-
-        def flow() -> Answer:
-            found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
-            if found.kept.sum() < config.few_corners:
-                exposed = _histogram_matched(second.grey, first.grey)
-                wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
-                found = max(found, wider, key=lambda tracked: tracked.kept.sum())
-            return found.pixels, found.kept
-
-        windows = _WINDOW_PX, _WIDE_WINDOW_PX, config.few_corners
-        settings = repr((*windows, _PYRAMID_LEVELS, _FORWARD_BACKWARD_PX))
-        predicted = () if predicted_flow is None else predicted_flow.given
-        given = (first, second, points, settings, *predicted)
-        pixels, kept = self._get_or_compute("optical flow", given, flow)
-        return pixels, kept
+        found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
+        if found.kept.sum() < self._config.few_corners:
+            exposed = _histogram_matched(second.grey, first.grey)
+            wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
+            found = max(found, wider, key=lambda tracked: tracked.kept.sum())
+        return found.pixels, found.kept
 
     def _filled(self, frame: Frame, arrived: Corners) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
@@ -141,10 +119,7 @@ class CornerTracker:
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
-            settings = repr((room, _CORNER_QUALITY, config.corner_spacing_px))
-            (fresh,) = self._get_or_compute(
-                "new corners", (frame, pixels, settings), lambda: (self._detected(frame.grey, pixels, room),)
-            )
+            fresh = self._detected(frame.grey, pixels, room)
             pixels = np.concatenate([pixels, fresh])
             track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
             next_id += len(fresh)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.config.sections import GeometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
@@ -126,7 +126,7 @@ class VisualOdometry:
         if len(tracks) < self._config.min_inliers:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
         else:
-            learned = _sample(depth_previous_unscaled, tracks.previous)
+            learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = self._trusted(learned, height_unscaled)
             ends = (previous.index, current.index)
             measured = (
@@ -161,7 +161,7 @@ class VisualOdometry:
             tracks = find()
             if len(tracks) < self._config.min_inliers:
                 return None
-            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), None, mask, error)
+            matches = self._matches(tracks, nearest_depth(depth_first_unscaled, tracks.previous), None, mask, error)
             found = self._two_views.refined(matches, known[0])
             if found is None or found.inliers.sum() < self._config.min_inliers:
                 return None
@@ -321,12 +321,3 @@ def _unit_pose_and_length(T_previous_current: FloatArray) -> tuple[UnitRelativeP
         if length > 0
         else None
     )
-
-
-def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
-    """Depth at the nearest pixel of each point, NaN where there is none."""
-    height, width = depth.shape
-    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
-    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    sampled = depth[v, u].astype(np.float64)
-    return np.where(np.isfinite(sampled) & (sampled > 0), sampled, np.nan)

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
+from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
-
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

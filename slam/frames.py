@@ -291,6 +291,15 @@ def runs(frames: Collection[int]) -> list[tuple[int, int]]:
     return found
 
 
+def nearest_depth(depth: DepthMap, pixels: NDArray[np.floating[Any]]) -> FloatArray:
+    """Depth ``(M,)`` of a map ``(H, W)`` at the pixels nearest to points ``(M, 2)``, NaN where it is unknown."""
+    height, width = depth.shape
+    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
+    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
+    nearest = depth[v, u].astype(np.float64)
+    return np.where(np.isfinite(nearest) & (nearest > 0), nearest, np.nan)
+
+
 def sampled_depth(depth: DepthMap, u: NDArray[np.float32], v: NDArray[np.float32]) -> DepthMap:
     """Depth of a map ``(H, W)``, not positive or not finite where unknown, at columns and rows ``(h, w)``.
 

@@ -122,7 +122,7 @@ def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> Driv
     answers = without_cache if cache is None else CacheNamespace(DiskCache(cache), networks.sha256).get_or_compute
     predictor = NetworkPredictor(networks, recording.intrinsics, answers=answers)
     config = load_config(None, QUIET)
-    found = SlamPipeline(recording, predictor, config, noise=networks.noise, get_or_compute=answers).estimate()
+    found = SlamPipeline(recording, predictor, config, noise=networks.noise).estimate()
     T_true = np.array(recording.reference)
     T_true[:, :3, 3] *= umeyama(found.optimised.positions, T_true[:, :3, 3], with_scale=True).scale
     return DriveSteps.of(Path(root).name + (sequence and f" {sequence}"), found.drive.steps, found.scale, T_true)
@@ -140,7 +140,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("drives", nargs="+", metavar="ROOT[:SEQUENCE]", help="recordings with true poses")
     parser.add_argument("--weights", default="default")
-    parser.add_argument("--cache", type=Path, help="cache folder of the images' measurements")
+    parser.add_argument("--cache", type=Path, help="cache folder of the networks' outputs")
     options = parser.parse_args(words)
     try:
         networks = DepthPosePredictor.from_weights(options.weights, runtime="onnx")

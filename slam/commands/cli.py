@@ -72,9 +72,7 @@ def run(
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
     output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
-    cache: Annotated[
-        Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
-    ] = None,
+    cache: Annotated[Path | None, typer.Option(help="folder that keeps network outputs for later runs")] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
         Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")

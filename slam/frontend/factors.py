@@ -23,7 +23,7 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.frontend.window.gaps import led_through
+from slam.frontend.window.gaps import join_gap_ends
 from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.geometry.se3 import FloatArray, invert, nearest_rotation
 
@@ -45,21 +45,24 @@ def make_factors(
         geometry: noise of image geometry.
     """
     geometric = _geometric(drive.steps, scale, geometry)
+    # the noise of the networks is that of their own unit
+    unscaled = [pose.scaled(1.0 / scale.unit_at(pose)) for pose in geometric]
     if noise is None:
-        networks = network_factors(drive.trusted, measured_noise(drive.trusted, geometric))
+        networks = network_factors(drive.trusted, measured_noise(drive.trusted, unscaled))
     else:
-        networks = calibrated_factors(drive.trusted, geometric, noise)
+        networks = calibrated_factors(drive.trusted, unscaled, noise)
     if frontend.use == "gaps" or (frontend.use == "calibrated" and noise is None):
         networks = without_measured(networks, geometric)
-
-    def scaled(poses: Sequence[RelativePose]) -> list[RelativePose]:
-        return [pose.scaled(scale.unit_at(pose)) for pose in poses]
-
     window = drive.map_poses
-    others = [[pose for pose in poses if not window.within(pose)] for poses in (networks, drive.gap_steps, geometric)]
-    by_network, interpolated, by_image = (scaled(poses) for poses in others)
-    by_window = scaled_poses(window.poses, window, scale)
-    interpolated = led_through(interpolated, [*by_network, *by_image], by_window, window.segments)
+
+    def outside(poses: Sequence[RelativePose]) -> list[RelativePose]:
+        return [pose for pose in poses if not window.is_inside(pose)]
+
+    by_network, interpolated = (
+        [pose.scaled(scale.unit_at(pose)) for pose in outside(poses)] for poses in (networks, drive.gap_steps)
+    )
+    by_image, by_window = outside(geometric), scaled_poses(window.poses, window, scale)
+    interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_window, window.segments)
     return [*by_network, *interpolated, *by_image, *by_window]
 
 
@@ -72,12 +75,12 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
 
 def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
-    units = map_units(window, scale)
+    units = {number: window.learned_units[number] * unit for number, unit in depth_units(window, scale).items()}
     return [pose.scaled(units[window.segments[pose.from_index]]) for pose in poses]
 
 
-def map_units(window: WindowPoses, scale: Scale) -> dict[int, float]:
-    """The unit of the scale per learned length in each map, by the map's number."""
+def depth_units(window: WindowPoses, scale: Scale) -> dict[int, float]:
+    """The unit of the scale per learned depth in each map, by the map's number."""
     numbers = set(window.segments.values())
     return {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
 
@@ -114,13 +117,13 @@ def _precedence(factor: RelativePose) -> tuple[bool, int]:
 
 
 def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[RelativePose]:
-    """Every step of image geometry, unscaled: with its own length where that was measured, else by learned depth."""
+    """Every step of image geometry: with its own length where that was measured, else by learned depth."""
     noise = _step_noise(steps, scale, config)
     factors = []
     for ends, motion in steps.motions.items():
         length = scale.lengths.get(ends)
         if not motion.is_triangulated or length is None:
-            factors.append(motion.relative_pose)
+            factors.append(motion.relative_pose.scaled(scale.unit_at(motion.relative_pose)))
             continue
         pose = motion.with_length(length.value, length.relative_sigma, length.relative_correlated_sigma, noise[ends])
         factors.append(replace(pose, student_t_dof=STUDENT_T_DOF))

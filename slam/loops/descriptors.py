@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View
+from slam.frames import DepthMap, Descriptors, Frame, Grey, Intrinsics, View, nearest_depth
 
 _CELL_PX = 32
 _DETECTED_PER_KEPT = 4
@@ -40,8 +40,10 @@ class FeatureExtractor:
                 ``max_depth_heights`` of it are not trusted.
         """
         pixels, descriptors = self._features(frame.grey)
-        points = self._points(pixels, depth_unscaled, height_unscaled)
-        return View(frame.index, pixels, descriptors, points)
+        z = nearest_depth(depth_unscaled, pixels)
+        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
+        points = self._intrinsics.rays(pixels) * np.where(z < farthest, z, np.nan)[:, None]
+        return View(frame.index, pixels, descriptors, points.astype(np.float32))
 
     def _features(self, grey: Grey) -> tuple[NDArray[np.float32], Descriptors]:
         """Pixels ``(M, 2)`` and descriptors ``(M, 32)``."""
@@ -51,16 +53,6 @@ class FeatureExtractor:
         if not chosen:
             return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
         return np.array([keypoint.pt for keypoint in chosen], np.float32), descriptors
-
-    def _points(
-        self, pixels: NDArray[np.float32], depth: DepthMap, height_unscaled: float | None
-    ) -> NDArray[np.float32]:
-        columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, depth.shape[1] - 1)
-        rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, depth.shape[0] - 1)
-        z = depth[rows, columns].astype(np.float64)
-        farthest = np.inf if height_unscaled is None else _MAX_DEPTH_HEIGHTS * height_unscaled
-        z = np.where(np.isfinite(z) & (z > 0) & (z < farthest), z, np.nan)
-        return np.asarray(self._intrinsics.rays(pixels) * z[:, None], dtype=np.float32)
 
 
 def hamming(first: Descriptors, second: Descriptors) -> NDArray[np.float32]:

@@ -42,7 +42,6 @@ from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.storage.cache import GetOrCompute, without_cache
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
@@ -62,7 +61,6 @@ class SlamPipeline:
         config: SlamConfig,
         progress: Progress | None = None,
         noise: PoseNoise | None = None,
-        get_or_compute: GetOrCompute = without_cache,
         checkpoint: SessionCheckpoint | None = None,
         seed: int = 0,
         gps_track: GpsTrack | None = None,
@@ -75,7 +73,6 @@ class SlamPipeline:
             config: of all parts.
             progress: called with the stage, done and total.
             noise: of the snippet poses; None measures it against image geometry alone.
-            get_or_compute: a cache of image measurements.
             checkpoint: measurements of the first frames of the sequence, whose images are then not read.
             seed: of all RANSAC draws.
             gps_track: positions of the drive.
@@ -86,7 +83,6 @@ class SlamPipeline:
         self._sequence, self._predictor = sequence, predictor
         self._config = decided(config, sequence.camera_height_m)
         self._progress = progress or (lambda stage, done, total: None)
-        self._get_or_compute = get_or_compute
         self._checkpoint = checkpoint
         self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
         self._seed = seed
@@ -253,7 +249,6 @@ class SlamPipeline:
             self._config,
             self._watch,
             examples,
-            self._get_or_compute,
             self._seed,
             state,
         )

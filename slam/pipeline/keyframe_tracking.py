@@ -11,7 +11,8 @@ from slam.config.sections import LoopsConfig, SlamConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.window.descriptors import describe
-from slam.frontend.window.local_map import LocalMap, corners_of
+from slam.frontend.window.flow import new_corners
+from slam.frontend.window.local_map import LocalMap
 from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
 from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.geometry.se3 import FloatArray, invert
@@ -84,7 +85,7 @@ class KeyframeTracking:
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
             self._places = Relocaliser(views_of(lost), T_map_camera, self._intrinsics, self._seed)
-        corners = corners_of(frame.grey, self._config)
+        corners = new_corners(frame.grey, np.zeros((0, 2), np.float32), self._config.max_corners)
         unknown = np.full((len(corners), 3), np.nan, np.float32)
         found = self._places.locate(View(frame.index, corners, describe(frame.grey, corners), unknown))
         if found is None:

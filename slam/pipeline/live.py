@@ -121,7 +121,7 @@ class Slam:
         depth = (config or SlamConfig()).depth
         source = open_depth(depth, intrinsics, None)
         networks = DepthPosePredictor.from_weights(name_or_dir, device, "onnx")
-        predictor, _ = make_predictor(networks, source, depth, intrinsics)
+        predictor = make_predictor(networks, source, depth, intrinsics)
         return cls(
             predictor,
             intrinsics,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config.sections import SlamConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
-from slam.frontend.factors import map_units, scaled_poses
+from slam.frontend.factors import depth_units, scaled_poses
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.window.joining import SharedCorners, join
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
@@ -41,21 +41,26 @@ _LEAST_SIGMA = 1e-4
 class MapClosure:
     """Poses by the closed maps, their accepted ``loops``, the rejected ones, and the maps that were joined.
 
-    Rejected loops are in the unit of learned depth, accepted ones in that of their maps.
+    Lengths of loops are in the unit of their maps; ``learned_units`` is that of learned depth per unit of the map of
+    each keyframe, before maps were joined, by its frame.
     """
 
     poses: WindowPoses
     loops: tuple[MapLoop, ...] = ()
     rejected: tuple[RejectedLoop, ...] = ()
+    learned_units: Mapping[int, float] = field(default_factory=dict)
     candidates: int = 0
     measured: int = 0
     joins: tuple[TrackingEvent, ...] = ()
 
     def closures(self, scale: Scale) -> LoopClosures:
         """The loops in the unit of the scale, the accepted ones by the relative poses of the closed maps."""
-        scaled, units = scaled_poses(self.poses.loops, self.poses, scale), map_units(self.poses, scale)
+        scaled, depth_unit = scaled_poses(self.poses.loops, self.poses, scale), depth_units(self.poses, scale)
         accepted = (Loop(pose, loop.inliers, loop.score) for pose, loop in zip(scaled, self.loops, strict=True))
-        rejected = [loop.scaled(units[self.poses.segments[loop.from_index]]) for loop in self.rejected]
+        rejected = [
+            loop.scaled(self.learned_units[loop.from_index] * depth_unit[self.poses.segments[loop.from_index]])
+            for loop in self.rejected
+        ]
         rejected.sort(key=lambda r: (-r.inliers, -r.score, r.to_index, r.from_index))
         return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
 
@@ -86,7 +91,8 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     joins = rows.joins(loops)
     for joined in joins:
         logger.info("%s", joined)
-    return MapClosure(poses, tuple(loops), rows.in_learned_unit(rejected), found.candidates, found.measured, joins)
+    counts = found.candidates, found.measured
+    return MapClosure(poses, tuple(loops), tuple(rejected), rows.learned_units(), *counts, joins)
 
 
 def views_of(local: LocalMap) -> list[View]:
@@ -126,12 +132,12 @@ class _Rows:
         first, last = (self.keyframes[row].index for row in loop.rows)
         return RejectedLoop(first, last, reason, loop.score, loop.inliers, loop.similarity.T_from_to)
 
-    def in_learned_unit(self, rejected: Sequence[RejectedLoop]) -> tuple[RejectedLoop, ...]:
-        """Rejected loops in the unit of learned depth in place of that of their first frame's map."""
+    def learned_units(self) -> dict[int, float]:
+        """The unit of learned depth per unit of each keyframe's map, by its frame."""
         units: dict[int, float] = {}
         for segment in self.segments:
             units |= dict.fromkeys((keyframe.index for keyframe in segment.map.keyframes), learned_unit(segment.map))
-        return tuple(loop.scaled(units[loop.from_index]) for loop in rejected)
+        return units
 
     def joins(self, loops: Sequence[MapLoop]) -> tuple[TrackingEvent, ...]:
         """Each map after the first that loops join with an earlier one."""

@@ -30,7 +30,6 @@ from slam.pipeline.pending import PendingFrame, PendingTask
 from slam.pipeline.reading import predicted_depth
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
-from slam.runtime.storage.cache import GetOrCompute, without_cache
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
 
@@ -78,7 +77,6 @@ class Observer:
         config: SlamConfig,
         stopwatch: Stopwatch,
         examples: Examples | None = None,
-        get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
         state: FrontEndState | None = None,
     ) -> None:
@@ -90,7 +88,6 @@ class Observer:
             config: of all parts.
             stopwatch: measures the time of stages.
             examples: frames to keep whole for the report; None keeps none.
-            get_or_compute: a cache of image measurements.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
         """
@@ -100,15 +97,11 @@ class Observer:
         self._examples = examples or Examples(range(0))
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate)
-        self._odometry = VisualOdometry(
-            config.geometry, intrinsics, get_or_compute, seed, None if state is None else state.odometry
-        )
+        self._odometry = VisualOdometry(config.geometry, intrinsics, seed, None if state is None else state.odometry)
         keyframes = WindowState() if state is None else state.keyframes
         self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
         self._keyframes.decide(self._drive)
-        self._road = RoadHomography(
-            config.road, intrinsics, get_or_compute, () if state is None else state.road_directions
-        )
+        self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
         self._window: tuple[Frame, ...] = () if state is None else state.window

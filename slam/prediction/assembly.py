@@ -12,7 +12,7 @@ from slam.prediction.depth_source import DepthSource, SourcedPredictor
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
-from slam.runtime.storage.cache import CacheNamespace, DiskCache, GetOrCompute, without_cache
+from slam.runtime.storage.cache import CacheNamespace, DiskCache
 from slam.runtime.storage.fingerprint import code_fingerprint
 
 
@@ -49,22 +49,16 @@ def make_predictor(
     config: DepthConfig,
     intrinsics: Intrinsics,
     cache: Path | None = None,
-) -> tuple[Predictor, GetOrCompute]:
-    """The networks behind the cache, with depth by ``source`` where there is one, and the cache of measurements.
-
-    Files of a depth folder are read in every run; what is measured with them is cached under their content.
-    """
+) -> Predictor:
+    """The networks, behind the cache where one is given, with depth by ``source`` where there is one."""
     if cache is None:
-        own, get_or_compute = NetworkPredictor(networks, intrinsics), without_cache
+        own = NetworkPredictor(networks, intrinsics)
     else:
         disk, code = DiskCache(cache), code_fingerprint()
         # outputs of GPU and CPU differ a little and share no entries
         identity = f"{networks.sha256} {networks.record.network.model_dump_json()} {networks.device} {code}"
-        get_or_compute = CacheNamespace(disk, code).get_or_compute
-        own = NetworkPredictor(networks, intrinsics, get_or_compute, CacheNamespace(disk, identity).get_or_compute)
+        own = NetworkPredictor(networks, intrinsics, CacheNamespace(disk, identity).get_or_compute)
         if isinstance(source, OnnxDepth):
             identity = f"{source.identity} {source.runtime} {code}"
             source.use_cache(CacheNamespace(disk, identity).get_or_compute)
-    if source is None:
-        return own, get_or_compute
-    return SourcedPredictor(own, source, config.align), get_or_compute
+    return own if source is None else SourcedPredictor(own, source, config.align)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from erfsfm.inference import depth_at, limit_torch_threads
 from erfsfm.photometric_residual import PhotometricResidual, thumbnail
 from slam.frames import DepthMap, Frame, Image, Intrinsics, SnippetPoses
-from slam.runtime.storage.cache import Answer, GetOrCompute, Given, without_cache
+from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 
 class Networks(Protocol):
@@ -41,24 +41,16 @@ class Networks(Protocol):
 class NetworkPredictor:
     """Depth and snippet poses of the frames of one sequence, by the networks."""
 
-    def __init__(
-        self,
-        networks: Networks,
-        intrinsics: Intrinsics,
-        get_or_compute: GetOrCompute = without_cache,
-        answers: GetOrCompute = without_cache,
-    ) -> None:
+    def __init__(self, networks: Networks, intrinsics: Intrinsics, answers: GetOrCompute = without_cache) -> None:
         """Predict for the frames of one sequence.
 
         Args:
             networks: depth and pose network.
             intrinsics: of all images.
-            get_or_compute: a cache of measurements on images and network outputs.
-            answers: a cache of outputs of these networks alone.
+            answers: a cache of outputs of these networks.
         """
         self._networks = networks
         self._intrinsics = intrinsics
-        self._get_or_compute = get_or_compute
         self._answers = answers
         self._residual = PhotometricResidual(intrinsics.K, intrinsics.width, intrinsics.height)
         self._key = object()  # key of outputs cached in frames, which outlive the networks
@@ -89,14 +81,8 @@ class NetworkPredictor:
         self, frames: Sequence[Frame], disparity: NDArray[np.float32], T_source_target: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Photometric residual ``(N,)`` of each source, over the difference of the images."""
-
-        def measure() -> Answer:
-            thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
-            return (self._residual.ratios(thumbnails, disparity, T_source_target),)
-
-        given: list[Given] = [*frames, disparity, T_source_target, repr(self._intrinsics)]
-        (residuals,) = self._get_or_compute("photometric residual", given, measure)
-        return residuals
+        thumbnails = [frame.derived("thumbnail", partial(thumbnail, frame.grey)) for frame in frames]
+        return self._residual.ratios(thumbnails, disparity, T_source_target)
 
     def _disparity(self, frame: Frame) -> NDArray[np.float32]:
         def compute() -> Answer:

@@ -106,7 +106,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     source.fps = camera.fps
     intrinsics = StreamedSequence.intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
-    predictor, _ = make_predictor(networks, depth, settings.depth, intrinsics)
+    predictor = make_predictor(networks, depth, settings.depth, intrinsics)
     name = Path(request.source).stem or "live"
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)

@@ -85,7 +85,7 @@ class RunRequest:
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: called with (stage, done, total).
         command: recorded in the metrics.
-        cache: folder of network outputs and image measurements; None computes all of them.
+        cache: folder of network outputs; None computes all of them.
         rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
         continues: a run folder whose last frame comes right before the first of these, by the same camera; its
             configuration is used, and the new folder has the whole drive. A run that did not end goes on in its own
@@ -206,8 +206,8 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
             f"{resumes or request.continues} was run with other weights or another depth source: continue it with the "
             "same --weights and depth.source"
         )
-    predictor, get_or_compute = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
-    rest = get_or_compute, checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
+    predictor = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
+    rest = checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
     pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)

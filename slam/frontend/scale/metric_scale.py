@@ -43,8 +43,8 @@ class StepLength:
 class Scale:
     """``per_frame`` ``(N,)`` times an unscaled length near that frame is a length in ``unit``.
 
-    ``lengths`` are those of the steps measured without learned depth, unscaled: times ``per_frame`` at a step's first
-    frame they are in ``unit``. ``estimate`` is that of the mode's unit, or why there is none.
+    ``lengths`` of the steps that image geometry measured are in ``unit``. ``estimate`` is that of the mode's unit, or
+    why there is none.
     """
 
     mode: ScaleMode
@@ -71,7 +71,8 @@ class Scale:
             return replace(self, estimate=other)
         per_frame = other.value * self.per_frame
         estimate = replace(other, value=float(np.median(per_frame)))
-        return replace(self, estimate=estimate, per_frame=per_frame, unit="metres")
+        lengths = {ends: replace(length, value=other.value * length.value) for ends, length in self.lengths.items()}
+        return replace(self, estimate=estimate, per_frame=per_frame, lengths=lengths, unit="metres")
 
     def unit_at(self, measured: RelativePose) -> float:
         """The mode's unit per unscaled length at the first frame of a measurement."""
@@ -127,17 +128,12 @@ def find_scale(
         estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
         logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)
     contradicted = [ends for ends, is_so in zip(steps, solved.contradicted, strict=True) if is_so]
-    return Scale(mode, estimate, per_frame, _unscaled_lengths(steps, solved, per_frame), named, contradicted)
+    return Scale(mode, estimate, per_frame, _measured_lengths(steps, solved), named, contradicted)
 
 
-def _unscaled_lengths(steps: Sequence[Ends], solved: StepLengths, per_frame: FloatArray) -> dict[Ends, StepLength]:
-    """Unscaled lengths of the measured steps."""
+def _measured_lengths(steps: Sequence[Ends], solved: StepLengths) -> dict[Ends, StepLength]:
     rows = zip(steps, solved.length, solved.relative_sigma, solved.relative_correlated_sigma, strict=True)
-    return {
-        ends: StepLength(float(length / per_frame[ends[0]]), float(sigma), float(correlated))
-        for ends, length, sigma, correlated in rows
-        if np.isfinite(length)
-    }
+    return {ends: StepLength(*map(float, row)) for ends, *row in rows if np.isfinite(row[0])}
 
 
 def _height_by_lidar(metres: Mapping[Ends, float], drive: Drive) -> float | None:

@@ -23,7 +23,6 @@ from slam.frames import Frame, Intrinsics
 from slam.frontend.failure import MeasurementFailure
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
@@ -61,17 +60,10 @@ class RoadHomography:
     short and wide one is used, which ends before such a car; it is less accurate.
     """
 
-    def __init__(
-        self,
-        config: RoadConfig,
-        intrinsics: Intrinsics,
-        get_or_compute: GetOrCompute = without_cache,
-        directions: tuple[FloatArray, ...] = (),
-    ) -> None:
+    def __init__(self, config: RoadConfig, intrinsics: Intrinsics, directions: tuple[FloatArray, ...] = ()) -> None:
         """Prepare for the first step, or resume with the ``directions`` of motion so far (`state`)."""
         self._config = config
         self._intrinsics = intrinsics
-        self._get_or_compute = get_or_compute
         long = _Shape(_FAR_HEIGHTS, _HALF_WIDTH_HEIGHTS, _RELATIVE_SIGMA)
         near = _Shape(config.near_heights, _NEAR_HALF_WIDTH_HEIGHTS, _NEAR_RELATIVE_SIGMA)
         self._top_row = int(np.clip(np.floor(intrinsics.cy), 0, intrinsics.height - 1))
@@ -123,20 +115,14 @@ class RoadHomography:
     ) -> tuple[FloatArray, float, float]:
         """The plane ``m`` ``(3,)`` that aligns the road, and the correlation of both images with and without it."""
 
-        def align() -> Answer:
-            before, now = self._layers(previous), self._layers(current)
-            plane = self._search(strip, before[0], now[0], T_unit, expected)
-            for layer_before, layer_now in zip(before, now, strict=True):
-                plane, correlation = self._refine(
-                    strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(_TILT_SIGMA_DEG))
-                )
-            standing = _correlation(*(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now)))
-            return plane, np.array([correlation, standing])
-
-        settings = (self._intrinsics, strip.shape.far_heights, strip.shape.half_width_heights, _POINTS)
-        given = (previous, current, T_unit, expected, repr((*settings, _TILT_SIGMA_DEG)))
-        plane, correlations = self._get_or_compute("road homography", given, align)
-        return plane, float(correlations[0]), float(correlations[1])
+        before, now = self._layers(previous), self._layers(current)
+        plane = self._search(strip, before[0], now[0], T_unit, expected)
+        for layer_before, layer_now in zip(before, now, strict=True):
+            plane, correlation = self._refine(
+                strip, layer_before, layer_now, T_unit, plane, expected, float(np.deg2rad(_TILT_SIGMA_DEG))
+            )
+        standing = _correlation(*(strip.local(fine[strip.rows, strip.columns, 0]) for _, fine in (before, now)))
+        return plane, correlation, standing
 
     def _expected(self) -> FloatArray:
         """The expected normal ``(3,)``: that of a level camera, pitched so that the motion is parallel to the road.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam.config.sections import GeometryConfig
-from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose
+from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
 from slam.frontend.visual.dynamic_mask import DynamicMask
@@ -43,7 +43,6 @@ from slam.frontend.visual.working_size import WorkingSize
 from slam.geometry.resection import consensus, refine
 from slam.geometry.robust import MAD_TO_SIGMA
 from slam.geometry.se3 import FloatArray, invert, make
-from slam.runtime.storage.cache import GetOrCompute, without_cache
 
 logger = logging.getLogger(__name__)
 ESSENTIAL_SOURCE = "essential"
@@ -87,7 +86,6 @@ class VisualOdometry:
         self,
         config: GeometryConfig,
         intrinsics: Intrinsics,
-        get_or_compute: GetOrCompute = without_cache,
         seed: int = 0,
         state: OdometryState | None = None,
     ) -> None:
@@ -96,8 +94,8 @@ class VisualOdometry:
         self._working = WorkingSize(intrinsics)
         self._intrinsics = intrinsics = self._working.camera
         self._seed = seed
-        self._tracker = CornerTracker(config, get_or_compute, None if state is None else state.tracker)
-        self._two_views = TwoViewEstimator(config, intrinsics.fx, get_or_compute, seed)
+        self._tracker = CornerTracker(config, None if state is None else state.tracker)
+        self._two_views = TwoViewEstimator(config, intrinsics.fx, seed)
         self._state = state or OdometryState(
             self._tracker.state(),
             DynamicMask.empty(intrinsics.width, intrinsics.height, config.dynamic_mask_sharpness),
@@ -132,7 +130,7 @@ class VisualOdometry:
         if len(tracks) < self._config.min_inliers:
             measured: Motion | MeasurementFailure = MeasurementFailure(f"only {len(tracks)} corners could be tracked")
         else:
-            learned = _sample(depth_previous_unscaled, tracks.previous)
+            learned = nearest_depth(depth_previous_unscaled, tracks.previous)
             depth = self._trusted(learned, height_unscaled)
             ends = (previous.index, current.index)
             measured = (
@@ -169,7 +167,7 @@ class VisualOdometry:
             tracks = find()
             if len(tracks) < self._config.min_inliers:
                 return None
-            matches = self._matches(tracks, _sample(depth_first_unscaled, tracks.previous), None, mask, error)
+            matches = self._matches(tracks, nearest_depth(depth_first_unscaled, tracks.previous), None, mask, error)
             found = self._two_views.refined(matches, known[0])
             if found is None or found.inliers.sum() < self._config.min_inliers:
                 return None
@@ -335,12 +333,3 @@ def _unit_pose_and_length(T_previous_current: FloatArray) -> tuple[UnitRelativeP
         if length > 0
         else None
     )
-
-
-def _sample(depth: DepthMap, pixels: FloatArray) -> FloatArray:
-    """Depth at the nearest pixel of each point, NaN where there is none."""
-    height, width = depth.shape
-    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 0, width - 1)
-    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 0, height - 1)
-    sampled = depth[v, u].astype(np.float64)
-    return np.where(np.isfinite(sampled) & (sampled > 0), sampled, np.nan)

@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics
+from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import UnitRelativePose
-from slam.runtime.storage.cache import Given
 
 _NEAREST = 1e-6
-
-Pixels = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +33,6 @@ class PredictedFlow:
     length: float
     depth_previous: DepthMap
     intrinsics: Intrinsics
-
-    @property
-    def given(self) -> tuple[Given, ...]:
-        """All that the flow depends on, for a cache key."""
-        moved = self.length * self.unit_pose.direction
-        return self.unit_pose.R_current_previous, moved, self.depth_previous, repr(self.intrinsics)
 
     def warp_back(self, current: Grey) -> Grey:
         """The later image ``(H, W)`` warped to the earlier one, equal to it where the prediction is right."""

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from slam.config.sections import GeometryConfig
 from slam.frames import Frame, Grey
-from slam.frontend.visual.predicted_flow import Pixels, PredictedFlow
+from slam.frontend.sparse_flow import Pixels, are_inside, lucas_kanade, new_corners
+from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.cache import Answer, GetOrCompute, without_cache
 
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
-_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+_LIMITS = 30, 0.01  # most iterations, and the shift in pixels below which they end
+_CORNER_BLOCK_PX = 5
 _CORNER_QUALITY = 0.003  # least corner strength over that of the strongest corner
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
 _PYRAMID_LEVELS = 4  # image pyramid levels above the full image
@@ -63,14 +64,8 @@ class TrackerState:
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(
-        self,
-        config: GeometryConfig,
-        get_or_compute: GetOrCompute = without_cache,
-        state: TrackerState | None = None,
-    ) -> None:
+    def __init__(self, config: GeometryConfig, state: TrackerState | None = None) -> None:
         self._config = config
-        self._get_or_compute = get_or_compute
         self._state = state or TrackerState({})
         self._frames_kept = config.rotation_baseline_steps + 2
 
@@ -101,15 +96,10 @@ class CornerTracker:
         tracked = np.isin(corners.track_ids, self._state.corners[following].track_ids)
         points, track_ids = corners.pixels[tracked], corners.track_ids[tracked]
 
-        def flow() -> Answer:
+        def find() -> Tracks:
             target = _warped(current.grey, _WINDOW_PX, predicted_flow)
             found = self._first_flow(previous.grey, current.grey, points, [target])
-            return found.pixels, found.kept
-
-        def find() -> Tracks:
-            settings = repr((_WINDOW_PX, _FORWARD_BACKWARD_PX))
-            given = previous, current, points, settings, *predicted_flow.given
-            pixels, kept = self._get_or_compute("flow across a baseline", given, flow)
+            pixels, kept = found.pixels, found.kept
             return Tracks(points[kept].astype(np.float64), pixels[kept].astype(np.float64), track_ids[kept])
 
         return find
@@ -118,22 +108,12 @@ class CornerTracker:
         self, first: Frame, second: Frame, points: Pixels, predicted_flow: PredictedFlow | None
     ) -> tuple[Pixels, NDArray[np.bool_]]:
         """Points ``(M, 2)`` tracked to the second frame, and which are reliable; with wide windows if few."""
-        config = self._config
-
-        def flow() -> Answer:
-            found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
-            if found.kept.sum() < config.few_corners:
-                exposed = _histogram_matched(second.grey, first.grey)
-                wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
-                found = max(found, wider, key=lambda tracked: tracked.kept.sum())
-            return found.pixels, found.kept
-
-        windows = _WINDOW_PX, _WIDE_WINDOW_PX, config.few_corners
-        settings = repr((*windows, _PYRAMID_LEVELS, _FORWARD_BACKWARD_PX))
-        predicted = () if predicted_flow is None else predicted_flow.given
-        given = (first, second, points, settings, *predicted)
-        pixels, kept = self._get_or_compute("optical flow", given, flow)
-        return pixels, kept
+        found = self._flow(first.grey, second.grey, points, _WINDOW_PX, predicted_flow)
+        if found.kept.sum() < self._config.few_corners:
+            exposed = _histogram_matched(second.grey, first.grey)
+            wider = self._flow(first.grey, exposed, points, _WIDE_WINDOW_PX, predicted_flow)
+            found = max(found, wider, key=lambda tracked: tracked.kept.sum())
+        return found.pixels, found.kept
 
     def _filled(self, frame: Frame, arrived: Corners) -> Corners:
         """Keep the corners tracked to a frame, and new ones up to the largest number."""
@@ -141,10 +121,7 @@ class CornerTracker:
         pixels, track_ids = arrived.pixels, arrived.track_ids
         room = config.max_corners - len(pixels)
         if room > 0:
-            settings = repr((room, _CORNER_QUALITY, config.corner_spacing_px))
-            (fresh,) = self._get_or_compute(
-                "new corners", (frame, pixels, settings), lambda: (self._detected(frame.grey, pixels, room),)
-            )
+            fresh = new_corners(frame.grey, pixels, room, _CORNER_QUALITY, config.corner_spacing_px, _CORNER_BLOCK_PX)
             pixels = np.concatenate([pixels, fresh])
             track_ids = np.concatenate([track_ids, next_id + np.arange(len(fresh))])
             next_id += len(fresh)
@@ -153,13 +130,6 @@ class CornerTracker:
         known = {**self._state.corners, frame.index: corners}
         self._state = replace(self._state, corners={index: known[index] for index in kept}, next_track_id=next_id)
         return corners
-
-    def _detected(self, grey: Grey, pixels: Pixels, room: int) -> Pixels:
-        """At most ``room`` corners ``(M, 2)`` away from those tracked."""
-        config = self._config
-        free = _away_from(pixels, int(config.corner_spacing_px), grey.shape)
-        corners = cv2.goodFeaturesToTrack(grey, room, _CORNER_QUALITY, config.corner_spacing_px, mask=free, blockSize=5)
-        return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
 
     def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
@@ -176,17 +146,16 @@ class CornerTracker:
             tried = np.flatnonzero(~kept)
             if len(tried) == 0:
                 break
-            forward, found = _lucas_kanade(first, target.image, points[tried], target)
+            window = target.side, target.levels, _LIMITS
+            forward, found = lucas_kanade(first, target.image, points[tried], *window)
             tried, forward = tried[found], forward[found]
             if len(tried) == 0:
                 continue
-            backward, found_back = _lucas_kanade(target.image, first, forward, target)
+            backward, found_back = lucas_kanade(target.image, first, forward, *window)
             error = np.abs(backward - points[tried]).max(axis=1)
             returned = found_back & (error < _FORWARD_BACKWARD_PX)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
-        height, width = second.shape
-        inside = (pixels >= 0).all(axis=1) & (pixels <= [width - 1, height - 1]).all(axis=1)
-        return _Tracked(pixels, kept & inside)
+        return _Tracked(pixels, kept & are_inside(pixels, second.shape))
 
 
 @dataclass(frozen=True)
@@ -207,37 +176,12 @@ def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
     return _Target(predicted_flow.warp_back(second), side, _PREDICTED_LEVELS, predicted_flow.in_current)
 
 
-def _lucas_kanade(start: Grey, end: Grey, pixels: Pixels, target: _Target) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Tracked pixels ``(M, 2)``, and which of them were found."""
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        start,
-        end,
-        pixels.reshape(-1, 1, 2),
-        None,
-        winSize=(target.side, target.side),
-        maxLevel=target.levels,
-        criteria=_CRITERIA,
-    )
-    return moved.reshape(-1, 2), status.ravel().astype(bool)
-
-
 @dataclass(frozen=True)
 class _Tracked:
     """Tracked points ``(M, 2)``, and which of them are reliable ``(M,)``."""
 
     pixels: Pixels
     kept: NDArray[np.bool_]
-
-
-def _away_from(pixels: Pixels, radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A mask ``(H, W)``, zero within ``radius`` of pixels ``(M, 2)`` inside of it."""
-    height, width = shape[0] + 2 * radius, shape[1] + 2 * radius
-    disc = np.zeros((2 * radius + 1,) * 2, np.uint8)
-    rows, columns = np.nonzero(cv2.circle(disc, (radius, radius), radius, 1, -1))
-    u, v = np.rint(pixels).astype(np.int64).T
-    mask = np.full(height * width, 255, np.uint8)
-    mask[np.add.outer(v * width + u, rows * width + columns)] = 0
-    return mask.reshape(height, width)[radius : height - radius, radius : width - radius]
 
 
 def _histogram_matched(grey: Grey, other: Grey) -> Grey:

@@ -8,7 +8,7 @@ usual direction of motion.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -28,7 +28,6 @@ from slam.frontend.visual.moving_regions import moving_corners
 from slam.frontend.visual.residuals import Residuals, tangent_of
 from slam.geometry.robust import mad_sigma, weighted_median
 from slam.geometry.se3 import FloatArray
-from slam.runtime.storage.cache import Answer, GetOrCompute, Given, without_cache
 
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
@@ -94,16 +93,9 @@ class TwoViewEstimate:
 class TwoViewEstimator:
     """Estimates the motions of one drive; stateless, the history is an argument."""
 
-    def __init__(
-        self,
-        config: GeometryConfig,
-        focal_px: float,
-        get_or_compute: GetOrCompute = without_cache,
-        seed: int = 0,
-    ) -> None:
+    def __init__(self, config: GeometryConfig, focal_px: float, seed: int = 0) -> None:
         self._config = config
         self._focal_px = focal_px
-        self._get_or_compute = get_or_compute
         self._seed = seed
 
     def estimate(self, matches: Matches, history: MotionHistory) -> TwoViewEstimate | None:
@@ -134,61 +126,23 @@ class TwoViewEstimator:
         return self._refined(matches, start, prior)
 
     def _by_essential(self, first: FloatArray, second: FloatArray) -> UnitRelativePose | None:
-        tolerance = INLIER_PX / self._focal_px
-        given = first, second, repr((tolerance, self._seed))
-        return self._cached_unit_pose(
-            "motion by essential matrix", given, lambda: unit_pose_by_essential(first, second, tolerance, self._seed)
-        )
+        return unit_pose_by_essential(first, second, INLIER_PX / self._focal_px, self._seed)
 
     def _by_pnp(self, first: FloatArray, second: FloatArray, depth: FloatArray) -> UnitRelativePose | None:
-        tolerance = _RESECTION_PX / self._focal_px
-        given = first, second, depth, repr((tolerance, self._seed))
-        return self._cached_unit_pose(
-            "motion by PnP", given, lambda: unit_pose_by_pnp(first, second, depth, tolerance, self._seed)
-        )
-
-    def _cached_unit_pose(
-        self, kind: str, given: tuple[Given, ...], find: Callable[[], UnitRelativePose | None]
-    ) -> UnitRelativePose | None:
-        def answer() -> Answer:
-            found = find()
-            return () if found is None else (found.R_current_previous, found.direction)
-
-        known = self._get_or_compute(kind, given, answer)
-        return UnitRelativePose(*known) if known else None
+        return unit_pose_by_pnp(first, second, depth, _RESECTION_PX / self._focal_px, self._seed)
 
     def _residuals(self, matches: Matches) -> Residuals:
         return Residuals(matches.rays_previous, matches.rays_current, matches.depth_previous, self._focal_px)
 
     def _refined(self, matches: Matches, start: UnitRelativePose | None, prior: MotionPrior) -> TwoViewEstimate | None:
-        if start is None:
-            return None
-
-        def refine() -> Answer:
-            found = self._fitted(matches, start, prior)
-            if found is None:
-                return ()
-            unit_pose = found.unit_pose
-            return unit_pose.R_current_previous, unit_pose.direction, found.covariance, found.inliers, found.agreeing
-
-        settings = repr((prior.axis_sigma, INLIER_PX, _ALONG_PX, self._focal_px))
-        depth = matches.depth_previous, matches.depth_sigma
-        corners = (matches.rays_previous, matches.rays_current, *depth, matches.weights)
-        begin = (start.R_current_previous, start.direction, prior.axis)
-        known = self._get_or_compute("two-view refinement", (*corners, *begin, settings), refine)
-        if not known:
-            return None
-        R_current_previous, direction, covariance, inliers, agreeing = known
-        unit_pose = UnitRelativePose(R_current_previous, direction)
-        return TwoViewEstimate(unit_pose, covariance, inliers.astype(bool), agreeing.astype(bool))
-
-    def _fitted(self, matches: Matches, start: UnitRelativePose, prior: MotionPrior) -> TwoViewEstimate | None:
         """Gauss-Newton with Cauchy weights over rotation, direction and the length in the unit of learned depth.
 
         Across its epipolar line a corner has the noise of the image, along it that of learned depth. A corner with
         parallax is an inlier whatever its learned depth says: its own shift is the better measurement. Without parallax
         the corner is far away or moves along with the camera, which learned depth alone can tell apart.
         """
+        if start is None:
+            return None
         residuals = self._residuals(matches)
         begin = self._length(matches, start, residuals)
         if begin is None:

@@ -13,7 +13,7 @@ from slam.frontend.gap_interpolation import equal_step
 from slam.geometry.se3 import FloatArray, invert
 
 
-def led_through(
+def join_gap_ends(
     interpolated: Sequence[RelativePose],
     measured: Sequence[RelativePose],
     by_map: Sequence[RelativePose],

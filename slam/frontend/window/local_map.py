@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import WindowConfig
-from slam.frames import DepthMap, Grey, Intrinsics
+from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
+from slam.frontend.sparse_flow import Pixels
 from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.frontend.window.descriptors import Descriptors
-from slam.frontend.window.flow import Pixels, flow, new_corners
+from slam.frontend.window.flow import flow
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.geometry.triangulation import triangulate
 
@@ -36,7 +36,6 @@ _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
-CORNER_SPACING_PX = 12.0  # least distance between corners, pixels
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
 
 
@@ -58,10 +57,7 @@ class WindowKeyframe:
 
     def with_depth(self, depth: DepthMap) -> WindowKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
-        height, width = depth.shape
-        u = np.clip(np.rint(self.pixels[:, 0]).astype(np.int64), 0, width - 1)
-        v = np.clip(np.rint(self.pixels[:, 1]).astype(np.int64), 0, height - 1)
-        return replace(self, learned_depth=depth[v, u].astype(np.float64))
+        return replace(self, learned_depth=nearest_depth(depth, self.pixels))
 
     def without(self, gone: TrackIds) -> WindowKeyframe:
         """The same without some tracks."""
@@ -76,12 +72,6 @@ class WindowKeyframe:
             learned_depth=self.learned_depth[rows],
             descriptors=self.descriptors[rows],
         )
-
-
-def corners_of(grey: Grey, config: WindowConfig) -> Pixels:
-    """Corners ``(M, 2)`` of an image without tracks."""
-    none = np.zeros((0, 2), np.float32)
-    return new_corners(grey, none, config.max_corners, CORNER_SPACING_PX)
 
 
 @dataclass

@@ -16,17 +16,13 @@ from numpy.typing import NDArray
 
 from slam.config.sections import WindowConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
+from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
 from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.window.descriptors import describe
-from slam.frontend.window.flow import Pixels, flow, new_corners
+from slam.frontend.window.flow import flow, new_corners
 from slam.frontend.window.initialisation import View, first_points
-from slam.frontend.window.local_map import (
-    CORNER_SPACING_PX,
-    LocalMap,
-    TrackIds,
-    WindowKeyframe,
-)
+from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
 from slam.geometry.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
@@ -288,7 +284,7 @@ class WindowOdometry:
             pixels = local.aligned(frame.grey, T, track_ids, pixels, intrinsics)
             again, found = local.found_again(frame.grey, T, track_ids, intrinsics)
             track_ids, pixels = np.concatenate([track_ids, again]), np.concatenate([pixels, found])
-        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels), CORNER_SPACING_PX)
+        fresh = new_corners(frame.grey, pixels, config.max_corners - len(pixels))
         track_ids = np.concatenate([track_ids, local.new_tracks(len(fresh))])
         pixels = np.concatenate([pixels, fresh])
         order = np.argsort(track_ids)

@@ -24,13 +24,18 @@ _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 
 @dataclass(frozen=True)
 class WindowPoses:
-    """Relative ``poses`` and ``loops``, unscaled, and the segment of every frame that has a pose, by frame."""
+    """Relative ``poses`` and ``loops`` in the units of their maps.
+
+    ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units`` the unit of learned
+    depth per unit of each map, by its number.
+    """
 
     poses: Sequence[RelativePose] = ()
     segments: Mapping[int, int] = field(default_factory=dict)
     loops: Sequence[RelativePose] = ()
+    learned_units: Mapping[int, float] = field(default_factory=dict)
 
-    def within(self, pose: RelativePose) -> bool:
+    def is_inside(self, pose: RelativePose) -> bool:
         """Whether both frames of a measurement have poses in one map."""
         first, last = (self.segments.get(frame) for frame in pose.ends)
         return first is not None and first == last
@@ -54,7 +59,7 @@ class WindowPoses:
 def window_poses(
     maps: Sequence[Segment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
 ) -> WindowPoses:
-    """All relative poses of some maps, in the unit of learned depth.
+    """All relative poses of some maps.
 
     Args:
         maps: of one drive.
@@ -65,23 +70,24 @@ def window_poses(
     poses: list[RelativePose] = []
     closing: dict[Ends, RelativePose] = {}
     segments: dict[int, int] = {}
+    units: dict[int, float] = {}
     for number, segment in enumerate(part for part in maps if part.started):
         found = _segment_poses(segment, intrinsics, seed)
         poses += found
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
+        units[number] = learned_unit(segment.map)
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
-    return WindowPoses(poses, segments, [closing[ends] for ends in loops])
+    return WindowPoses(poses, segments, [closing[ends] for ends in loops], units)
 
 
 def _segment_poses(segment: Segment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
-    local = segment.map
-    unit, keyframes = learned_unit(local), local.keyframes
+    local, keyframes = segment.map, segment.map.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
     found: list[RelativePose] = []
     for before, after in pairwise(keyframes):
         seen = _seen_from(local, after.track_ids, after.pixels, after.T_camera_world, intrinsics, seed)
         sigmas = None if seen is None else seen[1]
-        found.append(_relative(before, after.index, after.T_camera_world, sigmas, unit))
+        found.append(_relative(before, after.index, after.T_camera_world, sigmas))
     T_guess = keyframes[0].T_camera_world
     for frame in segment.frames:
         if frame.index in place:
@@ -93,13 +99,13 @@ def _segment_poses(segment: Segment, intrinsics: Intrinsics, seed: int) -> list[
         if located is not None:
             T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
-            found.append(_relative(nearest, frame.index, T_guess, sigmas, unit))
+            found.append(_relative(nearest, frame.index, T_guess, sigmas))
     return found
 
 
 def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, seed: int) -> dict[Ends, RelativePose]:
     """Between keyframes of this map, their sigmas by the points that both see."""
-    unit, keyframes = learned_unit(local), {keyframe.index: keyframe for keyframe in local.keyframes}
+    keyframes = {keyframe.index: keyframe for keyframe in local.keyframes}
     found = {}
     for first, last in loops:
         if first not in keyframes or last not in keyframes:
@@ -108,7 +114,7 @@ def _loop_poses(local: LocalMap, loops: Sequence[Ends], intrinsics: Intrinsics, 
         both = np.isin(after.track_ids, before.track_ids)
         T = after.T_camera_world
         seen = _seen_from(local, after.track_ids[both], after.pixels[both], T, intrinsics, seed)
-        pose = _relative(before, last, T, None if seen is None else seen[1], unit)
+        pose = _relative(before, last, T, None if seen is None else seen[1])
         found[first, last] = replace(pose, source=LOOP_SOURCE)
     return found
 
@@ -144,15 +150,11 @@ def _seen_from(
 
 
 def _relative(
-    keyframe: WindowKeyframe,
-    index: int,
-    T_camera_world: FloatArray,
-    sigmas: FloatArray | None,
-    unit: float,
+    keyframe: WindowKeyframe, index: int, T_camera_world: FloatArray, sigmas: FloatArray | None
 ) -> RelativePose:
     """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
     floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
     own = 10.0 * floors if sigmas is None else sigmas
-    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), WINDOW_SOURCE).scaled(unit)
+    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), WINDOW_SOURCE)

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import scipy
 
-# what computes cached results: networks, and measurements in the pass over the frames
-_ROOTS = ("slam.prediction.assembly", "slam.pipeline.batch")
+_ROOT = "slam.prediction.assembly"  # it computes all cached results: outputs of networks
 _PACKAGES = ("slam", "erfsfm")
 
 
@@ -37,7 +36,7 @@ def fingerprint(root: Path) -> str:
 def sources(root: Path) -> list[Path]:
     """Files behind cached results: all that compute them, and all of both packages that these import."""
     found: dict[str, Path] = {}
-    waiting = list(_ROOTS)
+    waiting = [_ROOT]
     while waiting:
         name = waiting.pop()
         place = root.joinpath(*name.split("."))

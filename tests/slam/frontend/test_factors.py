@@ -91,9 +91,8 @@ def test_every_measurement_becomes_a_factor_in_the_unit_of_the_scale() -> None:
 def test_a_step_takes_its_own_length_also_where_it_skips_frames() -> None:
     """Learned depth makes every step three times too long; a step of one frame and one of three have own lengths."""
     wrong = drive(3.0 / METRES)
-    lengths = {(0, 1): np.linalg.norm(pose(0, 1).T_from_to[:3, 3]), (2, 5): np.linalg.norm(pose(2, 5).T_from_to[:3, 3])}
-    unscaled = {ends: float(length) / METRES for ends, length in lengths.items()}
-    found = {f.ends: f for f in factors(Drive(motions=motions(STEPS, wrong)), scale(unscaled))}
+    lengths = {ends: float(np.linalg.norm(pose(*ends).T_from_to[:3, 3])) for ends in ((0, 1), (2, 5))}
+    found = {f.ends: f for f in factors(Drive(motions=motions(STEPS, wrong)), scale(lengths))}
     for ends in lengths:
         np.testing.assert_allclose(found[ends].T_from_to, pose(*ends).T_from_to, atol=1e-9)
         assert found[ends].student_t_dof == STUDENT_T_DOF

@@ -171,7 +171,9 @@ def test_rejected_loops_have_the_unit_of_the_trajectory(monkeypatch: pytest.Monk
     loops = after.closures(Scale("none", unit, np.full(len(truth), 3.0), {}, "the networks' own unit"))
     measured = [loop for loop in loops.rejected if loop.T_from_to is not None]
     assert loops.accepted == () and len(measured) > 3
-    lengths = {pose.ends: np.linalg.norm(pose.T_from_to[:3, 3]) for pose in after.poses.poses}
+    poses = after.poses
+    learned = [pose.scaled(poses.learned_units[poses.segments[pose.to_index]]) for pose in poses.poses]
+    lengths = {pose.ends: np.linalg.norm(pose.T_from_to[:3, 3]) for pose in learned}
     true = {(a, b): np.linalg.norm(truth[a, :3, 3] - truth[b, :3, 3]) for a, b in lengths}
     units = [length / true[ends] for ends, length in lengths.items() if ends[0] < 30]
     for loop in measured:

@@ -54,8 +54,7 @@ def find(mode, measurements: tuple[Drive, list[RelativePose]], height_m: float |
 
 
 def lengths(scale: Scale) -> dict[Ends, float]:
-    """Lengths of steps in the mode's unit."""
-    return {ends: length.value * scale.per_frame[ends[0]] for ends, length in scale.lengths.items()}
+    return {ends: length.value for ends, length in scale.lengths.items()}
 
 
 def assert_lengths(scale: Scale, expected: dict[Ends, float], rtol: float) -> None:
@@ -77,10 +76,10 @@ def test_the_road_in_the_image_outweighs_the_learned_road(mode, unit_m, planes):
     assert scale.estimate.frames_used == len(STEPS_M) and scale.estimate.spread < 0.02
 
 
-def test_lengths_are_unscaled_and_have_sigmas():
+def test_lengths_are_in_the_unit_of_the_scale_and_have_sigmas():
     scale = find("camera-height", measured())
     for ends, length in scale.lengths.items():
-        assert length.value == pytest.approx(UNIT * metres(ends), rel=0.03)
+        assert length.value == pytest.approx(metres(ends), rel=0.03)
         assert 0 < length.relative_sigma <= 0.06 and length.relative_correlated_sigma >= length.relative_sigma
 
 
@@ -129,15 +128,15 @@ def test_steps_that_skip_frames_have_lengths_by_their_two_frames():
     assert_lengths(unscaled, {ends: UNIT * metres(ends) for ends in steps}, rtol=1e-6)
 
 
-def test_lengths_are_unscaled_by_the_unit_at_their_first_frames():
-    """The unit of learned depth drifts by a tenth; lengths by it alone are those of the motions."""
+def test_lengths_by_learned_depth_alone_have_the_unit_at_their_first_frames():
+    """The unit of learned depth drifts by a tenth."""
     steps = [(k, k + 3) for k in range(0, FRAMES - 1, 3)]
     drifting = np.linspace(1.0, 1.1, FRAMES)
     planes = [GroundPlane(HEIGHT_M * UNIT / unit, DOWN, 1.0) for unit in drifting]
     scale = find("camera-height", (replace(measured(road=False, steps=steps)[0], roads=planes), []))
     assert scale.per_frame[-1] > 1.03 * scale.per_frame[0]
     for ends in steps:
-        assert scale.lengths[ends].value == pytest.approx(UNIT * metres(ends), rel=1e-4)
+        assert scale.lengths[ends].value == pytest.approx(scale.per_frame[ends[0]] * UNIT * metres(ends), rel=1e-4)
 
 
 def test_a_step_inside_of_a_longer_one_is_no_link_and_has_no_length():

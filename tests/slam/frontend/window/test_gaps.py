@@ -5,7 +5,7 @@ import numpy as np
 from slam.config.sections import PoseGraphConfig
 from slam.frames import RelativePose
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.window.gaps import led_through
+from slam.frontend.window.gaps import join_gap_ends
 from slam.frontend.window.relative_poses import WINDOW_SOURCE
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 from slam.graph.pose_graph import PoseGraph
@@ -27,7 +27,7 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
     by_map = [relative(truth, a, b, 0.01, WINDOW_SOURCE) for a, b in pairwise(mapped)]
     guesses = [RelativePose(k, k + 1, step, np.full(6, 0.005), INTERPOLATED_SOURCE) for k in range(before - 1, after)]
     measured = [relative(truth, after, after + 1, 0.01, "essential")]
-    found = led_through(guesses, measured, by_map, dict.fromkeys(mapped, 0))
+    found = join_gap_ends(guesses, measured, by_map, dict.fromkeys(mapped, 0))
     assert [pose.ends for pose in found] == [pose.ends for pose in guesses]
     graph = PoseGraph(PoseGraphConfig())
     graph.add_relative(*found, *measured, *by_map)
@@ -41,5 +41,5 @@ def test_a_gap_between_two_maps_stays_a_guess() -> None:
     guess = RelativePose(1, 2, np.eye(4), np.ones(6), INTERPOLATED_SOURCE)
     truth = from_rotation_vector(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
     by_map = [relative(truth, 0, 1, 0.01, WINDOW_SOURCE), relative(truth, 2, 3, 0.01, WINDOW_SOURCE)]
-    (found,) = led_through([guess], [], by_map, {0: 0, 1: 0, 2: 1, 3: 1})
+    (found,) = join_gap_ends([guess], [], by_map, {0: 0, 1: 0, 2: 1, 3: 1})
     assert found is guess

@@ -24,7 +24,8 @@ _STREET_DEPTH_M = 15.0  # median depth of a street
 class KeyframeDepth:
     """A keyframe's image ``(H, W, 3)``, the network's depth ``(H, W)`` in the unit of the trajectory, and that refined.
 
-    ``unbiased`` is the network's depth without the bias that was measured on the drive. ``refined`` is None where refinement is switched off or no neighbour is at a useful distance.
+    ``unbiased`` is the network's depth without the bias that was measured on the drive. ``refined`` is None where
+    refinement is switched off or no neighbour is at a useful distance.
     """
 
     index: int

@@ -50,6 +50,7 @@ PNP_SOURCE = "pnp"
 STILL_SOURCE = "still"
 _MIN_RATIOS = 8
 _PNP_ITERATIONS = 200
+_LEAST_PNP_SHARE = 0.5  # of the corners: what fewer agree on is chance
 _LEARNED_RELATIVE_SIGMA = 0.1
 _LEARNED_LENGTH_RELATIVE_SIGMA = 0.05
 # least rotation sigma of a standing camera and of PnP
@@ -315,8 +316,9 @@ class VisualOdometry:
         pixels, K = tracks.current[known], self._intrinsics.K
         found = consensus(points_previous, pixels, K, _PNP_ITERATIONS, _REPROJECTION_PX, self._seed)
         count = 0 if found is None else len(found[2])
-        if found is None or count < self._config.min_inliers:
-            return MeasurementFailure(f"little parallax, and only {count} corners agree with the learned depth")
+        if found is None or count < max(self._config.min_inliers, _LEAST_PNP_SHARE * len(pixels)):
+            known_corners = f"{count} of {len(pixels)} corners"
+            return MeasurementFailure(f"little parallax, and only {known_corners} agree with the learned depth")
         resection = refine(points_previous, pixels, K, found)
         length = float(np.linalg.norm(resection.T_camera_points[:3, 3]))
         # errors of corners are correlated, and so are those of learned depth

@@ -35,7 +35,6 @@ from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionChec
 from slam.pipeline.doubts import warn_of_another_place, warn_of_doubts
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
-from slam.pipeline.keyframe_tracking import decided
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
@@ -80,8 +79,7 @@ class SlamPipeline:
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
         self._noise = noise
-        self._sequence, self._predictor = sequence, predictor
-        self._config = decided(config, sequence.camera_height_m)
+        self._sequence, self._predictor, self._config = sequence, predictor, config
         self._progress = progress or (lambda stage, done, total: None)
         self._checkpoint = checkpoint
         self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
@@ -250,6 +248,7 @@ class SlamPipeline:
             examples,
             self._seed,
             state,
+            self._sequence.camera_height_m,
         )
         ahead = read_ahead(partial(read_frame, self._sequence), range(first, total))
         with observer, closing(ahead) as read:

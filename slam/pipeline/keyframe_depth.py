@@ -3,43 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from erfsfm.mvs.refine import RefinedDepth, Road
+from erfsfm.mvs.refine import Road
 from slam.config.sections import DepthConfig, MappingConfig
-from slam.frames import DepthMap, Image, Intrinsics
+from slam.frames import DepthMap, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
+from slam.mapping.filters import KeyframeDepth
 
 _SOME = 20
 _STREET_DEPTH_M = 15.0  # median depth of a street
-
-
-@dataclass(frozen=True)
-class KeyframeDepth:
-    """A keyframe's image ``(H, W, 3)``, the network's depth ``(H, W)`` in the unit of the trajectory, and that refined.
-
-    ``refined`` is None where refinement is switched off or no neighbour is at a useful distance.
-    """
-
-    index: int
-    image: Image
-    depth: DepthMap
-    refined: RefinedDepth | None
-
-    @property
-    def best(self) -> DepthMap:
-        """The depth to fuse: refined where it was."""
-        return self.depth if self.refined is None else self.refined.depth
-
-    @property
-    def relative_sigma(self) -> DepthMap | None:
-        """Sigma of the depth to fuse, relative to it; None where it is the network's, which states none."""
-        return None if self.refined is None else self.refined.relative_sigma
 
 
 class KeyframeDepths:
@@ -64,7 +41,7 @@ class KeyframeDepths:
         """
         self._keyframes: Sequence[Keyframe] = drive.keyframes
         self._roads = drive.roads
-        self._scale = scale_per_frame
+        self._scale, self._T_world_camera = scale_per_frame, T_world_camera
         self._refiner: DepthRefiner | None = None
         if config.refine == "multiview":
             indices = [keyframe.index for keyframe in self._keyframes]
@@ -83,7 +60,7 @@ class KeyframeDepths:
         return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
     def at(self, n: int) -> KeyframeDepth:
-        """The n-th keyframe."""
+        """The n-th keyframe in the unit of the trajectory; without a sigma where its depth was not refined."""
         keyframe = self._keyframes[n]
         scale, depth = float(self._scale[keyframe.index]), self._of_network(keyframe)
         refined = None
@@ -91,7 +68,10 @@ class KeyframeDepths:
             plane = self._roads[keyframe.index]
             road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
             refined = self._refiner.refine(n, depth, road)
-        return KeyframeDepth(keyframe.index, keyframe.image, depth, refined)
+        image, pose = keyframe.image, self._T_world_camera[keyframe.index]
+        if refined is None:
+            return KeyframeDepth(keyframe.index, depth, None, image, pose)
+        return KeyframeDepth(keyframe.index, refined.depth, refined.relative_sigma, image, pose, depth)
 
     def _of_network(self, keyframe: Keyframe) -> DepthMap:
         return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

@@ -23,8 +23,8 @@ from erfsfm.inference import DepthPosePredictor, save_image
 from slam.config.sections import load_config
 from slam.frames import DepthMap, Image
 from slam.frames import Sequence as FrameSequence
+from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.batch import SlamPipeline
-from slam.pipeline.keyframe_depth import KeyframeDepth
 from slam.prediction.networks import NetworkPredictor
 from slam.results.depth import true_depth
 from slam.runtime.errors import SlamError
@@ -75,11 +75,11 @@ def run(drive: FrameSequence, weights: str, settings: Sequence[str], compare: Ca
 def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Shown], keyframe: KeyframeDepth) -> None:
     """Keep a keyframe's maps and errors."""
     depths = {name: keyframe.depth}
-    if keyframe.refined is not None:
-        depths[f"{name}, refined"] = keyframe.refined.depth
-    truth = true_depth(drive, keyframe.index)
-    before = shown.get(keyframe.index)
-    shown[keyframe.index] = Shown(keyframe.image, (before.depths if before else {}) | depths, truth)
+    if keyframe.network_depth is not None:
+        depths = {name: keyframe.network_depth, f"{name}, refined": keyframe.depth}
+    truth = true_depth(drive, keyframe.frame)
+    before = shown.get(keyframe.frame)
+    shown[keyframe.frame] = Shown(keyframe.image, (before.depths if before else {}) | depths, truth)
     if truth is None:
         return
     known = (truth >= EDGES_M[0]) & (truth < EDGES_M[-1])

@@ -13,6 +13,7 @@ import numpy as np
 
 from slam.config.sections import load_config
 from slam.evaluation.map import compare, statistics
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.results.map_error import HasTrueDepth
 from slam.results.map_error import find_truth as surface_of
@@ -46,7 +47,7 @@ def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
         size = intrinsics.width, intrinsics.height
         depth = cv2.resize(sequence.true_depth(frame).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)
-        tsdf_map.integrate(depth, image, sequence.reference[frame], exact, frame)
+        tsdf_map.integrate(KeyframeDepth(frame, depth, exact, image, sequence.reference[frame]))
     found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points_world})
     numbers = statistics(found.distances["map"])
     score = numbers["f_score"]

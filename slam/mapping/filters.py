@@ -22,14 +22,19 @@ FILTERS = ("unknown", "border", "bonnet", "sky", "range", "sigma", "edge", "agre
 
 
 @dataclass(frozen=True)
-class DepthView:
-    """A frame: depth ``(H, W)`` with 0 where unknown, its relative sigma or None, its image and pose."""
+class KeyframeDepth:
+    """A frame to fuse: depth ``(H, W)``, not positive where unknown, its relative sigma or None, its image and pose.
+
+    The depth was refined where it has a sigma. ``network_depth`` ``(H, W)`` is the network's own, None where that is
+    the depth to fuse.
+    """
 
     frame: int
     depth: DepthMap
     relative_sigma: DepthMap | None
     image: Image
     T_world_camera: FloatArray
+    network_depth: DepthMap | None = None
 
 
 class DepthFilters:
@@ -54,7 +59,7 @@ class DepthFilters:
         """The share of all pixels that each filter took from what those before it left."""
         return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
 
-    def kept(self, view: DepthView, other: DepthView | None) -> DepthMap:
+    def kept(self, view: KeyframeDepth, other: KeyframeDepth | None) -> DepthMap:
         """The depth to fuse ``(H, W)``, 0 elsewhere; ``other`` sees the same place from another position."""
         config, depth = self._config, view.depth
         everything = np.ones(depth.shape, dtype=bool)
@@ -80,13 +85,13 @@ class DepthFilters:
         self._frames += 1
         return np.where(left, depth, np.float32(0))
 
-    def trusted(self, view: DepthView) -> DepthMap:
+    def trusted(self, view: KeyframeDepth) -> DepthMap:
         """Depth with 0 where its sigma is too large."""
         if view.relative_sigma is None:
             return view.depth
         return np.where(view.relative_sigma <= self._config.max_relative_sigma, view.depth, np.float32(0))
 
-    def projected(self, view: DepthView, other: DepthView) -> tuple[DepthMap, DepthMap, DepthMap]:
+    def projected(self, view: KeyframeDepth, other: KeyframeDepth) -> tuple[DepthMap, DepthMap, DepthMap]:
         """Columns, rows and depth ``(H, W)`` of a view's pixels in the other; unknown ones lie outside of it."""
         T_other_camera = (invert(other.T_world_camera) @ view.T_world_camera).astype(np.float32)
         K = self._camera.K.astype(np.float32)
@@ -114,7 +119,7 @@ class DepthFilters:
         found: Mask = sky & is_above[piece]
         return found
 
-    def _agrees(self, view: DepthView, other: DepthView) -> Mask:
+    def _agrees(self, view: KeyframeDepth, other: KeyframeDepth) -> Mask:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import tempfile
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import MappingConfig
-from slam.frames import DepthMap, Image, Intrinsics
+from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
-from slam.mapping.filters import DepthFilters, DepthView
+from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
 from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
@@ -73,7 +73,7 @@ class _Stretch:
     length: float = 0.0
     position: FloatArray | None = None
 
-    def moved_to(self, position: FloatArray) -> None:
+    def add(self, position: FloatArray) -> None:
         """Count a fused frame."""
         if self.position is not None:
             self.length += float(np.linalg.norm(position - self.position))
@@ -100,7 +100,7 @@ class TsdfMap:
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
         remove_submaps(self._folder)  # of a run that was killed here
-        self._previous: DepthView | None = None
+        self._previous: KeyframeDepth | None = None
         self._first: int | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None
@@ -108,34 +108,21 @@ class TsdfMap:
         self._fused = 0
         self._surface: MapSurface | None = None
 
-    def integrate(
-        self,
-        depth: DepthMap,
-        image: Image,
-        T_world_camera: FloatArray,
-        relative_sigma: DepthMap | None = None,
-        frame: int = 0,
-    ) -> None:
+    def integrate(self, keyframe: KeyframeDepth) -> None:
         """Filter a depth map, also by the previous keyframe, and fuse it; skip it if the camera hardly moved.
-
-        Args:
-            depth: metric z-depth ``(H, W)`` at the size of the intrinsics, not positive where unknown.
-            image: its image ``(H, W, 3)`` uint8 RGB.
-            T_world_camera: its pose.
-            relative_sigma: of the depth, relative to it ``(H, W)``; None where it is not known.
-            frame: its number.
 
         Raises:
             RunError: a submap cannot be written.
         """
+        depth, image = keyframe.depth, keyframe.image
         if depth.shape != self._size or image.shape != (*self._size, 3):
             raise ValueError(f"depth and image must be {self._size}; got {depth.shape} and {image.shape}")
         known = np.isfinite(depth) & (depth > 0)
         known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
-        view = DepthView(frame, known_depth, relative_sigma, image, T_world_camera)
+        view = replace(keyframe, depth=known_depth, network_depth=None)
         previous = self._previous
         if previous is None:
-            self._first, self._previous = frame, view
+            self._first, self._previous = view.frame, view
         elif self._has_moved(view.T_world_camera, previous.T_world_camera):
             if not self._first_is_fused:
                 self._fuse(previous, view)
@@ -220,7 +207,7 @@ class TsdfMap:
         config = self._config
         return moved >= config.keyframe_distance_m or turned >= np.deg2rad(_KEYFRAME_ROTATION_DEG)
 
-    def _fuse(self, view: DepthView, other: DepthView | None) -> None:
+    def _fuse(self, view: KeyframeDepth, other: KeyframeDepth | None) -> None:
         """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
         kept = self._filters.kept(view, other)
         config = self._config
@@ -231,7 +218,7 @@ class TsdfMap:
         if not stretch.fusion.integrate(kept, view.T_world_camera):
             return
         self._views.add(view, kept)
-        stretch.moved_to(view.T_world_camera[:3, 3])
+        stretch.add(view.T_world_camera[:3, 3])
         self._fused += 1
         self._surface = None
         is_large = stretch.fusion.blocks * _BLOCK_MB >= _FUSION_SHARE * config.memory_mb

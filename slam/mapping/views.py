@@ -10,7 +10,7 @@ import numpy as np
 
 from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
-from slam.mapping.filters import DepthFilters, DepthView, sampled
+from slam.mapping.filters import DepthFilters, KeyframeDepth, sampled
 
 _STEP = 0.1  # of the largest fused depth
 _STEP_DEG = 10.0
@@ -23,7 +23,7 @@ _BRIGHT = 247.0
 
 @dataclass(frozen=True)
 class _Candidate:
-    view: DepthView
+    view: KeyframeDepth
     sharpness: float
 
 
@@ -33,13 +33,13 @@ class ViewChooser:
     def __init__(self, filters: DepthFilters, depth_max_m: float) -> None:
         """Of the camera of these filters; ``depth_max_m`` is the largest fused depth."""
         self._filters, self._step_m = filters, _STEP * depth_max_m
-        self._chosen: list[DepthView] = []
+        self._chosen: list[KeyframeDepth] = []
         self._steps: list[float] = []
         self._begin: FloatArray | None = None
         self._best: _Candidate | None = None
-        self._last: DepthView | None = None
+        self._last: KeyframeDepth | None = None
 
-    def add(self, view: DepthView, kept: DepthMap) -> None:
+    def add(self, view: KeyframeDepth, kept: DepthMap) -> None:
         """A fused frame with the depth that passed the filters."""
         if self._begin is not None and self._is_far(view.T_world_camera, self._begin):
             self._close()
@@ -47,7 +47,7 @@ class ViewChooser:
             self._begin = view.T_world_camera
         sharpness = _sharpness(view.image)
         if self._best is None or sharpness > self._best.sharpness:
-            self._best = _Candidate(DepthView(view.frame, kept, None, view.image, view.T_world_camera), sharpness)
+            self._best = _Candidate(KeyframeDepth(view.frame, kept, None, view.image, view.T_world_camera), sharpness)
 
     def take(self, camera: Intrinsics) -> dict[str, Any]:
         """The views since the last call, as fields of a `Submap`."""
@@ -77,7 +77,7 @@ class ViewChooser:
         turned = float(rotation_angle(T_other_camera[:3, :3]))
         return float(np.linalg.norm(T_other_camera[:3, 3])) >= self._step_m or turned >= np.deg2rad(_STEP_DEG)
 
-    def _brightness_step(self, view: DepthView, before: DepthView) -> float:
+    def _brightness_step(self, view: KeyframeDepth, before: KeyframeDepth) -> float:
         """Logarithm of the brightness of surfaces that two views share, over that in the one before."""
         u, v, z = self._filters.projected(view, before)
         same = np.abs(sampled(before.depth, u, v) - z) < _SAME_SURFACE * z

@@ -30,12 +30,12 @@ from slam.geometry.geodesy import GpsTrack
 from slam.geometry.se3 import FloatArray
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures, close_loops
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
 from slam.pipeline.doubts import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.keyframe_depth import KeyframeDepth, KeyframeDepths
-from slam.pipeline.keyframe_tracking import decided
+from slam.pipeline.keyframe_depth import KeyframeDepths
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.positioning import Location, Positioning
@@ -80,8 +80,7 @@ class SlamPipeline:
         if noise is None:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
         self._noise = noise
-        self._sequence, self._predictor = sequence, predictor
-        self._config = decided(config, sequence.camera_height_m)
+        self._sequence, self._predictor, self._config = sequence, predictor, config
         self._progress = progress or (lambda stage, done, total: None)
         self._checkpoint = checkpoint
         self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
@@ -131,7 +130,13 @@ class SlamPipeline:
         with self._watch.stage("lidar"):
             lidar = lidar_path(self._sequence)
         scale, factors, T_odometry = self._measure(drive, T_network, lidar)
-        loops = self._close_loops(drive, scale, T_odometry) if closure is None else closure.closures(scale)
+        views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
+        if closure is None:
+            with self._watch.stage("loops"):
+                camera, config = self._sequence.intrinsics, self._config.loops
+                loops = close_loops(views, T_odometry, camera, config, scale.is_metric, self._seed)
+        else:
+            loops = closure.closures(scale)
         graph, T_world_camera, location = self._optimise(scale, factors, T_odometry, loops)
         reference = self._sequence.reference
         return Estimate(
@@ -144,6 +149,7 @@ class SlamPipeline:
             state=state,
             scale=scale,
             factors=factors,
+            views=views,
             loops=loops.without(graph.dropped),
             graph=graph,
             location=location,
@@ -177,13 +183,6 @@ class SlamPipeline:
             closure = close_maps(drive.maps, self._sequence.intrinsics, self._config, self._seed)
         return drive.with_maps(closure.poses, closure.joins), closure
 
-    def _close_loops(self, drive: Drive, scale: Scale, T_odometry: FloatArray) -> LoopClosures:
-        """Loops among all views, after the last frame."""
-        with self._watch.stage("loops"):
-            scaled = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
-            intrinsics, config = self._sequence.intrinsics, self._config.loops
-            return close_loops(scaled, T_odometry, intrinsics, config, scale.is_metric, self._seed)
-
     def fuse(
         self,
         estimate: Estimate,
@@ -212,8 +211,7 @@ class SlamPipeline:
                 if compare is not None:
                     compare(keyframe)
                 with self._watch.stage("map"):
-                    pose, number = T_world_camera[keyframe.index], keyframe.index
-                    tsdf_map.integrate(keyframe.best, keyframe.image, pose, keyframe.relative_sigma, number)
+                    tsdf_map.integrate(keyframe)
                 self._progress("map", done, len(moved))
         return tsdf_map
 
@@ -251,6 +249,7 @@ class SlamPipeline:
             examples,
             self._seed,
             state,
+            self._sequence.camera_height_m,
         )
         ahead = read_ahead(partial(read_frame, self._sequence), range(first, total))
         with observer, closing(ahead) as read:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from slam.formats.trajectory import Trajectory
-from slam.frames import RelativePose
+from slam.frames import RelativePose, View
 from slam.frontend.drive import Drive
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
@@ -22,8 +22,9 @@ from slam.runtime.timing import Stopwatch
 class Estimate:
     """Trajectories with one row a frame, the factors and loops they fit, the graph, and the map once it is fused.
 
-    ``drive`` is completed, its rotations smoothed. ``state`` is that of the front end, for a run that continues this
-    one; frames before ``first`` are of earlier runs. ``location`` is None without a GPS track, and the reason where the
+    ``drive`` is completed, its rotations smoothed; the points of ``views`` are in the unit of the trajectories.
+    ``state`` is that of the front end, for a run that continues this one; frames before ``first`` are of earlier runs.
+    ``location`` is None without a GPS track, and the reason where the
     track cannot be used.
     """
 
@@ -36,6 +37,7 @@ class Estimate:
     state: FrontEndState
     scale: Scale
     factors: list[RelativePose]
+    views: list[View]
     loops: LoopClosures
     graph: PoseGraph
     location: Location | MeasurementFailure | None

@@ -3,46 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from erfsfm.mvs.refine import RefinedDepth, Road
+from erfsfm.mvs.refine import Road
 from slam.config.sections import DepthConfig, MappingConfig
-from slam.frames import DepthMap, Image, Intrinsics
+from slam.frames import DepthMap, Intrinsics
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
 from slam.geometry.se3 import FloatArray
 from slam.mapping.depth_refinement import DepthRefiner
+from slam.mapping.filters import KeyframeDepth
 
 _SOME = 20
 _STREET_DEPTH_M = 15.0  # median depth of a street
-
-
-@dataclass(frozen=True)
-class KeyframeDepth:
-    """A keyframe's image ``(H, W, 3)``, the network's depth ``(H, W)`` in the unit of the trajectory, and that refined.
-
-    ``unbiased`` is the network's depth without the bias that was measured on the drive. ``refined`` is None where
-    refinement is switched off or no neighbour is at a useful distance.
-    """
-
-    index: int
-    image: Image
-    depth: DepthMap
-    unbiased: DepthMap
-    refined: RefinedDepth | None
-
-    @property
-    def best(self) -> DepthMap:
-        """The depth to fuse: refined where it was."""
-        return self.unbiased if self.refined is None else self.refined.depth
-
-    @property
-    def relative_sigma(self) -> DepthMap | None:
-        """Sigma of the depth to fuse, relative to it; None where it is the network's, which states none."""
-        return None if self.refined is None else self.refined.relative_sigma
 
 
 class KeyframeDepths:
@@ -63,14 +38,13 @@ class KeyframeDepths:
             drive: with at least one keyframe.
             scale_per_frame: factor ``(N,)`` on unscaled depth.
             T_world_camera: poses of all frames ``(N, 4, 4)``.
-            error: of learned depth on this drive.
+            error: of learned depth on this drive, taken out before depth is refined or fused.
             intrinsics: of the keyframes.
             config: whether to refine.
         """
         self._keyframes: Sequence[Keyframe] = drive.keyframes
         self._roads = drive.roads
-        self._scale = scale_per_frame
-        self._error = error
+        self._scale, self._T_world_camera, self._error = scale_per_frame, T_world_camera, error
         self._refiner: DepthRefiner | None = None
         if config.refine == "multiview":
             indices = [keyframe.index for keyframe in self._keyframes]
@@ -89,7 +63,7 @@ class KeyframeDepths:
         return mapping.in_unit(float(np.median(medians)) / _STREET_DEPTH_M) if medians else mapping
 
     def at(self, n: int) -> KeyframeDepth:
-        """The n-th keyframe."""
+        """The n-th keyframe in the unit of the trajectory; without a sigma where its depth was not refined."""
         keyframe = self._keyframes[n]
         scale, learned = float(self._scale[keyframe.index]), keyframe.depth_unscaled
         depth, unbiased = learned * np.float32(scale), (self._error.corrected(learned) * scale).astype(np.float32)
@@ -98,7 +72,10 @@ class KeyframeDepths:
             plane = self._roads[keyframe.index]
             road = Road(plane.normal, plane.height_unscaled * scale) if isinstance(plane, GroundPlane) else None
             refined = self._refiner.refine(n, unbiased, road)
-        return KeyframeDepth(keyframe.index, keyframe.image, depth, unbiased, refined)
+        image, pose = keyframe.image, self._T_world_camera[keyframe.index]
+        if refined is None:
+            return KeyframeDepth(keyframe.index, unbiased, None, image, pose, depth)
+        return KeyframeDepth(keyframe.index, refined.depth, refined.relative_sigma, image, pose, depth)
 
     def _of_network(self, keyframe: Keyframe) -> DepthMap:
         return keyframe.depth_unscaled * np.float32(self._scale[keyframe.index])

@@ -1,13 +1,14 @@
-"""Whether a drive is measured by keyframes and bundle adjustment, and its poses by them."""
+"""Which front end measures a drive, and its poses by keyframes and bundle adjustment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice
+from typing import Literal
 
 import numpy as np
 
-from slam.config.sections import LoopsConfig, SlamConfig, WindowConfig
+from slam.config.sections import LoopsConfig, WindowConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.window.descriptors import describe
@@ -23,22 +24,32 @@ from slam.pipeline.map_closure import views_of
 _RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
+_DOUBTFUL = 4  # last frames that are repeated or unusable
 _DECISION_STEPS = 30  # triangulated steps after which auto decides
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 
 
-def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
-    """The configuration with ``window.use`` decided where a camera height is known, which says that there is a road.
+FrontEnd = Literal["steps", "both", "keyframes"]
 
-    Lengths from the road do not enter the window yet, and on roads they matter more than its longer baselines.
+
+def choose(config: WindowConfig, camera_height_m: float | None, drive: Drive) -> FrontEnd:
+    """What measures a drive: both, until its first steps show whether the camera is on a vehicle.
+
+    A known camera height says that there is a road. Lengths from the road do not enter the map of keyframes yet, and on
+    roads they matter more than its longer baselines.
     """
-    if config.window.use != "auto" or camera_height_m is None:
-        return config
-    return config.model_copy(update={"window": config.window.model_copy(update={"use": "never"})})
+    if config.use == "always":
+        return "keyframes"
+    if config.use == "never" or camera_height_m is not None:
+        return "steps"
+    is_on_vehicle = _is_on_vehicle(drive)
+    if is_on_vehicle is None:
+        return "both"
+    return "steps" if is_on_vehicle else "keyframes"
 
 
 class KeyframeTracking:
-    """Tracks keyframes: beside the steps until those say whether they are a vehicle's, then in place of one of both."""
+    """Tracks keyframes, for as long as steps alone are not chosen."""
 
     def __init__(
         self,
@@ -47,14 +58,14 @@ class KeyframeTracking:
         intrinsics: Intrinsics,
         seed: int,
         state: WindowState | None,
+        camera_height_m: float | None = None,
     ) -> None:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
         self._config, self._loops, self._intrinsics, self._seed = config, loops, intrinsics, seed
+        self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
-        self._is_carried = False
-        self._odometry: WindowOdometry | None = None
-        if config.use != "never" and state is not None:
-            self._odometry = WindowOdometry(config, intrinsics, seed, state)
+        self._front_end: FrontEnd = "steps" if state is None else "both"
+        self._odometry = None if state is None else WindowOdometry(config, intrinsics, seed, state)
 
     def state(self) -> WindowState | None:
         """The state to resume from."""
@@ -97,29 +108,19 @@ class KeyframeTracking:
         odometry.relocalise(frame, depth, found.T_camera_map, tracks, corners[found.corners[first]], place)
         self._places = None  # the new keyframe changes the map
 
-    def decide(self, drive: Drive) -> None:
-        """End the tracking where the first steps are those of a vehicle."""
-        if self._odometry is None or self._is_carried:
-            return
-        vehicle = False if self._config.use == "always" else is_vehicle(drive)
-        self._is_carried = vehicle is False
-        if vehicle:
+    def choose(self, drive: Drive) -> None:
+        """Choose what measures the frames that follow, until that is one of both."""
+        if self._front_end == "both":
+            self._front_end = choose(self._config, self._camera_height_m, drive)
+        if self._front_end == "steps":
             self._odometry = None
 
     def measures(self, drive: Drive, index: int) -> bool:
-        """Whether keyframes alone measure the motion to the last frame: not before the decision, nor beside a gap or a
-        repeated image."""
-        doubtful = {*drive.repeated[-1:], *list(drive.unusable)[-1:]}
-        if self._odometry is None or not self._is_carried or not doubtful.isdisjoint((index - 1, index)):
+        """Whether keyframes alone measure the motion to one of the last frames: not by a gap or a repeated image."""
+        doubtful = {*drive.repeated[-_DOUBTFUL:], *list(drive.unusable)[-_DOUBTFUL:]}
+        if self._odometry is None or self._front_end == "both" or not doubtful.isdisjoint((index - 1, index)):
             return False
         return self._odometry.locates(index - 1, index)
-
-    def measure_alone(self, drive: Drive, index: int) -> bool:
-        """Whether keyframes locate one of the last frames and no step was measured to it."""
-        if self._odometry is None or not self._is_carried:
-            return False
-        has_step = any(motion.ends[1] == index for motion in drive.motions[-_FRAMES:])
-        return not has_step and self._odometry.has_located(index)
 
     def is_keyframe(self, index: int) -> bool:
         """Whether the last frame is a keyframe."""
@@ -127,7 +128,7 @@ class KeyframeTracking:
 
     def step(self, index: int) -> tuple[int, FloatArray] | None:
         """The last located frame before this one, and ``T_before_frame`` unscaled; None where it has no pose."""
-        if self._odometry is None or not self._is_carried or not self._odometry.segments:
+        if self._odometry is None or self._front_end == "both" or not self._odometry.segments:
             return None
         segment = self._odometry.segments[-1]
         placed = [(f.index, f.T_camera_world) for f in segment.frames[-_FRAMES:] if f.index <= index]
@@ -140,9 +141,9 @@ class KeyframeTracking:
         return before, T_before_frame
 
     def maps(self, drive: Drive) -> tuple[Segment, ...]:
-        """All maps so far; none of a vehicle, nor before that is decided."""
-        self.decide(drive)
-        if self._odometry is None or not self._is_carried:
+        """All maps so far; none of a vehicle, nor before the choice."""
+        self.choose(drive)
+        if self._odometry is None or self._front_end == "both":
             return ()
         return tuple(segment.copy() for segment in self._odometry.segments if segment.started)
 
@@ -156,12 +157,7 @@ class KeyframeTracking:
         return window_poses(maps, self._intrinsics, self._seed)
 
 
-def has_keyframes(config: WindowConfig, drive: Drive) -> bool:
-    """Whether a drive of which this was measured is tracked by keyframes, so that its state has them."""
-    return config.use == "always" or (config.use == "auto" and is_vehicle(drive) is not True)
-
-
-def is_vehicle(drive: Drive) -> bool | None:
+def _is_on_vehicle(drive: Drive) -> bool | None:
     """Whether the first triangulated steps all go the same way, as seen from the camera; None while they are few."""
     triangulated = (motion for motion in drive.motions if motion.is_triangulated)
     first = [motion.relative_pose.T_from_to[:3, 3] for motion in islice(triangulated, _DECISION_STEPS)]

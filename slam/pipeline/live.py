@@ -21,7 +21,7 @@ from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.growing import GrowingSequence
-from slam.pipeline.keyframe_tracking import decided, has_keyframes
+from slam.pipeline.keyframe_tracking import choose
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
@@ -91,7 +91,7 @@ class Slam:
                 f"{sweep_frames} and {seed}"
             )
         without_map = config.mapping.model_copy(update={"enabled": False})
-        config = decided(config.model_copy(update={"mapping": without_map}), camera_height_m)
+        config = config.model_copy(update={"mapping": without_map})
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
@@ -218,7 +218,8 @@ class Slam:
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        if has_keyframes(self._config.window, checkpoint.state.drive) != (checkpoint.state.keyframes is not None):
+        front_end = choose(self._config.window, self._sequence.camera_height_m, checkpoint.state.drive)
+        if (front_end == "steps") != (checkpoint.state.keyframes is None):
             raise SlamError(f"{path} was made with another window.use: make Slam with the same")
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
@@ -255,7 +256,13 @@ class Slam:
 
     def _observe(self, state: FrontEndState | None) -> Observer:
         return Observer(
-            self._predictor, self._sequence.intrinsics, self._config, Stopwatch(), seed=self._seed, state=state
+            self._predictor,
+            self._sequence.intrinsics,
+            self._config,
+            Stopwatch(),
+            seed=self._seed,
+            state=state,
+            camera_height_m=self._sequence.camera_height_m,
         )
 
 

@@ -79,6 +79,7 @@ class Observer:
         examples: Examples | None = None,
         seed: int = 0,
         state: FrontEndState | None = None,
+        camera_height_m: float | None = None,
     ) -> None:
         """Prepare for the first frame, or resume from a state.
 
@@ -90,6 +91,7 @@ class Observer:
             examples: frames to keep whole for the report; None keeps none.
             seed: of all RANSAC draws.
             state: of an observer of the same predictor, camera and configuration.
+            camera_height_m: above the road; None where unknown.
         """
         self._predictor = predictor
         self._config = config
@@ -99,8 +101,8 @@ class Observer:
         self._gate = ImageGate(None if state is None else state.gate)
         self._odometry = VisualOdometry(config.geometry, intrinsics, seed, None if state is None else state.odometry)
         keyframes = WindowState() if state is None else state.keyframes
-        self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes)
-        self._keyframes.decide(self._drive)
+        self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes, camera_height_m)
+        self._keyframes.choose(self._drive)
         self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
@@ -208,7 +210,7 @@ class Observer:
     def _submit_networks(self, frame: Frame) -> PendingFrame:
         sources, index = self._predictor.sources, frame.index
         self._window = (*self._window, frame)[-sources - 1 :]
-        is_sparse = self._keyframes.measure_alone(self._drive, index - 2)  # finished, whatever else is
+        is_sparse = self._keyframes.measures(self._drive, index - 2)  # finished, whatever else is
         depth = snippet = None
         if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
@@ -241,7 +243,7 @@ class Observer:
             step = self._measure_step(self._recent[-1], frame) if measure and self._recent else None
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
-        self._keyframes.decide(self._drive)
+        self._keyframes.choose(self._drive)
         if pending.snippet is not None:
             self._tasks.append(PendingTask("pose network", pending.snippet, self._drive.snippets.append))
         if rotation is not None:

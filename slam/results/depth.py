@@ -10,7 +10,7 @@ import numpy as np
 from slam.evaluation.depth import DepthErrors
 from slam.frames import DepthMap, Intrinsics, Sequence
 from slam.geometry.se3 import FloatArray, apply
-from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.mapping.filters import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
 from slam.results.summary import null
 from slam.runtime.errors import SlamError
@@ -28,7 +28,7 @@ class DepthQuality:
         """``is_metric`` tells whether the run's depth is in metres."""
         self._sequence, self._is_metric = sequence, is_metric
         self._network, self._refined = DepthErrors(), DepthErrors()
-        self._keyframes = self._not_refined = 0
+        self._keyframes = 0
         self._unreadable: list[str] = []
 
     def add(self, keyframe: KeyframeDepth) -> None:
@@ -37,17 +37,15 @@ class DepthQuality:
         if not self._is_metric:
             return
         try:
-            truth = true_depth(self._sequence, keyframe.index, self._keyframes)
+            truth = true_depth(self._sequence, keyframe.frame, self._keyframes)
         except SlamError as error:
             self._unreadable.append(str(error))
             return
         if truth is None:
             return
-        self._network.add(keyframe.depth, truth)
-        if keyframe.refined is None:
-            self._not_refined += 1
-        else:
-            self._refined.add(keyframe.refined.depth, truth, keyframe.refined.relative_sigma)
+        self._network.add(keyframe.depth if keyframe.network_depth is None else keyframe.network_depth, truth)
+        if keyframe.relative_sigma is not None:
+            self._refined.add(keyframe.depth, truth, keyframe.relative_sigma)
 
     def summary(self, is_refined: bool) -> dict[str, Any]:
         """``network`` and ``refined``, each null with a reason where it cannot be computed; warns of unread maps."""

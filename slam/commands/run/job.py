@@ -148,10 +148,9 @@ def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
 
 
 def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
-    """The camera, and every view with its points, in the unit and at the poses of the optimised trajectory."""
-    views = tuple(view.scaled(float(result.scale.per_frame[view.index])) for view in result.drive.views)
-    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in views], dtype=np.intp)]
-    return Places(intrinsics, views, T_world_camera)
+    """The camera, and every view with its points at the poses of the optimised trajectory."""
+    T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in result.views], dtype=np.intp)]
+    return Places(intrinsics, tuple(result.views), T_world_camera)
 
 
 def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseException) -> None:

@@ -36,6 +36,7 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
+_LAST_FRAMES = 4
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
 
@@ -169,16 +170,11 @@ class WindowOdometry:
         """Whether that frame is the last keyframe."""
         return self._state.segments[-1].map.keyframes[-1].index == index
 
-    def has_located(self, index: int) -> bool:
-        """Whether one of the last frames has a pose in the newest map."""
-        last = [frame for segment in self._state.segments[-1:] for frame in segment.frames[-3:]]
-        return any(frame.index == index and frame.T_camera_world is not None for frame in last)
-
     def locates(self, first: int, last: int) -> bool:
-        """Whether the last two frames are these, both with a pose in the newest map."""
-        frames = self._state.segments[-1].frames[-2:]
-        located = [frame.index for frame in frames if frame.T_camera_world is not None]
-        return located == [first, last]
+        """Whether two of the last frames both have a pose in the newest map."""
+        frames = self._state.segments[-1].frames[-_LAST_FRAMES:] if self._state.segments else []
+        located = {frame.index for frame in frames if frame.T_camera_world is not None}
+        return {first, last} <= located
 
     def _begin(self, frame: Frame) -> None:
         """A new map whose first keyframe is this frame; a map that never had points is forgotten."""

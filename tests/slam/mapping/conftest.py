@@ -7,6 +7,7 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.geometry import se3
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 
 CAMERA = Intrinsics(208, 64, 120.0, 120.0, 103.5, 31.5)
@@ -46,7 +47,7 @@ def street_map() -> StreetMap:
             noise = np.random.default_rng(k).normal(0, 2, (CAMERA.height, CAMERA.width, 1))
             image = np.clip(grey(k) + noise, 0, 255).astype(np.uint8).repeat(3, axis=2)
             T_world_camera = se3.make(np.eye(3), np.array([0.0, 0.0, per_metre * k]))
-            tsdf_map.integrate(np.float32(per_metre) * depth, image, T_world_camera, frame=k)
+            tsdf_map.integrate(KeyframeDepth(k, np.float32(per_metre) * depth, None, image, T_world_camera))
         return tsdf_map
 
     return make

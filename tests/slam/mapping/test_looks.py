@@ -6,7 +6,7 @@ import pytest
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.mapping.colours import evened
-from slam.mapping.filters import FILTERS, DepthFilters, DepthView
+from slam.mapping.filters import FILTERS, DepthFilters, KeyframeDepth
 from slam.mapping.holes import with_holes_closed
 from slam.mapping.map import TsdfMap
 from slam.mapping.patch import Patch
@@ -31,7 +31,7 @@ def test_a_view_without_depth_paints_nothing_right_before_it():
         image = np.full((64, 104, 3), (200, 0, 0) if z < 7 else (0, 200, 0), np.uint8)
         T_world_camera = np.eye(4)
         T_world_camera[2, 3] = z
-        tsdf_map.integrate(depth, image, T_world_camera, frame=frame)
+        tsdf_map.integrate(KeyframeDepth(frame, depth, None, image, T_world_camera))
     mesh = tsdf_map.mesh()
     plate = mesh.colours[(np.abs(mesh.vertices_world[:, :2]) < 0.15).all(axis=1)]
     assert len(plate) and plate[:, 1].max() < 0.1
@@ -91,7 +91,7 @@ def test_each_filter_counts_what_it_took():
     image[12:18, 60:70] = 250  # a window: in one piece with nothing at the upper border, whose last row is 10
     config = MappingConfig(border=0.1, bonnet=0.2, max_relative_sigma=0.2)
     filters = DepthFilters(config, camera)
-    kept = filters.kept(DepthView(0, depth, sigma, image, np.eye(4)), None)
+    kept = filters.kept(KeyframeDepth(0, depth, sigma, image, np.eye(4)), None)
     shares = filters.shares()
     assert tuple(shares) == FILTERS
     assert shares["unknown"] == pytest.approx(0.1)
@@ -105,7 +105,7 @@ def test_each_filter_counts_what_it_took():
 def test_a_camera_that_looks_down_sees_no_sky():
     filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
     bright = np.full((50, 100, 3), 250, np.uint8)
-    filters.kept(DepthView(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
+    filters.kept(KeyframeDepth(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
     assert filters.shares()["sky"] == 0
 
 
@@ -116,7 +116,7 @@ def test_how_far_depth_is_fused_depends_on_its_sigma():
     image = np.full((50, 100, 3), 90, np.uint8)
 
     def farthest(relative_sigma: np.ndarray | None) -> float:
-        view = DepthView(0, depth, relative_sigma, image, np.eye(4))
+        view = KeyframeDepth(0, depth, relative_sigma, image, np.eye(4))
         return float(DepthFilters(config, camera).kept(view, None).max())
 
     assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
@@ -130,8 +130,8 @@ def test_border_sky_and_edges_are_no_doubt_of_exact_depth():
     depth[:, 60:] = 15.0
     image = np.full((50, 100, 3), 250, np.uint8)
     filters = DepthFilters(MappingConfig(border=0.1), camera)
-    exact = filters.kept(DepthView(0, depth, np.zeros_like(depth), image, np.eye(4)), None)
+    exact = filters.kept(KeyframeDepth(0, depth, np.zeros_like(depth), image, np.eye(4)), None)
     np.testing.assert_array_equal(exact, depth)
-    learned = filters.kept(DepthView(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), None)
+    learned = filters.kept(KeyframeDepth(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), None)
     assert (learned[24:, 10:59] > 0).all() and (learned[24:, 61:90] > 0).all()
     assert np.count_nonzero(learned) == 26 * 78  # rows below the horizon

@@ -6,6 +6,7 @@ from slam.formats.ply import read_ply
 from slam.frames import Frame, Intrinsics
 from slam.frontend.drive import Keyframe
 from slam.geometry import se3
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
@@ -43,7 +44,7 @@ def street_map(noise=lambda depth, k: depth, frames: int = 12, **config) -> Tsdf
     tsdf_map = TsdfMap(MappingConfig(**config), CAMERA)
     for k in range(frames):
         T_world_camera = pose(0.0, 0.0, float(k))
-        tsdf_map.integrate(noise(street(T_world_camera[:3, 3]), k), GREY, T_world_camera)
+        tsdf_map.integrate(KeyframeDepth(0, noise(street(T_world_camera[:3, 3]), k), None, GREY, T_world_camera))
     return tsdf_map
 
 
@@ -51,7 +52,7 @@ def test_one_wall_lands_where_the_camera_saw_it():
     # Open3D wants T_camera_world: with the inverse the plate would lie at x = -1
     tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)
     for z in (0.0, 0.5, 1.0):
-        tsdf_map.integrate(plate(8.0 - z), GREY, pose(1.0, 0.5, z))
+        tsdf_map.integrate(KeyframeDepth(0, plate(8.0 - z), None, GREY, pose(1.0, 0.5, z)))
     vertices = tsdf_map.mesh().vertices_world
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -62,7 +63,7 @@ def test_one_wall_lands_where_the_camera_saw_it():
 def test_one_wall_from_a_rotated_camera():
     tsdf_map = TsdfMap(MappingConfig(min_weight=2, min_component_triangles=10), CAMERA)
     for x in (0.0, 0.5, 1.0):
-        tsdf_map.integrate(plate(8.05 - x), GREY, pose(x, 0.0, 3.0, yaw=np.pi / 2))
+        tsdf_map.integrate(KeyframeDepth(0, plate(8.05 - x), None, GREY, pose(x, 0.0, 3.0, yaw=np.pi / 2)))
     cloud = tsdf_map.cloud()
     np.testing.assert_allclose(cloud.points_world[:, 0], 8.05, atol=0.003)
     np.testing.assert_allclose(cloud.points_world[:, 2].mean(), 3.0, atol=0.1)
@@ -83,7 +84,7 @@ def test_thinned_keyframes_keep_the_geometry():
     tsdf_map = TsdfMap(config, thinned)
     for k, z in enumerate((0.0, 0.5, 1.0)):
         keyframe = Keyframe.of(Frame(k, float(k), GREY), plate(8.0 - z), spill_file, config)
-        tsdf_map.integrate(keyframe.depth_unscaled, keyframe.image, pose(1.0, 0.0, z))
+        tsdf_map.integrate(KeyframeDepth(0, keyframe.depth_unscaled, None, keyframe.image, pose(1.0, 0.0, z)))
     vertices = tsdf_map.mesh().vertices_world
     np.testing.assert_allclose(vertices[:, 2], 8.0, atol=0.003)
     assert abs((vertices[:, 0].min() + vertices[:, 0].max()) / 2 - 1.0) < 0.15
@@ -140,7 +141,7 @@ def test_flying_pixels_and_far_depth_are_left_out():
         )
         tsdf_map = TsdfMap(config, CAMERA)
         for x in (0.0, 0.31):
-            tsdf_map.integrate(smeared, GREY, pose(x, 0.0, 0.0))
+            tsdf_map.integrate(KeyframeDepth(0, smeared, None, GREY, pose(x, 0.0, 0.0)))
         return tsdf_map.mesh().vertices_world
 
     def between(vertices):
@@ -186,14 +187,14 @@ def test_empty_maps_say_so_and_do_not_crash(tmp_path):
     empty = TsdfMap(MappingConfig(), CAMERA)
     sky = TsdfMap(MappingConfig(), CAMERA)
     for k in range(4):
-        sky.integrate(np.full(V.shape, 80.0, np.float32), GREY, pose(0.0, 0.0, float(k)))
+        sky.integrate(KeyframeDepth(0, np.full(V.shape, 80.0, np.float32), None, GREY, pose(0.0, 0.0, float(k))))
     unknown = TsdfMap(MappingConfig(), CAMERA)
     for k in range(4):
-        unknown.integrate(np.full(V.shape, np.nan, np.float32), GREY, pose(0.0, 0.0, float(k)))
+        unknown.integrate(KeyframeDepth(0, np.full(V.shape, np.nan, np.float32), None, GREY, pose(0.0, 0.0, float(k))))
     all_small = street_map(min_component_triangles=10**9)
     never_enough = TsdfMap(MappingConfig(), CAMERA)
     for k in range(5):  # every view sees another place
-        never_enough.integrate(street(np.zeros(3)), GREY, pose(500.0 * k, 0.0, 0.0))
+        never_enough.integrate(KeyframeDepth(0, street(np.zeros(3)), None, GREY, pose(500.0 * k, 0.0, 0.0)))
     for tsdf_map in (empty, sky, unknown, all_small, never_enough):
         with pytest.raises(SlamError, match="the map is empty"):
             tsdf_map.surface().write_mesh(tmp_path / "mesh.ply")
@@ -208,6 +209,6 @@ def test_a_frame_with_hardly_any_depth_left_is_skipped(first: int, size: int, fu
     depth[first : first + size, 4:20] = 8.0
     camera = Intrinsics(CAMERA.width, CAMERA.height - 1, 120.0, 120.0, 103.5, 31.5)
     tsdf_map = TsdfMap(MappingConfig(), camera)
-    tsdf_map.integrate(depth, GREY[:-1], pose(0.0, 0.0, 0.0))
+    tsdf_map.integrate(KeyframeDepth(0, depth, None, GREY[:-1], pose(0.0, 0.0, 0.0)))
     tsdf_map.statistics()
     assert tsdf_map.statistics().frames_fused == fused

@@ -12,7 +12,7 @@ from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.checkpoint import SERIALISER
-from slam.pipeline.keyframe_tracking import decided, is_vehicle
+from slam.pipeline.keyframe_tracking import FrontEnd, choose
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
@@ -33,16 +33,18 @@ def steps(count: int, scatter: float) -> Drive:
     return Drive(motions=motions)
 
 
-@pytest.mark.parametrize(("count", "scatter", "vehicle"), [(60, 0.02, True), (60, 1.0, False), (20, 0.02, None)])
-def test_a_vehicle_goes_the_same_way_for_a_while(count: int, scatter: float, vehicle: bool | None) -> None:
-    assert is_vehicle(steps(count, scatter)) is vehicle
+@pytest.mark.parametrize(
+    ("count", "scatter", "front_end"), [(60, 0.02, "steps"), (60, 1.0, "keyframes"), (20, 0.02, "both")]
+)
+def test_a_vehicle_goes_the_same_way_for_a_while(count: int, scatter: float, front_end: FrontEnd) -> None:
+    assert choose(WindowConfig(), None, steps(count, scatter)) == front_end
 
 
-def test_a_known_camera_height_decides() -> None:
-    assert decided(SlamConfig(), 1.65).window.use == "never"
-    assert decided(SlamConfig(), None).window.use == "auto"
-    always = SlamConfig(window=WindowConfig(use="always"))
-    assert decided(always, 1.65).window.use == "always"
+def test_a_known_camera_height_and_a_setting_choose() -> None:
+    by_hand = steps(60, 1.0)
+    assert choose(WindowConfig(), 1.65, by_hand) == "steps"
+    assert choose(WindowConfig(use="never"), None, by_hand) == "steps"
+    assert choose(WindowConfig(use="always"), 1.65, by_hand) == "keyframes"
 
 
 KEYFRAMES_ALONE = SlamConfig(

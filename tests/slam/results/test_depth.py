@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from erfsfm.mvs.refine import RefinedDepth
 from slam.frames import Intrinsics
-from slam.pipeline.keyframe_depth import KeyframeDepth
+from slam.mapping.filters import KeyframeDepth
 from slam.results.depth import DepthQuality, projected, true_depth
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.excerpt import Excerpt
@@ -23,8 +22,9 @@ def keyframe(refined: bool = True) -> KeyframeDepth:
     image = np.zeros((6, 8, 3), np.uint8)
     sigma = np.full_like(DEPTH, 0.1)
     sigma[0] = 0.3
-    found = RefinedDepth(DEPTH * 1.1, sigma, np.ones_like(DEPTH, bool)) if refined else None
-    return KeyframeDepth(2, image, DEPTH, DEPTH, found)
+    if not refined:
+        return KeyframeDepth(2, DEPTH, None, image, np.eye(4))
+    return KeyframeDepth(2, DEPTH * 1.1, sigma, image, np.eye(4), DEPTH)
 
 
 def with_depth(tmp_path) -> RecordedSequence:

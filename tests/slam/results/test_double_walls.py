@@ -14,6 +14,7 @@ from slam.frontend.scale.metric_scale import LengthUnit, Scale
 from slam.frontend.scale.scale_estimate import ScaleEstimate
 from slam.loops.closure import LoopClosures
 from slam.loops.verification import Loop
+from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.results.double_walls import double_walls_at_loops
 from slam.results.folder import RunFolder
@@ -40,7 +41,7 @@ def fused(trajectory: Trajectory, first: int = 0) -> TsdfMap:
     grey = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
     tsdf_map = TsdfMap(MappingConfig(submap_m=PASS - 1.0), CAMERA)
     for frame, T_world_camera in enumerate(trajectory.T_world_camera, first):
-        tsdf_map.integrate(depth, grey, T_world_camera, frame=frame)
+        tsdf_map.integrate(KeyframeDepth(frame, depth, None, grey, T_world_camera))
     assert tsdf_map.surface().submaps == 2
     return tsdf_map
 

@@ -256,6 +256,7 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
 def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     from slam.results.comparison import unit_notes
     from slam.results.terminal_table import metrics_table
+    from slam.runtime.run_files import REPORT
 
     sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
     known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
@@ -275,7 +276,7 @@ def _print_run(path: Path, metrics: dict[str, Any]) -> None:
     frames, before = sequence["frames"], sequence.get("continued_at", 0)
     processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
     seconds, per_second = timing["seconds_total"], timing["frames_per_second"]
-    report = path / "report.html"
+    report = path / REPORT
     typer.echo(
         f"{processed} in {seconds:.1f} s ({per_second:.1f} a second); everything in {path}"
         + (f", read {report}" if report.is_file() else "")

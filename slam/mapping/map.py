@@ -16,10 +16,11 @@ from slam.frames import DepthMap, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
-from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
+from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
 from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
@@ -98,7 +99,7 @@ class TsdfMap:
         self._filters = DepthFilters(config, intrinsics)
         self._views = ViewChooser(self._filters, config.depth_max_m)
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
-        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
+        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
         remove_submaps(self._folder)  # of a run that was killed here
         self._previous: DepthView | None = None
         self._first: int | None = None

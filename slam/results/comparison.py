@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import TRAJECTORIES
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -10,10 +10,10 @@ from typing import Any
 
 from erfsfm.common.lock import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
-from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
-from slam.results.output import TRAJECTORIES as TRAJECTORIES
+from slam.results.output_folder import claim, reclaim, replace_run, stamped, whole_place
 from slam.results.schema import MetricsFile
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import ESTIMATE, METRICS, trajectory_file
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.json_file import read_json
 
@@ -113,10 +113,10 @@ class RunFolder:
         """Write ``metrics.json``; a number that is not finite is an error."""
         self.write_text(METRICS, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
-    def write_trajectory(self, stem: str, trajectory: Trajectory) -> None:
-        """Write ``<stem>.kitti.txt`` and ``<stem>.tum.txt``."""
-        write_kitti(self.path / f"{stem}.kitti.txt", trajectory)
-        write_tum(self.path / f"{stem}.tum.txt", trajectory)
+    def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """Write one of the trajectories (``network``, ``optimised``, ``reference`` ...) in both formats."""
+        write_kitti(self.path / trajectory_file(name, "kitti"), trajectory)
+        write_tum(self.path / trajectory_file(name, "tum"), trajectory)
 
     def metrics(self) -> dict[str, Any]:
         """The content of ``metrics.json``; without the file, the status of a killed run.
@@ -132,8 +132,7 @@ class RunFolder:
 
     def trajectory(self, name: str) -> Trajectory | None:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
-        stem = name if name == "reference" else f"trajectory_{name}"
-        path = self.path / f"{stem}.tum.txt"
+        path = self.path / trajectory_file(name, "tum")
         return read_trajectory(path, "tum") if path.exists() else None
 
     def require(self, name: str) -> Path:

@@ -15,9 +15,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
 from slam.results.summary import null
-
-GEOJSON = "trajectory_optimised.geojson"
-KML = "trajectory_optimised.kml"
+from slam.runtime.run_files import GEOJSON, KML
 
 
 def gps_metrics(result: Estimate, in_graph: bool) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from typing import Any
 from slam.evaluation.double_walls import double_wall_share
 from slam.frames import Sequence
 from slam.mapping.map import TsdfMap
-from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import MapSurface, positions
 from slam.pipeline.batch import Progress
@@ -19,6 +18,7 @@ from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.run_files import MAP_CLOUD, MAP_MESH, SUBMAPS
 
 logger = logging.getLogger(__name__)
 
@@ -41,8 +41,8 @@ def write_map(
         remove_submaps(folder.path / SUBMAPS)
         return _no_map(str(error))
     with result.stopwatch.stage("mesh"):
-        surface.write_mesh(folder.path / "map_mesh.ply")
-        surface.write_cloud(folder.path / "map_cloud.ply")
+        surface.write_mesh(folder.path / MAP_MESH)
+        surface.write_cloud(folder.path / MAP_CLOUD)
     walls = _double_walls(surface, result.map, result)
     remove_submaps(folder.path / SUBMAPS)
     errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, sequence)

@@ -23,7 +23,7 @@ from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import umeyama
 from slam.pipeline.doubts import DOUBLED, doubled_frames
 from slam.pipeline.estimate import Estimate
-from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.folder import RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.summary import (
     SCHEMA,
@@ -35,6 +35,7 @@ from slam.results.summary import (
     finite,
     null,
 )
+from slam.runtime.run_files import TRAJECTORIES
 from slam.sequences.continued import unused_scans
 
 

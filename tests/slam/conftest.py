@@ -142,7 +142,7 @@ def make_run(tmp_path: Path) -> MakeRun:
         folder = RunFolder.create(tmp_path / name, tmp_path, "sim")
         stamps = 0.1 * np.arange(300)
         for each, (step_m, yaw_bias) in GEOMETRY.items():
-            folder.write_trajectory(f"trajectory_{each}", Trajectory(stamps, drive(300, step_m, yaw_bias)))
+            folder.write_trajectory(each, Trajectory(stamps, drive(300, step_m, yaw_bias)))
         if reference:
             folder.write_trajectory("reference", Trajectory(stamps, drive(300, 1.0, 0.0)))
         folder.write_text("graph.g2o", G2O)

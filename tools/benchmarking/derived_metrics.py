@@ -13,6 +13,7 @@ from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.results.comparison import is_metric, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.results.summary import null
+from slam.runtime.run_files import LOOPS
 
 FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
 
@@ -58,7 +59,7 @@ def _loops(folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
         reason = f"loops in {unit_of_lengths(metrics)} cannot be compared with metres"
     if reference is None or reason:
         return null("true_loops", reason) | null("false_loops", reason)
-    accepted = json.loads((folder / "loops.json").read_text(encoding="utf-8"))["accepted"]
+    accepted = json.loads((folder / LOOPS).read_text(encoding="utf-8"))["accepted"]
     false = sum(
         is_false(np.array(loop["T_from_to"]), *reference.T_world_camera[[loop["from"], loop["to"]]])
         for loop in accepted

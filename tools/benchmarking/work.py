@@ -23,11 +23,12 @@ from benchmarking.plan import BenchmarkSequence, Job
 from slam.commands.batch import cluster
 from slam.commands.batch.cluster import Spread
 from slam.results.comparison import failure
+from slam.runtime.run_files import GRAPH, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.runtime.storage.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
-BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # removed after a run: no table reads them
+BULKY = (MAP_MESH, MAP_CLOUD, PLACES, GRAPH)  # removed after a run: no table reads them
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def job_result(job: Job) -> JobResult:
 
 
 def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
-    metrics = _read(job.place / "run" / "metrics.json")
+    metrics = _read(job.place / "run" / METRICS)
     reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was interrupted")
     commit = record.get("commit", "")
     if reason:

@@ -15,6 +15,7 @@ from slam.commands.batch.execution import Outcome
 from slam.results.comparison import METRES, MISSING, lookup, unit_of_lengths, written
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import REPORT
 from slam.runtime.storage.files import write_atomically
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def _row(outcome: Outcome) -> dict[str, Any]:
 
 def _cells(outcome: Outcome, row: dict[str, Any], output: Path) -> tuple[str, str, list[str]]:
     """Name, address of the report (empty without one), and numbers of a run."""
-    report = outcome.folder / "report.html"
+    report = outcome.folder / REPORT
     address = quote(os.path.relpath(report, output.absolute())) if report.is_file() else ""
     return outcome.drive.name, address, [_text(row[name], decimals) for name, _, decimals in _COLUMNS]
 

@@ -24,10 +24,11 @@ from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry import se3
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.comparison import CAMERA_HEIGHTS, METRES, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import ESTIMATE, GRAPH, PLACES
 from slam.runtime.storage.files import write_atomically
 
 Progress = Callable[[str, int, int], None]
@@ -79,7 +80,7 @@ def export(
         write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
         write(output, _trajectory(folder, up))
     elif what == "graph":
-        source = folder.require("graph.g2o")
+        source = folder.require(GRAPH)
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     elif what == "colmap":
@@ -161,15 +162,13 @@ def _rotated(ply: Ply, up: str) -> Ply:
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     """The optimised trajectory in the given axes."""
-    folder.require("trajectory_optimised.tum.txt")
+    folder.require(ESTIMATE)
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
         raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
     frames, _ = lookup(folder.metrics(), "sequence", "frames")
     if frames is not None and frames != len(trajectory):
-        raise RunError(
-            f"{folder.path}: trajectory_optimised.tum.txt is damaged: it has {len(trajectory)} rows for {frames} frames"
-        )
+        raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     if up != "y-down":
         T_up_world = se3.make(R_UP_WORLDS[up], np.zeros(3))
         trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)

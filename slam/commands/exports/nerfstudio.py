@@ -17,10 +17,11 @@ from slam.formats.trajectory import Trajectory, nearest_stamps
 from slam.formats.transforms import TRANSFORMS, write_transforms
 from slam.frames import Image, Sequence
 from slam.geometry.se3 import FloatArray
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove, write_atomically
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence

@@ -41,7 +41,7 @@ def localize(
     from slam.commands.localisation.tables import localisation_json, localisation_table, write_localisations
     from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
-    from slam.results.replaced import check_replaced_trajectory
+    from slam.results.output_file import check_replaced_trajectory
     from slam.runtime.errors import RunError
 
     run_folder = RunFolder.open(map)

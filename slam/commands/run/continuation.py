@@ -12,11 +12,11 @@ import numpy as np
 from erfsfm.inference import overlapping
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
-from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
-from slam.results.output import UNFINISHED
 from slam.runtime.errors import ConfigError, RunError
+from slam.runtime.run_files import CONFIG, DRIVE, UNFINISHED
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def settings_to_resume(folder: Path, config: str | Path | None, overrides: Seque
     Raises:
         ConfigError: another change.
     """
-    if not (folder / "config.yaml").is_file():
+    if not (folder / CONFIG).is_file():
         return load_config(config, overrides)  # it was killed before its first frame
     return settings_to_continue(folder, config, overrides)
 
@@ -84,8 +84,8 @@ def settings_to_continue(folder: Path, config: str | Path | None, overrides: Seq
     """
     if config is not None:
         raise ConfigError(f"the configuration of {folder} is used to continue it: leave out --config")
-    own = load_config(RunFolder(folder).require("config.yaml"))
-    settings = load_config(folder / "config.yaml", overrides)
+    own = load_config(RunFolder(folder).require(CONFIG))
+    settings = load_config(folder / CONFIG, overrides)
     # another path may lead to the same source, or to more files of it: its identity is compared later
     depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})
     compared = settings.model_copy(update={"depth": depth})

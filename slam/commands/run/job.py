@@ -16,7 +16,7 @@ from slam.config.sections import SlamConfig, dump_yaml
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.pipeline.batch import Progress, SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
@@ -26,13 +26,13 @@ from slam.results.folder import RunFolder
 from slam.results.gps import write_places
 from slam.results.map import write_map
 from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
-from slam.results.output import ESTIMATE
 from slam.results.report.map_view import write_map_views
 from slam.results.report.page import DepthExample, write_report
 from slam.results.report.rerun import write_rerun
-from slam.results.run_log import LOG, RunLog
+from slam.results.run_log import RunLog
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, PLACES
 from slam.sequences.continued import Continued
 
 
@@ -94,7 +94,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
 
 def _run(job: Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
-    folder.write_text("config.yaml", dump_yaml(job.settings))
+    folder.write_text(CONFIG, dump_yaml(job.settings))
     stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
     # a run does not go on without the images of a live drive, nor in a folder without those before its own
@@ -135,15 +135,15 @@ def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
 def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
     """Trajectories, graph, loops and places."""
     for name in ("network", "odometry", "optimised"):
-        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+        folder.write_trajectory(name, getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
     write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
-        folder.write_trajectory("trajectory_lidar", lidar)
-    result.graph.write_g2o(folder.path / "graph.g2o")
-    folder.write_text("loops.json", as_json(result.loops.details()))
+        folder.write_trajectory("lidar", lidar)
+    result.graph.write_g2o(folder.path / GRAPH)
+    folder.write_text(LOOPS, as_json(result.loops.details()))
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
 
 
@@ -165,6 +165,6 @@ def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseExceptio
     with suppress(SlamError, OSError):
         folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
         if job.stream is not None and folder.trajectory("odometry") is None:
-            folder.write_trajectory("trajectory_odometry", job.stream.tracked())
+            folder.write_trajectory("odometry", job.stream.tracked())
         if job.settings.output.report:
             write_report(folder, [], None)

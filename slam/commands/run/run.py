@@ -34,7 +34,7 @@ from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.folder import RunFolder
-from slam.results.output import check_output, whole_place
+from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.results.summary import Provenance
 from slam.runtime.errors import RunError

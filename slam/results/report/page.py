@@ -12,14 +12,13 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from slam.evaluation.drift import REFERENCE
 from slam.formats.trajectory import Trajectory
 from slam.frames import DepthMap, Image
 from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
 from slam.results.report import tables as report_tables
 from slam.results.report.map_report import has_map_curve, map_error_figure, map_errors_table, map_filters, map_sizes
-from slam.results.report.map_view import MAP_ABOVE, MAP_DRIVER, MapViews
+from slam.results.report.map_view import MapViews
 from slam.results.report.plots import (
     depth_figure,
     drift_figure,
@@ -30,6 +29,7 @@ from slam.results.report.plots import (
 )
 from slam.results.report.tables import Cell, Table
 from slam.runtime.errors import SlamError
+from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 
 Metrics = Mapping[str, Any]
 
-REPORT = "report.html"
 _TEMPLATES = Environment(
     loader=PackageLoader("slam", "results/report"),
     autoescape=True,
@@ -47,27 +46,6 @@ _TEMPLATES = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_MEANINGS = {
-    "config.yaml": "resolved configuration",
-    "metrics.json": "every number of this page",
-    "trajectory_optimised.geojson": "optimised trajectory on the earth",
-    "trajectory_optimised.kml": "the same for Google Earth",
-    "trajectory_network": "raw network poses, chained",
-    "trajectory_odometry": "front end fused, no loops",
-    "trajectory_optimised": "after the pose graph",
-    "trajectory_lidar": "KISS-ICP on the LiDAR scans",
-    "reference": "ground truth",
-    "graph.g2o": "pose graph",
-    "loops.json": "accepted and rejected loops",
-    "places.npz": "features of places, for localize",
-    "drive.zip": "measurements of every frame, for run --continue",
-    "keyframes.npz": "keyframes of the map, for run --continue",
-    "map_mesh.ply": "map as a mesh, y down",
-    "map_cloud.ply": "map as a coloured cloud, y down",
-    MAP_ABOVE: "the map from above",
-    MAP_DRIVER: "the map from the driver's seat",
-    "run.log": "log of the run",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +108,7 @@ def write_report(
         map_errors=map_errors_table(metrics),
         map_curve=_map_curve(metrics),
         no_map=_absence(metrics, "map"),
-        loops=report_tables.loops(metrics, folder.path / "loops.json"),
+        loops=report_tables.loops(metrics, folder.path / LOOPS),
         no_loops=_absence(metrics, "loops"),
         tracking=report_tables.tracking(metrics),
         graph=report_tables.graph(metrics),
@@ -216,9 +194,8 @@ def _files(folder: RunFolder) -> Table | None:
     rows = []
     for path in sorted(folder.path.iterdir()):
         if path.is_file() and not path.name.startswith(".") and path.name != REPORT:
-            meaning = _MEANINGS.get(path.name) or _MEANINGS.get(path.name.partition(".")[0], "")
             size = _size(path.stat().st_size)
-            rows.append([Cell(path.name, address=quote(path.name)), Cell(meaning), Cell(size)])
+            rows.append([Cell(path.name, address=quote(path.name)), Cell(MEANINGS.get(path.name, "")), Cell(size)])
     return Table((), rows, "words") if rows else None
 
 

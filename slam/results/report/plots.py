@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from erfsfm.common.figure_file import require_figure, save_figure
-from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
+from slam.evaluation.drift import aligned, estimates, segment_drifts, travelled
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import DepthMap, Image
 from slam.results.comparison import METRES, unit_of_lengths
-from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.results.folder import RunFolder
 from slam.results.report.map_picture import AerialView
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import REFERENCE, TRAJECTORIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,9 +22,9 @@ from slam.results.comparison import (
     lookup,
     written,
 )
-from slam.results.folder import TRAJECTORIES
 from slam.results.schema import LoopsFile
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.storage.json_file import read_json
 
 Metrics = Mapping[str, Any]

@@ -15,11 +15,12 @@ from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
 from slam.config.sections import load_config
 from slam.frames import Frame
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.results import folder as run_folder
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import DRIVE, KEYFRAMES
 from slam.runtime.storage.json_file import read_json
 from slam.sequences.catalogue import open_sequence
 from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root

@@ -41,7 +41,7 @@ def test_an_earlier_run_stays_until_the_new_one_replaces_it(make_run: MakeRun) -
     (old / "notes.txt").write_text("what I saw")
     before = contents(old)
     new = begin(old)
-    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     assert new.path == old / "unfinished" and contents(old) == before
     new.publish()
     assert new.path == old and RunFolder.open(old).metrics()["status"] == "running"
@@ -74,7 +74,7 @@ def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
 ) -> None:
     old = make_run("mine").path
     new = begin(old)
-    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     replace, calls = Path.replace, iter(range(moved))
 
     def killed_later(path: Path, target: Path) -> Path:
@@ -87,7 +87,7 @@ def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
         new.publish()
     assert RunFolder.open(old).metrics()["status"] in ("ok", "running")
     again = begin(old)
-    again.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    again.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     again.publish()
     own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
     assert {path.name for path in old.iterdir()} == own

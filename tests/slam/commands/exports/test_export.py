@@ -14,9 +14,10 @@ from slam.commands.exports.options import R_UP_WORLDS
 from slam.formats.ply import read_ply_points
 from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.run_files import PLACES
 
 MakeRun = Callable[..., RunFolder]
 

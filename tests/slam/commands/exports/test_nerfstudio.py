@@ -69,7 +69,8 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
     with pytest.raises(RunError, match="another camera"):
         export(folder, "nerfstudio", tmp_path / "scene")
-    from slam.loops.places import PLACES, Places
+    from slam.loops.places import Places
+    from slam.runtime.run_files import PLACES
 
     camera = open_sequence(tmp_path / "drive").intrinsics
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
@@ -140,7 +141,7 @@ def lengthen(folder: RunFolder, rows: int, continued_at: int, frames: str | None
     from slam.formats.trajectory import Trajectory
 
     poses = np.tile(np.eye(4), (rows, 1, 1))
-    folder.write_trajectory("trajectory_optimised", Trajectory(0.1 * np.arange(rows), poses, True))
+    folder.write_trajectory("optimised", Trajectory(0.1 * np.arange(rows), poses, True))
     metrics = folder.metrics()
     metrics["sequence"] |= {"frames": rows, "continued_at": continued_at}
     if frames is not None:
@@ -154,9 +155,7 @@ def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path:
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
     assert trajectory is not None
-    folder.write_trajectory(
-        "trajectory_optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True)
-    )
+    folder.write_trajectory("optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True))
     metrics = folder.metrics()
     metrics["sequence"]["frames"] = 3
     folder.write_metrics(metrics)

@@ -22,9 +22,10 @@ from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
+from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 
@@ -218,7 +219,7 @@ def test_where_the_truth_is_known_errors_and_success_are_said(
     run.write_trajectory("reference", Trajectory(stamps, reference()))
     scaled = reference().copy()
     scaled[:, :3, 3] *= UNIT
-    run.write_trajectory("trajectory_optimised", Trajectory(stamps, scaled))
+    run.write_trajectory("optimised", Trajectory(stamps, scaled))
     run.write_metrics(run.metrics() | {"scale": scale})
     rows = reference()[[10, 25, 40, 50, 50]]
     rows[1, 0, 3] += 3.0  # a wrong truth

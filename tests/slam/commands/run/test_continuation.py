@@ -18,11 +18,11 @@ import pytest
 from slam import run_slam
 from slam.frames import Frame
 from slam.pipeline import batch
-from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.observer import Observer
 from slam.results.folder import RunFolder
 from slam.runtime.errors import ConfigError, RunError, SequenceError, SlamError
-from slam.runtime.storage.files import KEYFRAMES_PART
+from slam.runtime.run_files import DRIVE, KEYFRAMES_PART
 
 KILLED = """
 import os, signal, sys

@@ -17,10 +17,11 @@ import slam.commands.cli
 from slam import Slam, run_slam
 from slam.commands.localisation.localiser import localise
 from slam.config.sections import load_config
-from slam.loops.places import PLACES, Places
-from slam.pipeline.checkpoint import KEYFRAMES, read_keyframes
+from slam.loops.places import Places
+from slam.pipeline.checkpoint import read_keyframes
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
+from slam.runtime.run_files import KEYFRAMES, PLACES
 from slam.sequences.catalogue import open_sequence
 from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 

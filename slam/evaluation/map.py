@@ -20,7 +20,6 @@ from slam.evaluation.surface import (
     SPARSE_VIEW_STEP_M,
     VIEW_STEP_M,
     Indices,
-    Mask,
     SurfaceTruth,
     accumulated,
     length_m,
@@ -29,6 +28,7 @@ from slam.evaluation.surface import (
     stretches,
     thinned,
 )
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
 
 NEAR_CAMERA_M = 20.0

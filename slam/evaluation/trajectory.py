@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
-from slam.evaluation.drift import KITTI_LENGTHS_M, path_distance, relative_errors, segment_errors
+from slam.evaluation.drift import KITTI_LENGTHS_M, relative_errors, segment_errors
 from slam.formats.trajectory import Trajectory, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -211,7 +211,7 @@ def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray
     """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
     segments = segment_errors(T_world_estimate, T_world_reference, KITTI_LENGTHS_M)
     if not segments:
-        path_m = path_distance(T_world_reference)[-1]
+        path_m = se3.path_distance(T_world_reference)[-1]
         reason = f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m"
         return {"t_rel_percent": reason, "r_rel_deg_per_100m": reason}
     translation = np.concatenate([each.translation_m / each.length_m for each in segments])

@@ -17,9 +17,10 @@ from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
-from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
+from slam.mapping.surface import MapSurface, colours, normals, positions, submap_mesh
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.progress import Progress
 from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own

@@ -11,13 +11,13 @@ from slam.frames import Sequence
 from slam.mapping.map import TsdfMap
 from slam.mapping.submap import remove_submaps
 from slam.mapping.surface import MapSurface, positions
-from slam.pipeline.batch import Progress
 from slam.pipeline.estimate import Estimate
 from slam.results.double_walls import AT_LOOPS, double_walls_at_loops
 from slam.results.folder import RunFolder
 from slam.results.map_error import map_errors, no_map_errors
 from slam.results.summary import null
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.progress import Progress
 from slam.runtime.run_files import MAP_CLOUD, MAP_MESH, SUBMAPS
 
 logger = logging.getLogger(__name__)

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
-from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
-from slam.frames import Intrinsics, Sequence
+from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
+from slam.frames import Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate

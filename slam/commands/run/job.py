@@ -17,7 +17,7 @@ from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import Places
-from slam.pipeline.batch import Progress, SlamPipeline
+from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import FrontEndState, Observer
@@ -32,6 +32,7 @@ from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.results.summary import Provenance, as_json, describe_start
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.progress import Progress
 from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, PLACES
 from slam.sequences.continued import Continued
 

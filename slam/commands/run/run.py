@@ -29,7 +29,7 @@ from slam.commands.run.continuation import (
 from slam.commands.run.job import Job, complete
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
-from slam.pipeline.batch import Progress, SlamPipeline
+from slam.pipeline.batch import SlamPipeline
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
@@ -39,6 +39,7 @@ from slam.results.run_log import run_log
 from slam.results.summary import Provenance
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_rerun
+from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, DepthView
 from slam.mapping.fusion import Fusion
 from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
-from slam.mapping.surface import MapSurface, colours, normals, positions, submap_mesh
+from slam.mapping.surface import MapSurface, colours, normals, positions
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.progress import Progress
@@ -103,7 +102,6 @@ class TsdfMap:
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
         remove_submaps(self._folder)  # of a run that was killed here
         self._previous: DepthView | None = None
-        self._first: int | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
@@ -137,7 +135,7 @@ class TsdfMap:
         view = DepthView(frame, known_depth, relative_sigma, image, T_world_camera)
         previous = self._previous
         if previous is None:
-            self._first, self._previous = frame, view
+            self._previous = view
         elif self._has_moved(view.T_world_camera, previous.T_world_camera):
             if not self._first_is_fused:
                 self._fuse(previous, view)
@@ -184,21 +182,6 @@ class TsdfMap:
         """The whole surface as points, in memory; raises as ``surface``."""
         points = np.concatenate(list(self.surface().cloud_pieces()))
         return MapCloud(positions(points), normals(points), colours(points))
-
-    def submap_of(self, frame: int) -> int | None:
-        """Number of the finished submap whose stretch of road a frame is on; None before the first fused frame."""
-        if self._first is None or frame < self._first:
-            return None
-        return max(bisect_right(self._views_of_submaps, frame, key=lambda views: int(views[0])) - 1, 0)
-
-    def submap_anchor(self, number: int) -> int:
-        """The frame in the middle of a finished submap."""
-        views = self._views_of_submaps[number]
-        return int(views[len(views) // 2])
-
-    def submap_mesh(self, number: int) -> tuple[FloatArray, NDArray[np.int64]]:
-        """A finished submap by itself, as `slam.mapping.surface.submap_mesh`."""
-        return submap_mesh(submap_path(self._folder, number), self._config)
 
     @property
     def voxel_size(self) -> float:

@@ -171,24 +171,6 @@ class MapSurface:
         return written
 
 
-def submap_mesh(path: Path, config: MappingConfig) -> tuple[FloatArray, Triangles]:
-    """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of one submap by itself, with its small pieces and holes.
-
-    Raises:
-        SlamError: it is damaged.
-    """
-    store = SubmapStore([path])
-    least_weight = min(config.min_weight, float(store.fused))
-    vertices, triangles, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for tile in store.tiles():
-        patch = extract_patch(store, tile, config.voxel_size_m, least_weight)
-        if patch is not None:
-            vertices.append(patch.vertices)
-            triangles.append(patch.triangles[patch.own] + count)
-            count += len(patch.vertices)
-    return np.concatenate(vertices), np.concatenate(triangles)
-
-
 def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:
     triangles = piece.triangles.read()
     chosen: Triangles = triangles[kept.parts[piece.label.read()[triangles[:, 0]]]].astype(np.int64)

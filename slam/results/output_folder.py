@@ -15,10 +15,10 @@ from pathlib import Path
 
 from erfsfm.common.files import unfinished_name, write_atomically
 from slam.mapping.submap import remove_submaps
-from slam.results.schema import MetricsFile
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import ESTIMATE, KEYFRAMES_PART, MEANINGS, METRICS, SUBMAPS, UNFINISHED
-from slam.runtime.storage.json_file import read_json
+from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
 
@@ -117,13 +117,11 @@ def _made(path: Path) -> bool:
 def _is_run(metrics: Path) -> bool:
     """Whether a ``metrics.json`` is that of a run, however it ended."""
     try:
-        content = read_json(metrics, MetricsFile)
+        content = Metrics.read(metrics)
     except (OSError, RunError):
         return False
-    if not {"schema", "status"} <= set(content):
-        return False
-    provenance = content.get("provenance")
-    return isinstance(provenance, dict) and "weights_sha256" in provenance
+    named = not isinstance(content.provenance.weights_sha256, Missing)
+    return named and {"schema_", "status"} <= content.model_fields_set
 
 
 def _is_rest(path: Path) -> bool:

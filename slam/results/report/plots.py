@@ -18,8 +18,8 @@ from slam.evaluation.drift import aligned, estimates, segment_drifts
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import DepthMap, Image
 from slam.geometry.se3 import path_distance
-from slam.results.comparison import METRES, unit_of_lengths
 from slam.results.folder import RunFolder
+from slam.results.metrics import METRES
 from slam.results.report.map_picture import AerialView
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import REFERENCE, TRAJECTORIES
@@ -254,7 +254,7 @@ def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, 
 
 def length_unit(run: RunFolder) -> str:
     """The unit of a run's trajectories and map, for the axes of a plot."""
-    unit = unit_of_lengths(run.metrics())
+    unit = run.metrics().unit
     return "m" if unit == METRES else unit
 
 

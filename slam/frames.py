@@ -24,6 +24,7 @@ T = TypeVar("T")
 Image = NDArray[np.uint8]
 Grey = NDArray[np.uint8]
 DepthMap = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 Descriptors = NDArray[np.uint8]
 Event = Literal["map begun", "lost", "relocalised", "map joined"]  # of the tracking of keyframes
 Ends = tuple[int, int]  # the two frames of a step or a factor

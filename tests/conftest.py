@@ -86,7 +86,6 @@ _METRICS = {
     "map": {
         **dict.fromkeys(("triangles", "points", "blocks", "submaps"), int),
         **{"filters": dict, "floater_share": float, "double_wall_share": float},
-        "double_wall_share_at_loops": {"before": float, "after": float},
         **_MAP_ERRORS,
         **{"in_field": dict, "by_distance": list, "truth": str, "evaluated_m": float},
         "with_scale": {"scale": float, **_MAP_ERRORS},

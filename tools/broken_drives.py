@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +20,9 @@ from numpy.typing import NDArray
 
 from slam import run_slam
 from slam.geometry.se3 import FloatArray, umeyama
+from slam.results.metrics import SequenceMetrics
 from slam.runtime.errors import SlamError
+from slam.runtime.storage.record import Missing, known
 from slam.sequences.simulated import FPS, SimulatedSequence
 from slam.simulation.kitti_layout import write_calibration, write_image, write_lines, write_poses
 from slam.simulation.street import SimulationOptions
@@ -190,19 +191,18 @@ def examine(fault: str, drive: Drive, sequence: SimulatedSequence, weights: str)
             return Outcome(fault, None, (str(error).replace(str(root), "ROOT"),))
         finally:
             logging.getLogger("slam").removeHandler(said)
-        metrics = run.metrics()
         trajectory = run.trajectory("optimised")
         assert trajectory is not None
-        segments = _segments(metrics)
+        segments = _segments(run.metrics().sequence)
         shown = np.flatnonzero(drive.shows_road)
         rmse = ate(trajectory.T_world_camera, drive.T_world_camera, shown, segments)
         return Outcome(fault, rmse, tuple(line.replace(str(root), "ROOT") for line in said.lines))
 
 
-def _segments(metrics: dict[str, Any]) -> tuple[tuple[int, int], ...]:
+def _segments(sequence: SequenceMetrics | Missing) -> list[tuple[int, int]]:
     """First and last frame of each segment; a long gap belongs to the one before it."""
-    begins = [each["first"] for each in metrics["sequence"]["segments"]]
-    return tuple(zip(begins, [*(first - 1 for first in begins[1:]), metrics["sequence"]["frames"] - 1], strict=True))
+    begins, frames = [each.first for each in sequence.segments], known(sequence.frames) or 0
+    return list(zip(begins, [*(first - 1 for first in begins[1:]), frames - 1], strict=True))
 
 
 def ate(

@@ -21,6 +21,7 @@ from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMeshFile
 from slam.results.report.map_picture import MapScene
 from slam.results.report.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
+from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
 
 WIDTH_PX = 1600
@@ -53,7 +54,7 @@ def main() -> None:
 def seat(folder: RunFolder, sequence: Sequence, frame: int) -> NDArray[np.uint8]:
     """A frame above what its camera sees of the map within 100 m."""
     T_world_camera = trajectories_of(folder)["optimised"].T_world_camera[frame]
-    mesh = MapMeshFile(folder.require("map_mesh.ply")).near(T_world_camera[:3, 3], NEAR_M)
+    mesh = MapMeshFile(folder.require(MAP_MESH)).near(T_world_camera[:3, 3], NEAR_M)
     below = MapScene(mesh).from_seat(T_world_camera)
     image = sequence.frame(frame).image
     height = round(image.shape[0] * below.shape[1] / image.shape[1])
@@ -67,7 +68,7 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     images = [sequence.frame(int(k)).image for k in chosen]
     depths = [predictor.depth(image) for image in images]
     trajectories = trajectories_of(folder)
-    scene = MapScene(MapMeshFile(folder.require("map_mesh.ply")).reduced(1_000_000))
+    scene = MapScene(MapMeshFile(folder.require(MAP_MESH)).reduced(1_000_000))
     top = _raster(depth_figure(images, depths, [f"frame {k}" for k in chosen]), WIDTH_PX)
     left = _raster(trajectory_figure(trajectories, title="trajectories"), WIDTH_PX // 2)
     map_picture = map_figure(scene.from_above(trajectories["optimised"].positions), trajectories["optimised"])

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from slam.config.sections import load_config
-from slam.evaluation.map import compare, statistics
+from slam.evaluation.map import PlacedMetrics, compare, placed_metrics
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
+from slam.results.error_columns import written
 from slam.results.map_error import HasTrueDepth
 from slam.results.map_error import find_truth as surface_of
 from slam.runtime.errors import SlamError
@@ -49,11 +50,11 @@ def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
         image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)
         tsdf_map.integrate(KeyframeDepth(frame, depth, exact, image, sequence.reference[frame]))
     found = compare(truth, sequence.reference, {"map": tsdf_map.cloud().points_world})
-    numbers = statistics(found.distances["map"])
-    score = numbers["f_score"]
+    errors = placed_metrics(PlacedMetrics, found.distances["map"])
+    score = written(errors.f_score.m02, 2), written(errors.f_score.m05, 2)
     return (
-        f"accuracy {numbers['accuracy_median_m']:.3f} m, 90 % {numbers['accuracy_90_m']:.2f} m, "
-        f"completeness {numbers['completeness']:.3f}, F-score {score['0.2']:.2f} / {score['0.5']:.2f}"
+        f"accuracy {written(errors.accuracy_median_m, 3)} m, 90 % {written(errors.accuracy_90_m, 2)} m, "
+        f"completeness {written(errors.completeness, 3)}, F-score {' / '.join(score)}"
     )
 
 

@@ -7,7 +7,7 @@ import logging
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,6 +23,9 @@ from slam.runtime.errors import SlamError
 from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 from slam.runtime.unused_options import UnusedDevice, UnusedSeed
+
+if TYPE_CHECKING:
+    from slam.results.metrics import Metrics
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -109,7 +112,7 @@ def run(
         )
     metrics = folder.metrics()
     if as_json:
-        typer.echo(json.dumps(metrics, indent=2))
+        typer.echo(metrics.to_json())
         return
     _print_run(folder.path, metrics)
 
@@ -223,8 +226,8 @@ def doctor(
 
 
 def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
-    from slam.results.comparison import comparison_json, comparison_table
     from slam.results.folder import RunFolder
+    from slam.results.terminal_tables import comparison_json, comparison_table
 
     runs = [RunFolder.open(path) for path in paths]
     if as_json:
@@ -236,12 +239,12 @@ def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
 def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
     from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
     from slam.formats.trajectory import associate, read_trajectory
-    from slam.results.terminal_table import metrics_table
+    from slam.results.terminal_tables import metrics_table
 
     pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
     metrics = trajectory_metrics(*pair)
     if as_json:
-        typer.echo(json.dumps(metrics, indent=2))
+        typer.echo(metrics.to_json())
     else:
         print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
         for line in evo_commands(estimate, reference, format):
@@ -251,31 +254,33 @@ def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[s
         raise SlamError("; ".join(broken))
 
 
-def _print_run(path: Path, metrics: dict[str, Any]) -> None:
-    from slam.results.comparison import unit_notes
-    from slam.results.terminal_table import metrics_table
+def _print_run(path: Path, metrics: Metrics) -> None:
+    from slam.results.error_columns import written
+    from slam.results.terminal_tables import metrics_table
+    from slam.runtime.run_files import REPORT, TRAJECTORIES
+    from slam.runtime.storage.record import Missing, known
 
-    sequence, provenance, timing = metrics["sequence"], metrics["provenance"], metrics["timing"]
-    known = {name: errors for name, errors in metrics["trajectories"].items() if isinstance(errors, dict)}
-    title = f"{sequence['name']}, scale {metrics['scale']['mode']}"
-    if sequence["length_m"] is None:
-        typer.echo(f"{title}: no errors, for {sequence['length_m_reason']}")
+    sequence, provenance, timing = metrics.sequence, metrics.provenance, metrics.timing
+    title = f"{known(sequence.name)}, scale {known(metrics.scale.mode)}"
+    if isinstance(sequence.length_m, Missing):
+        typer.echo(f"{title}: no errors, for {sequence.length_m.reason}")
     else:
-        print_table(metrics_table(known, title))
-    for note in unit_notes(metrics):
+        errors = {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
+        print_table(metrics_table({name: e for name, e in errors.items() if not isinstance(e, Missing)}, title))
+    for note in metrics.unit_notes():
         typer.echo(note)
-    for gap in sequence["bridged"]:
-        typer.echo(f"INTERPOLATED: frames {gap['first']} to {gap['last']}: {gap['reason']}")
-    depth = "" if provenance["depth_source"] == "network" else f"; depth {provenance['depth_source']}"
-    typer.echo(f"weights {provenance['weights']}: {provenance['weights_licence']}{depth}")
-    if provenance["leak"]:
+    for gap in sequence.bridged:
+        typer.echo(f"INTERPOLATED: frames {gap.first} to {gap.last}: {gap.reason}")
+    depth = "" if provenance.depth_source == "network" else f"; depth {known(provenance.depth_source)}"
+    typer.echo(f"weights {known(provenance.weights)}: {known(provenance.weights_licence)}{depth}")
+    if provenance.leak is True:
         typer.echo("LEAK: these weights were trained on frames of this sequence")
-    frames, before = sequence["frames"], sequence.get("continued_at", 0)
+    frames, before = known(sequence.frames) or 0, known(sequence.continued_at) or 0
     processed = f"{frames - before} more frames, {frames} in all," if before else f"{frames} frames"
-    seconds, per_second = timing["seconds_total"], timing["frames_per_second"]
-    report = path / "report.html"
+    seconds, per_second = written(timing.seconds_total, 1), written(timing.frames_per_second, 1)
+    report = path / REPORT
     typer.echo(
-        f"{processed} in {seconds:.1f} s ({per_second:.1f} a second); everything in {path}"
+        f"{processed} in {seconds} s ({per_second} a second); everything in {path}"
         + (f", read {report}" if report.is_file() else "")
     )
 

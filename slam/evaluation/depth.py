@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
+
+from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
 
 LEAST_M, LARGEST_M = 1.0, 80.0
 COVERAGES = (50, 90, 95)
 _PIXELS_OF_A_FRAME = 3000
 _MOST_FRAMES = 500  # held; of a longer drive every second frame, every fourth, and so on
+
+
+class DepthMetrics(Record):
+    """The object D of ``metrics.json``; ``coverage`` is the share of errors inside so many per cent of the noise."""
+
+    abs_rel: Known[float] = MISSING
+    median_rel: Known[float] = MISSING
+    rmse_m: Known[float] = MISSING
+    a1: Known[float] = MISSING
+    coverage: Known[dict[str, float]] = MISSING
+    frames: Known[Count] = MISSING
 
 
 class DepthErrors:
@@ -51,26 +62,22 @@ class DepthErrors:
         if len(self._depths) > _MOST_FRAMES:
             self._depths, self._step = self._depths[::2], 2 * self._step
 
-    def summary(self) -> dict[str, Any] | None:
-        """The numbers over all pixels; None where no frame had truth.
-
-        ``coverage`` is the share of errors inside the central interval of so many per cent of the stated noise.
-        """
+    def metrics(self) -> DepthMetrics | None:
+        """The errors over all pixels; None where no frame had truth."""
         if not any(part.size for part in self._depths):
             return None
         depth, truth, sigma = np.concatenate(self._depths, axis=1).astype(np.float64)
         relative = np.abs(depth - truth) / truth
         ratio = np.maximum(depth / truth, truth / np.maximum(depth, 1e-9))
-        numbers: dict[str, Any] = {
-            "abs_rel": float(relative.mean()),
-            "median_rel": float(np.median(relative)),
-            "rmse_m": float(np.sqrt(np.square(depth - truth).mean())),
-            "a1": float((ratio < 1.25).mean()),
-        }
-        if np.isnan(sigma).any():
-            numbers |= {"coverage": None, "coverage_reason": "the network states no noise of its depth"}
-        else:
+        coverage: dict[str, float] | Missing = Missing("the network states no noise of its depth")
+        if not np.isnan(sigma).any():
             errors = np.log(ratio) / sigma
-            levels = {str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES}
-            numbers["coverage"] = levels
-        return numbers | {"frames": len(self._depths)}
+            coverage = {str(level): float((errors < ndtri(0.5 + level / 200)).mean()) for level in COVERAGES}
+        return DepthMetrics(
+            abs_rel=float(relative.mean()),
+            median_rel=float(np.median(relative)),
+            rmse_m=float(np.sqrt(np.square(depth - truth).mean())),
+            a1=float((ratio < 1.25).mean()),
+            coverage=coverage,
+            frames=len(self._depths),
+        )

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from slam.formats.trajectory import Trajectory, associate
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
+from slam.runtime.run_files import REFERENCE
 
-REFERENCE = "reference"
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 FIGURE_LENGTHS_M = (10.0, 20.0, 50.0, *KITTI_LENGTHS_M)
 SEGMENT_STEP = 10
@@ -76,7 +76,7 @@ def segment_errors(
         T_world_reference: true poses ``(N, 4, 4)``.
         lengths_m: path lengths, in increasing order.
     """
-    distance = path_distance(T_world_reference)
+    distance = se3.path_distance(T_world_reference)
     segments = []
     for length_m in lengths_m:
         starts = np.arange(0, len(distance), SEGMENT_STEP)
@@ -114,14 +114,3 @@ def segment_drifts(estimate: Trajectory, reference: Trajectory) -> list[Drift]:
 def estimates(trajectories: Mapping[str, Trajectory]) -> list[tuple[str, Trajectory]]:
     """All but the reference, by name."""
     return [(name, trajectory) for name, trajectory in trajectories.items() if name != REFERENCE]
-
-
-def path_distance(T_world_camera: FloatArray) -> FloatArray:
-    """Distance travelled ``(N,)`` up to each of the poses ``(N, 4, 4)``."""
-    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def travelled(trajectory: Trajectory) -> FloatArray:
-    """Distance travelled ``(N,)`` up to each pose of a trajectory."""
-    return path_distance(trajectory.T_world_camera)

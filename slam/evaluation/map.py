@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial import cKDTree
 
 from slam.evaluation.surface import (
@@ -20,7 +21,6 @@ from slam.evaluation.surface import (
     SPARSE_VIEW_STEP_M,
     VIEW_STEP_M,
     Indices,
-    Mask,
     SurfaceTruth,
     accumulated,
     length_m,
@@ -29,7 +29,9 @@ from slam.evaluation.surface import (
     stretches,
     thinned,
 )
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray, Similarity, nearest_rotation
+from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
 
 NEAR_CAMERA_M = 20.0
 COVERED_WITHIN_M = 0.3
@@ -41,9 +43,62 @@ _LEVER_M = 10.0  # distance from the camera at which an alignment counts rotatio
 _LEAST_IN_BIN = 20
 _LEAF_POINTS = 32  # of the tree of true surface: less memory than with 16
 
-_NO_MAP = "no map point lies within 25 m of a camera whose surroundings are known"
-_NO_SURFACE = "no true surface is known at this distance from a camera"
-_FEW = "too few points at this distance from a camera"
+_NO_MAP = Missing("no map point lies within 25 m of a camera whose surroundings are known")
+_NO_SURFACE = Missing("no true surface is known at this distance from a camera")
+_FEW = Missing("too few points at this distance from a camera")
+
+
+class Within(Record):
+    """A share or score for two limits of distance in metres."""
+
+    m02: Known[float] = Field(default=MISSING, alias="0.2")
+    m05: Known[float] = Field(default=MISSING, alias="0.5")
+
+
+class SurfaceMetrics(Record):
+    """Errors of points of a map and of the true surface."""
+
+    accuracy_median_m: Known[float] = MISSING
+    accuracy_90_m: Known[float] = MISSING
+    outlier_share: Known[float] = MISSING
+    completeness: Known[float] = MISSING
+    f_score: Known[Within] = MISSING
+    precision: Known[Within] = MISSING
+    recall: Known[Within] = MISSING
+
+
+class _Share(Record):
+    share: Known[float] = MISSING
+
+
+class InField(SurfaceMetrics, _Share):
+    """Errors without points that the truth's sensor could not have seen, and the ``share`` of those that it could."""
+
+
+class _Bin(Record):
+    from_m: Known[float] = MISSING
+    to_m: Known[float] = MISSING
+    map_points: Known[Count] = MISSING
+    surface_points: Known[Count] = MISSING
+
+
+class Ring(SurfaceMetrics, _Bin):
+    """Errors between two distances from the nearest camera."""
+
+
+class PlacedMetrics(SurfaceMetrics):
+    """Errors of a map that was moved to the truth."""
+
+    in_field: Known[InField] = MISSING
+    by_distance: Known[list[Ring]] = MISSING
+
+
+class _Scale(Record):
+    scale: Known[float] = MISSING
+
+
+class ScaledMetrics(PlacedMetrics, _Scale):
+    """Errors after a motion with a scale."""
 
 
 def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray, with_scale: bool = True) -> Similarity:
@@ -132,55 +187,51 @@ def compare(truth: SurfaceTruth, T_world_camera: FloatArray, maps: Mapping[str, 
     return MapComparison({name: _together(each) for name, each in found.items()}, length_m(T_world_camera, parts))
 
 
-def statistics(distances: MapDistances) -> dict[str, Any]:
-    """All errors of a placed map, also by distance from the nearest camera; a missing one is None with a reason."""
+_Kind = TypeVar("_Kind", bound=SurfaceMetrics)
+_Placed = TypeVar("_Placed", bound=PlacedMetrics)
+
+
+def placed_metrics(kind: type[_Placed], distances: MapDistances, **more: Any) -> _Placed:
+    """All errors of a placed map, also by distance from the nearest camera, with ``more`` values of their record."""
     whole = distances.headline()
-    measured = whole.where_measured()
     curve = []
     for from_m, to_m in BINS_M:
         ring = distances.between(from_m, to_m)
         points = {"map_points": len(ring.to_surface), "surface_points": len(ring.to_map)}
-        curve.append({"from_m": from_m, "to_m": to_m, **points, **_errors(ring, _LEAST_IN_BIN)})
-    return {
-        **_errors(whole, 1),
-        "in_field": _number("share", _share(whole.in_field), _NO_MAP) | _errors(measured, 1),
-        "by_distance": curve,
-    }
+        curve.append(_metrics(Ring, ring, _LEAST_IN_BIN, from_m=from_m, to_m=to_m, **points))
+    share = _share(whole.in_field) if len(whole.in_field) else _NO_MAP
+    in_field = _metrics(InField, whole.where_measured(), 1, share=share)
+    return _metrics(kind, whole, 1, in_field=in_field, by_distance=curve, **more)
 
 
-def _errors(distances: MapDistances, least: int) -> dict[str, Any]:
-    """Accuracy, completeness and F-scores of these points; None with a reason below ``least`` points."""
+def _metrics(kind: type[_Kind], distances: MapDistances, least: int, **more: Any) -> _Kind:
+    """Accuracy, completeness and F-scores of these points, missing below ``least`` points."""
     own, true = distances.to_surface, distances.to_map
-    no_map = _NO_MAP if least == 1 else _FEW
-    no_surface = _NO_SURFACE if least == 1 else _FEW
-    has_map, has_surface = len(own) >= least, len(true) >= least
-    precision = {key: _share(own <= within) if has_map else None for key, within in F_SCORES_M.items()}
-    recall = {key: _share(true <= within) if has_surface else None for key, within in F_SCORES_M.items()}
-    f_score: dict[str, Any] = {}
-    for key in F_SCORES_M:
-        f_score |= _number(key, _harmonic_mean(precision[key], recall[key]), no_map if not has_map else no_surface)
-    return {
-        **_number("accuracy_median_m", float(np.median(own)) if has_map else None, no_map),
-        **_number("accuracy_90_m", float(np.quantile(own, 0.9)) if has_map else None, no_map),
-        **_number("outlier_share", _share(own > OUTLIER_M) if has_map else None, no_map),
-        **_number("completeness", _share(true <= COVERED_WITHIN_M) if has_surface else None, no_surface),
-        "f_score": f_score,
-        "precision": {k: v for key in precision for k, v in _number(key, precision[key], no_map).items()},
-        "recall": {k: v for key in recall for k, v in _number(key, recall[key], no_surface).items()},
-    }
+    no_map = (_NO_MAP if least == 1 else _FEW) if len(own) < least else None
+    no_surface = (_NO_SURFACE if least == 1 else _FEW) if len(true) < least else None
+    precision = {key: no_map or _share(own <= within) for key, within in F_SCORES_M.items()}
+    recall = {key: no_surface or _share(true <= within) for key, within in F_SCORES_M.items()}
+    return kind(
+        accuracy_median_m=no_map or float(np.median(own)),
+        accuracy_90_m=no_map or float(np.quantile(own, 0.9)),
+        outlier_share=no_map or _share(own > OUTLIER_M),
+        completeness=no_surface or _share(true <= COVERED_WITHIN_M),
+        f_score=Within(**{key: _harmonic_mean(precision[key], recall[key]) for key in F_SCORES_M}),
+        precision=Within(**precision),
+        recall=Within(**recall),
+        **more,
+    )
 
 
-def _number(name: str, value: float | None, reason: str) -> dict[str, Any]:
-    return {name: value} if value is not None else {name: None, f"{name}_reason": reason}
+def _share(which: Mask) -> float:
+    return float(which.mean())
 
 
-def _share(which: Mask) -> float | None:
-    return float(which.mean()) if len(which) else None
-
-
-def _harmonic_mean(precision: float | None, recall: float | None) -> float | None:
-    if precision is None or recall is None:
-        return None
+def _harmonic_mean(precision: float | Missing, recall: float | Missing) -> float | Missing:
+    if isinstance(precision, Missing):
+        return precision
+    if isinstance(recall, Missing):
+        return recall
     return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from slam.geometry.se3 import FloatArray, rotation_angle
+from slam.frames import Mask
+from slam.geometry.se3 import FloatArray, path_distance, rotation_angle
 
 RANGE_M = 25.0  # of map points and of the true surface to the nearest camera
 STRETCH_M = 100.0
@@ -32,7 +33,6 @@ _KEY_BITS = 21  # a coordinate in voxels, both signs
 _OFFSET = np.dtype("V12")  # three float32 as one, which are inserted six times faster
 
 Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,7 @@ def stretches(T_world_camera: FloatArray, truth_frames: Indices) -> list[Indices
     """
     positions = T_world_camera[:, :3, 3]
     away, _ = cKDTree(positions[truth_frames]).query(positions)
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    number = (travelled / STRETCH_M).astype(np.int64)
+    number = (path_distance(T_world_camera) / STRETCH_M).astype(np.int64)
     parts = [np.flatnonzero((number == k) & (away <= _NEAR_TRUTH_M)) for k in range(int(number[-1]) + 1)]
     parts = [part for part in parts if len(part)]
     if len(parts) <= MOST_STRETCHES:

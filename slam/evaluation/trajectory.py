@@ -9,39 +9,83 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from pydantic import Field
 
 from erfsfm.evaluation.pose_metrics import SnippetErrors, snippet_errors, snippets_from_trajectory
-from slam.evaluation.drift import KITTI_LENGTHS_M, path_distance, relative_errors, segment_errors
+from slam.evaluation.drift import KITTI_LENGTHS_M, relative_errors, segment_errors
 from slam.formats.trajectory import Trajectory, matching_tolerance_s, read_trajectory
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import ConfigError, TrajectoryError
+from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record
 
 Alignment = Literal["none", "first", "scale", "6dof", "7dof"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 
-Metric = float | int | str
-"""A number, or in words why there is none."""
-
 SNIPPET_LENGTH = 5
 _SAME_ROTATION = 1e-9  # of the entries of a matrix
 
-_SNIPPET_KEYS = ("ate_mean", "ate_std", "re_mean", "re_std", "count")
-_ALIGN_KEYS = ("ate_rmse_m", "t_rel_percent", "r_rel_deg_per_100m", "rpe_trans_m", "rpe_rot_deg", "scale")
-_EVO_KEYS = ("ape_rmse_m_7dof", "rpe_trans_m", "rpe_rot_deg", "difference")
 # With fewer frames an alignment fits exactly, and its zero error is meaningless.
 _FEWEST_FRAMES: dict[Alignment, int] = {"none": 2, "first": 2, "scale": 3, "6dof": 3, "7dof": 3}
 _NO_REFERENCE = "there is no reference trajectory"
 _NOTHING_MOVES = "neither the estimate nor the reference moves, so there is no error to measure"
-_BACKWARDS = "the best scale is negative: the estimate goes the other way"
+_BACKWARDS = Missing("the best scale is negative: the estimate goes the other way")
 _OPPOSITE = -0.9  # cosine between the positions of snippets
-_REFERENCE_STANDS_STILL = "the reference does not move, so scaling would hide every error"
+_REFERENCE_STANDS_STILL = Missing("the reference does not move, so scaling would hide every error")
+
+
+class SnippetMetrics(Record):
+    """Errors of snippets of five frames, mean and standard deviation, and their number."""
+
+    ate_mean: Known[float] = MISSING
+    ate_std: Known[float] = MISSING
+    re_mean: Known[float] = MISSING
+    re_std: Known[float] = MISSING
+    count: Known[Count] = MISSING
+
+
+class AlignedMetrics(Record):
+    """The object A of ``metrics.json``: errors under one alignment."""
+
+    ate_rmse_m: Known[float] = MISSING
+    t_rel_percent: Known[float] = MISSING
+    r_rel_deg_per_100m: Known[float] = MISSING
+    rpe_trans_m: Known[float] = MISSING
+    rpe_rot_deg: Known[float] = MISSING
+    scale: Known[float] = MISSING
+
+
+class Alignments(Record):
+    """Errors by alignment."""
+
+    none: Known[AlignedMetrics] = MISSING
+    first: Known[AlignedMetrics] = MISSING
+    scale: Known[AlignedMetrics] = MISSING
+    dof6: Known[AlignedMetrics] = Field(default=MISSING, alias="6dof")
+    dof7: Known[AlignedMetrics] = Field(default=MISSING, alias="7dof")
+
+
+class EvoMetrics(Record):
+    """Statistics under the alignment ``7dof`` by evo, and their largest difference from ours."""
+
+    ape_rmse_m_7dof: Known[float] = MISSING
+    rpe_trans_m: Known[float] = MISSING
+    rpe_rot_deg: Known[float] = MISSING
+    difference: Known[float] = MISSING
+
+
+class TrajectoryMetrics(Record):
+    """The object T of ``metrics.json``: all errors of a trajectory."""
+
+    snippet5: Known[SnippetMetrics] = MISSING
+    align: Known[Alignments] = MISSING
+    evo: Known[EvoMetrics] = MISSING
 
 
 @dataclass(frozen=True)
@@ -50,15 +94,13 @@ class Aligned:
 
     T_world_estimate: FloatArray
     T_world_reference: FloatArray
-    scale: Metric
+    scale: float | Missing
 
 
 def trajectory_metrics(
     estimate: Trajectory, reference: Trajectory | None, snippet5: SnippetErrors | None = None
-) -> dict[str, Any]:
-    """The object T of ``metrics.json`` (``design.md``, section 7), ready for JSON.
-
-    Every number that cannot be computed is None, with the reason in a sibling ``<name>_reason``.
+) -> TrajectoryMetrics:
+    """The object T of ``metrics.json`` (``docs/outputs.md``); a number that cannot be computed is missing.
 
     Args:
         estimate: the trajectory to evaluate.
@@ -70,22 +112,22 @@ def trajectory_metrics(
     """
     reason = _why_not(estimate, reference)
     if reference is None or reason:
-        aligned_metrics = {name: _null(_ALIGN_KEYS, reason) for name in ALIGNMENTS}
-        unmatched = _record(_snippet_metrics(snippet5)) if snippet5 else _null(_SNIPPET_KEYS, reason)
-        return {"snippet5": unmatched, "align": aligned_metrics, "evo": _null(_EVO_KEYS, reason)}
+        snippets = _snippet_metrics(snippet5) if snippet5 else SnippetMetrics.missing(reason)
+        aligned = Alignments(**dict.fromkeys(Alignments.model_fields, AlignedMetrics.missing(reason)))
+        return TrajectoryMetrics(snippet5=snippets, align=aligned, evo=EvoMetrics.missing(reason))
     T_world_estimate, T_world_reference = estimate.T_world_camera, reference.T_world_camera
     ours = {name: _alignment_metrics(T_world_estimate, T_world_reference, name) for name in ALIGNMENTS}
-    snippets = snippet5 or _cut_snippets(T_world_estimate, T_world_reference)
-    snippet_metrics = _snippet_metrics(snippets)
-    if snippets and _stands_still(T_world_reference):
-        snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL)
-    elif snippets and snippet5 is None and _goes_backwards(T_world_estimate, T_world_reference):
-        snippet_metrics |= dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS)
-    return {
-        "snippet5": _record(snippet_metrics),
-        "align": {name: _record(metrics) for name, metrics in ours.items()},
-        "evo": _record(_evo_metrics(T_world_estimate, T_world_reference, ours["7dof"])),
-    }
+    snippet5, is_cut = snippet5 or _cut_snippets(T_world_estimate, T_world_reference), snippet5 is None
+    snippets = _snippet_metrics(snippet5)
+    if snippet5 and _stands_still(T_world_reference):
+        snippets = snippets.model_copy(update=dict.fromkeys(("ate_mean", "ate_std"), _REFERENCE_STANDS_STILL))
+    elif snippet5 and is_cut and _goes_backwards(T_world_estimate, T_world_reference):
+        snippets = snippets.model_copy(update=dict.fromkeys(("ate_mean", "ate_std"), _BACKWARDS))
+    return TrajectoryMetrics(
+        snippet5=snippets,
+        align=Alignments.model_validate(ours),
+        evo=_evo_metrics(T_world_estimate, T_world_reference, ours["7dof"]),
+    )
 
 
 def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment) -> Aligned:
@@ -106,7 +148,7 @@ def align(T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment
         fit = se3.umeyama(g, p, with_scale=scaled and not still)
     elif scaled and not still:
         fit = se3.Similarity(float((g * p).sum() / (p * p).sum()), np.eye(3), np.zeros(3))
-    scale: Metric = "the estimate does not move, so its scale is undefined" if scaled and still else fit.scale
+    scale = Missing("the estimate does not move, so its scale is undefined") if scaled and still else fit.scale
     return Aligned(fit.apply_to_poses(T_world_estimate), T_world_reference, scale)
 
 
@@ -127,7 +169,7 @@ def evo_commands(estimate: Path | str, reference: Path | str, format: str = "aut
     return [f"evo_ape {files} {options}", f"{steps} trans_part", f"{steps} angle_deg"]
 
 
-def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
+def exceeded(metrics: TrajectoryMetrics, limits: Sequence[str]) -> list[str]:
     """Metrics of T above their limits, one line each; a missing number counts as above.
 
     Args:
@@ -138,7 +180,7 @@ def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: if a limit is malformed or there is no such metric.
     """
-    lines = []
+    lines, names, tree = [], list(AlignedMetrics.model_fields), metrics.tree()
     for limit in limits:
         name, _, text = (part.strip() for part in limit.partition("="))
         try:
@@ -147,14 +189,14 @@ def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
             most = math.nan
         if not name or math.isnan(most):
             raise ConfigError(f"a limit is METRIC=VALUE with a number for VALUE; got '{limit}'")
-        path = f"align.7dof.{name}" if name in _ALIGN_KEYS else name
+        path = f"align.7dof.{name}" if name in names else name
         section, _, key = path.rpartition(".")
         if path not in _metric_paths():
             raise ConfigError(
-                f"there is no metric '{name}'; use {', '.join(_ALIGN_KEYS)} (under 7dof), "
+                f"there is no metric '{name}'; use {', '.join(names)} (under 7dof), "
                 f"align.{{{','.join(ALIGNMENTS)}}}.NAME, snippet5.NAME or evo.NAME"
             )
-        record: Any = metrics
+        record: Any = tree
         for part in section.split("."):
             record = record[part]
         if record[key] is None:
@@ -166,8 +208,12 @@ def exceeded(metrics: Mapping[str, Any], limits: Sequence[str]) -> list[str]:
 
 def _metric_paths() -> set[str]:
     """Every dotted path to a number of T."""
-    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in _ALIGN_KEYS}
-    return paths | {f"snippet5.{key}" for key in _SNIPPET_KEYS} | {f"evo.{key}" for key in _EVO_KEYS}
+    paths = {f"align.{name}.{key}" for name in ALIGNMENTS for key in AlignedMetrics.model_fields}
+    return (
+        paths
+        | {f"snippet5.{key}" for key in SnippetMetrics.model_fields}
+        | {f"evo.{key}" for key in EvoMetrics.model_fields}
+    )
 
 
 def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
@@ -188,32 +234,32 @@ def _why_not(estimate: Trajectory, reference: Trajectory | None) -> str:
 
 def _alignment_metrics(
     T_world_estimate: FloatArray, T_world_reference: FloatArray, alignment: Alignment
-) -> dict[str, Metric]:
+) -> AlignedMetrics:
     """The object A: errors of all rows after one alignment."""
     frames, fewest = len(T_world_estimate), _FEWEST_FRAMES[alignment]
     if frames < fewest:
-        return dict.fromkeys(_ALIGN_KEYS, f"this alignment needs {fewest} frames; there are {frames}")
+        return AlignedMetrics.missing(f"this alignment needs {fewest} frames; there are {frames}")
     if alignment in ("scale", "7dof") and _stands_still(T_world_reference):
-        return dict.fromkeys(_ALIGN_KEYS, _REFERENCE_STANDS_STILL)
+        return AlignedMetrics.missing(_REFERENCE_STANDS_STILL.reason)
     aligned = align(T_world_estimate, T_world_reference, alignment)
-    if not isinstance(aligned.scale, str) and aligned.scale <= 0:
-        return dict.fromkeys(_ALIGN_KEYS, _BACKWARDS)
+    if not isinstance(aligned.scale, Missing) and aligned.scale <= 0:
+        return AlignedMetrics.missing(_BACKWARDS.reason)
     offsets = aligned.T_world_estimate[:, :3, 3] - aligned.T_world_reference[:, :3, 3]
-    return {
-        "ate_rmse_m": float(np.sqrt((offsets**2).sum(axis=1).mean())),
+    return AlignedMetrics(
+        ate_rmse_m=float(np.sqrt((offsets**2).sum(axis=1).mean())),
         **_segment_metrics(aligned.T_world_estimate, aligned.T_world_reference),
         **_step_metrics(aligned.T_world_estimate, aligned.T_world_reference),
-        "scale": aligned.scale,
-    }
+        scale=aligned.scale,
+    )
 
 
-def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, Metric]:
+def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Missing]:
     """KITTI's drift: the mean over all segments of 100 to 800 m of true path."""
     segments = segment_errors(T_world_estimate, T_world_reference, KITTI_LENGTHS_M)
     if not segments:
-        path_m = path_distance(T_world_reference)[-1]
-        reason = f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m"
-        return {"t_rel_percent": reason, "r_rel_deg_per_100m": reason}
+        path_m = se3.path_distance(T_world_reference)[-1]
+        none = Missing(f"no segment of {KITTI_LENGTHS_M[0]:.0f} m fits into the path of {path_m:.1f} m")
+        return {"t_rel_percent": none, "r_rel_deg_per_100m": none}
     translation = np.concatenate([each.translation_m / each.length_m for each in segments])
     rotation = np.concatenate([each.rotation / each.length_m for each in segments])
     return {
@@ -222,11 +268,11 @@ def _segment_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray
     }
 
 
-def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, Metric]:
+def _step_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray) -> dict[str, float | Missing]:
     """Mean error from each frame to the next."""
     first = np.arange(len(T_world_estimate) - 1)
     if not first.size:
-        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), "a single frame makes no step")
+        return dict.fromkeys(("rpe_trans_m", "rpe_rot_deg"), Missing("a single frame makes no step"))
     translation, rotation = relative_errors(T_world_estimate, T_world_reference, first, first + 1)
     return {"rpe_trans_m": float(translation.mean()), "rpe_rot_deg": float(np.rad2deg(rotation).mean())}
 
@@ -246,29 +292,27 @@ def _goes_backwards(T_world_estimate: FloatArray, T_world_reference: FloatArray)
     return bool((g * p).sum() < _OPPOSITE * np.sqrt((g * g).sum() * (p * p).sum()))
 
 
-def _snippet_metrics(errors: SnippetErrors | None) -> dict[str, Metric]:
+def _snippet_metrics(errors: SnippetErrors | None) -> SnippetMetrics:
     if errors is None:
-        return {**dict.fromkeys(_SNIPPET_KEYS, f"a snippet needs {SNIPPET_LENGTH} frames"), "count": 0}
-    values = asdict(errors)
-    return {key: values[key] for key in _SNIPPET_KEYS}
+        few = Missing(f"a snippet needs {SNIPPET_LENGTH} frames")
+        return SnippetMetrics(ate_mean=few, ate_std=few, re_mean=few, re_std=few, count=0)
+    return SnippetMetrics.model_validate(asdict(errors))
 
 
-def _evo_metrics(
-    T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: Mapping[str, Metric]
-) -> dict[str, Metric]:
+def _evo_metrics(T_world_estimate: FloatArray, T_world_reference: FloatArray, ours: AlignedMetrics) -> EvoMetrics:
     """The statistics of ``7dof`` again, computed by evo alone, and the largest disagreement with ours."""
-    if isinstance(ours["ate_rmse_m"], str):
-        return dict.fromkeys(_EVO_KEYS, ours["ate_rmse_m"])
+    if isinstance(ours.ate_rmse_m, Missing):
+        return EvoMetrics.missing(ours.ate_rmse_m.reason)
     try:
         from evo import EvoException
         from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
         from evo.core.trajectory import PosePath3D
     except ImportError as error:
-        return dict.fromkeys(_EVO_KEYS, f"evo cannot be imported ({error})")
+        return EvoMetrics.missing(f"evo cannot be imported ({error})")
     estimate, reference = PosePath3D(poses_se3=[*T_world_estimate]), PosePath3D(poses_se3=[*T_world_reference])
+    values = {}
     try:
         estimate.align(reference, correct_scale=True)
-        values: dict[str, Metric] = {}
         for key, metric, statistic in (
             ("ape_rmse_m_7dof", APE(PoseRelation.translation_part), StatisticsType.rmse),
             ("rpe_trans_m", RPE(PoseRelation.translation_part, 1, Unit.frames), StatisticsType.mean),
@@ -277,10 +321,10 @@ def _evo_metrics(
             metric.process_data((reference, estimate))
             values[key] = float(metric.get_statistic(statistic))
     except EvoException as error:
-        return dict.fromkeys(_EVO_KEYS, f"evo fails: {error}")
-    pairs = (("ape_rmse_m_7dof", "ate_rmse_m"), ("rpe_trans_m", "rpe_trans_m"), ("rpe_rot_deg", "rpe_rot_deg"))
-    differences = [abs(float(values[theirs]) - float(ours[mine])) for theirs, mine in pairs]
-    return {**values, "difference": max(differences)}
+        return EvoMetrics.missing(f"evo fails: {error}")
+    pairs = zip(values.values(), (ours.ate_rmse_m, ours.rpe_trans_m, ours.rpe_rot_deg))
+    differences = [abs(theirs - mine) for theirs, mine in pairs if not isinstance(mine, Missing)]
+    return EvoMetrics(**values, difference=max(differences))
 
 
 def _stands_still(T_world_camera: FloatArray) -> bool:
@@ -293,18 +337,3 @@ def _is_constant(T_world_camera: FloatArray) -> bool:
     """Whether all poses are equal, up to rounding."""
     turned = np.ptp(T_world_camera[:, :3, :3], axis=0).max() > _SAME_ROTATION
     return _stands_still(T_world_camera) and not turned
-
-
-def _null(keys: Sequence[str], reason: str) -> dict[str, Any]:
-    return _record(dict.fromkeys(keys, reason))
-
-
-def _record(metrics: Mapping[str, Metric]) -> dict[str, Any]:
-    """Numbers by name; reasons and numbers that are not finite become None and a reason."""
-    record: dict[str, Any] = {}
-    for name, metric in metrics.items():
-        reason = metric if isinstance(metric, str) else "" if math.isfinite(metric) else "the result is not finite"
-        record[name] = None if reason else metric
-        if reason:
-            record[f"{name}_reason"] = reason
-    return record

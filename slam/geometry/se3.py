@@ -64,6 +64,12 @@ def chain(T_previous_next: FloatArray) -> FloatArray:
     return T_first_k
 
 
+def path_distance(T_world_camera: FloatArray) -> FloatArray:
+    """Distance travelled ``(N,)`` up to each of the poses ``(N, 4, 4)``."""
+    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def nearest_rotation(M: FloatArray) -> FloatArray:
     """The rotations ``(..., 3, 3)`` closest to M in the Frobenius norm (orthogonal Procrustes by SVD)."""
     U, _, Vt = np.linalg.svd(M)

@@ -11,7 +11,7 @@ import numpy as np
 
 from slam.config.sections import LoopsConfig
 from slam.frames import Intrinsics, RelativePose, View
-from slam.geometry.se3 import FloatArray
+from slam.geometry.se3 import FloatArray, path_distance
 from slam.loops.consistency import agreeing
 from slam.loops.retrieval import find_candidates, least_path
 from slam.loops.thresholds import LoopThresholds
@@ -107,9 +107,7 @@ def close_loops(
     """
     if not config.enabled:
         return LoopClosures(not_sought="loop closure is switched off (loops.enabled)")
-    steps = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
-    path = np.concatenate([[0.0], np.cumsum(steps)])
-    path = path[np.array([view.index for view in views], dtype=int)]
+    path = path_distance(T_world_camera)[np.array([view.index for view in views], dtype=int)]
     candidates = find_candidates(views, path, least_path(views, is_metric))
     thresholds = LoopThresholds.of_frames(config)
     verifier = LoopVerifier(thresholds, intrinsics, seed)

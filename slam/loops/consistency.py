@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.geometry.se3 import FloatArray, invert, path_distance, rotation_angle
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import Loop, RejectedLoop
 
@@ -28,7 +28,7 @@ def agreeing(
         T_world_camera: odometry ``(N, 4, 4)``.
         thresholds: of nearness and of agreement.
     """
-    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1))])
+    path = path_distance(T_world_camera)
     possible, kept, refused = [], [], []
     for loop in loops:
         earlier, later = loop.ends

@@ -15,7 +15,6 @@ from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import RunError
 from slam.runtime.storage.archive import opened_archive, read_array
 
-PLACES = "places.npz"
 _FORMAT = 1
 # kind and shape of each array, for V views and M corners
 _ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.config.sections import MappingConfig
-from slam.frames import DepthMap, Image, Intrinsics
+from slam.frames import DepthMap, Image, Intrinsics, Mask
 from slam.geometry.se3 import FloatArray, invert
 
-Mask = NDArray[np.bool_]
 _OUTSIDE = -9.0  # a column left of every image
 _DARK_BLUE = 110  # grey levels below which nothing is the sky by day
 _MOST_SIGMA = 1e3  # relative, in place of infinity where depth is unknown

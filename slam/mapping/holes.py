@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.patch import Mask, Patch, Triangles, in_tile
+from slam.mapping.patch import Patch, Triangles, in_tile
 
 _UPWARDS = 0.85  # least cosine to the camera's own upwards
 _FLAT = 0.15  # largest height of a hole's edge over its diameter

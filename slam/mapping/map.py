@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +15,12 @@ from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.mapping.filters import DepthFilters, KeyframeDepth
 from slam.mapping.fusion import Fusion
-from slam.mapping.submap import BLOCK_VOXELS, FOLDER, Submap, remove_submaps, submap_path, submap_paths
-from slam.mapping.surface import MapSurface, Progress, colours, normals, positions, submap_mesh
+from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_path, submap_paths
+from slam.mapping.surface import MapSurface, colours, normals, positions
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.progress import Progress
+from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
@@ -98,10 +99,9 @@ class TsdfMap:
         self._filters = DepthFilters(config, intrinsics)
         self._views = ViewChooser(self._filters, config.depth_max_m)
         self._temporary = None if folder is not None else tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-")
-        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / FOLDER
+        self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
         remove_submaps(self._folder)  # of a run that was killed here
         self._previous: KeyframeDepth | None = None
-        self._first: int | None = None
         self._first_is_fused = False
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
@@ -122,7 +122,7 @@ class TsdfMap:
         view = replace(keyframe, depth=known_depth, network_depth=None)
         previous = self._previous
         if previous is None:
-            self._first, self._previous = view.frame, view
+            self._previous = view
         elif self._has_moved(view.T_world_camera, previous.T_world_camera):
             if not self._first_is_fused:
                 self._fuse(previous, view)
@@ -169,21 +169,6 @@ class TsdfMap:
         """The whole surface as points, in memory; raises as ``surface``."""
         points = np.concatenate(list(self.surface().cloud_pieces()))
         return MapCloud(positions(points), normals(points), colours(points))
-
-    def submap_of(self, frame: int) -> int | None:
-        """Number of the finished submap whose stretch of road a frame is on; None before the first fused frame."""
-        if self._first is None or frame < self._first:
-            return None
-        return max(bisect_right(self._views_of_submaps, frame, key=lambda views: int(views[0])) - 1, 0)
-
-    def submap_anchor(self, number: int) -> int:
-        """The frame in the middle of a finished submap."""
-        views = self._views_of_submaps[number]
-        return int(views[len(views) // 2])
-
-    def submap_mesh(self, number: int) -> tuple[FloatArray, NDArray[np.int64]]:
-        """A finished submap by itself, as `slam.mapping.surface.submap_mesh`."""
-        return submap_mesh(submap_path(self._folder, number), self._config)
 
     @property
     def voxel_size(self) -> float:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.fusion import new_grid
 from slam.mapping.store import TILE_BLOCKS, Blocks, SubmapStore
@@ -15,7 +16,6 @@ from slam.mapping.submap import BLOCK_SIDE
 from slam.runtime.imports import import_open3d
 
 Triangles = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

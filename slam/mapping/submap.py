@@ -21,7 +21,6 @@ from slam.runtime.storage.files import write_atomically
 
 BLOCK_SIDE = 16
 BLOCK_VOXELS = BLOCK_SIDE**3
-FOLDER = "submaps"
 
 _NAME = re.compile(r"submap_(\d{5})\.npz")
 

@@ -6,7 +6,7 @@ surface are followed from tile to tile, small ones are left out, and the files a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,16 +17,16 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.config.sections import MappingConfig
 from slam.formats.ply_stream import write_ply_pieces
+from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter
 from slam.mapping.holes import with_holes_closed
-from slam.mapping.patch import Mask, Patch, Triangles, extract_patch
+from slam.mapping.patch import Patch, Triangles, extract_patch
 from slam.mapping.store import TILE_BLOCKS, SubmapStore
 from slam.mapping.submap import BLOCK_SIDE
 from slam.runtime.errors import EmptyMapError
+from slam.runtime.progress import Progress
 from slam.runtime.storage.spill import SpilledArray, SpillFile
-
-Progress = Callable[[str, int, int], None]
 
 _LENGTHS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
 VERTEX = np.dtype([*((name, "<f4") for name in _LENGTHS), *((name, "u1") for name in _COLOURS)])
@@ -169,24 +169,6 @@ class MapSurface:
         written: Mask = kept.parts[piece.label.read()]
         written[kept.elsewhere] = False
         return written
-
-
-def submap_mesh(path: Path, config: MappingConfig) -> tuple[FloatArray, Triangles]:
-    """Vertices ``(V, 3)`` and triangles ``(T, 3)`` of one submap by itself, with its small pieces and holes.
-
-    Raises:
-        SlamError: it is damaged.
-    """
-    store = SubmapStore([path])
-    least_weight = min(config.min_weight, float(store.fused))
-    vertices, triangles, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for tile in store.tiles():
-        patch = extract_patch(store, tile, config.voxel_size_m, least_weight)
-        if patch is not None:
-            vertices.append(patch.vertices)
-            triangles.append(patch.triangles[patch.own] + count)
-            count += len(patch.vertices)
-    return np.concatenate(vertices), np.concatenate(triangles)
 
 
 def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:

@@ -42,13 +42,12 @@ from slam.pipeline.positioning import Location, Positioning
 from slam.pipeline.reading import read_frame
 from slam.pipeline.requirements import require_possible
 from slam.runtime.imports import import_open3d_beside
+from slam.runtime.progress import Progress
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, int, int], None]
 
 
 class SlamPipeline:

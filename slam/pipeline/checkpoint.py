@@ -38,13 +38,13 @@ from slam.frontend.window.relative_poses import WindowPoses
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.observer import FrontEndState, RecentFrame
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import DRIVE, KEYFRAMES, KEYFRAMES_PART
 from slam.runtime.storage.archive import opened_archive, read_array
-from slam.runtime.storage.files import KEYFRAMES_PART, remove, write_atomically
+from slam.runtime.storage.files import remove, write_atomically
 from slam.runtime.storage.serialisation import Serialiser
 from slam.runtime.storage.spill import SpillFile
 from slam.sequences.continued import Continued
 
-DRIVE, KEYFRAMES = "drive.zip", "keyframes.npz"
 EVERY_FRAMES = 100
 _GROWTH = 0.1  # of a drive, before its state is written again: all writes together are eleven times the last one
 

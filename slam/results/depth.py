@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 import numpy as np
 
@@ -12,8 +11,9 @@ from slam.frames import DepthMap, Intrinsics, Sequence
 from slam.geometry.se3 import FloatArray, apply
 from slam.mapping.filters import KeyframeDepth
 from slam.results.map_error import NEAREST_M, HasTrueDepth
-from slam.results.summary import null
+from slam.results.metrics import DepthOfKeyframes
 from slam.runtime.errors import SlamError
+from slam.runtime.storage.record import Missing
 from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)
@@ -47,9 +47,9 @@ class DepthQuality:
         if keyframe.relative_sigma is not None:
             self._refined.add(keyframe.depth, truth, keyframe.relative_sigma)
 
-    def summary(self, is_refined: bool) -> dict[str, Any]:
-        """``network`` and ``refined``, each null with a reason where it cannot be computed; warns of unread maps."""
-        network, refined = self._network.summary(), self._refined.summary()
+    def metrics(self, is_refined: bool) -> DepthOfKeyframes:
+        """The errors, each missing with a reason where it cannot be computed; warns of unread maps."""
+        network, refined = self._network.metrics(), self._refined.metrics()
         unreadable = f"the true depth of {len(self._unreadable)} keyframes cannot be read"
         if self._unreadable:
             logger.warning("%s, first %s: they are not compared", unreadable, self._unreadable[0])
@@ -60,12 +60,9 @@ class DepthQuality:
             missing = "there are no keyframes (mapping.enabled)"
         elif not self._is_metric:
             missing = "depth is not in metres (see scale)"
-        numbers = null("network", missing) if network is None else {"network": network}
-        if refined is not None:
-            return numbers | {"refined": refined}
-        if network is not None:
-            missing = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
-        return numbers | null("refined", missing)
+        elsewhere = "no keyframe has a neighbour at a useful distance" if is_refined else "depth.refine is none"
+        why_not_refined = missing if network is None else elsewhere
+        return DepthOfKeyframes(network=network or Missing(missing), refined=refined or Missing(why_not_refined))
 
 
 def true_depth(sequence: Sequence, index: int, count: int = 1) -> DepthMap | None:

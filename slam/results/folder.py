@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from erfsfm.common.lock import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
-from slam.results.output import ESTIMATE, METRICS, claim, reclaim, replace_run, stamped, whole_place
-from slam.results.output import TRAJECTORIES as TRAJECTORIES
-from slam.results.schema import MetricsFile
+from slam.results.metrics import Metrics
+from slam.results.output_folder import claim, reclaim, replace_run, stamped, whole_place
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import ESTIMATE, METRICS, trajectory_file
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.json_file import read_json
+from slam.runtime.storage.record import MISSING, Missing
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +73,7 @@ class RunFolder:
         return cls.open_with_metrics(path)[0]
 
     @classmethod
-    def open_with_metrics(cls, path: str | Path) -> tuple[RunFolder, dict[str, Any]]:
+    def open_with_metrics(cls, path: str | Path) -> tuple[RunFolder, Metrics]:
         """As `open`, with its `metrics`, which are read once."""
         path = Path(path)
         if not (path / METRICS).is_file() and not (path / ESTIMATE).is_file():
@@ -83,8 +81,8 @@ class RunFolder:
             raise RunError(f"{path} is not a run folder: {what}; give a folder that 'erfsfm-slam run' wrote")
         folder = cls(path)
         metrics = folder.metrics()
-        if metrics.get("status", "ok") != "ok":
-            logger.warning("%s: %s: files that are there are whole", path, metrics.get("reason", metrics["status"]))
+        if metrics.failure:
+            logger.warning("%s: %s: files that are there are whole", path, metrics.failure)
         return folder, metrics
 
     def publish(self) -> None:
@@ -109,31 +107,29 @@ class RunFolder:
         """Write a file atomically: ``fill`` writes it under a temporary name."""
         write_atomically(self.path / name, fill, RunError)
 
-    def write_metrics(self, metrics: dict[str, Any]) -> None:
-        """Write ``metrics.json``; a number that is not finite is an error."""
-        self.write_text(METRICS, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    def write_metrics(self, metrics: Metrics) -> None:
+        """Write ``metrics.json``."""
+        self.write_text(METRICS, metrics.to_json() + "\n")
 
-    def write_trajectory(self, stem: str, trajectory: Trajectory) -> None:
-        """Write ``<stem>.kitti.txt`` and ``<stem>.tum.txt``."""
-        write_kitti(self.path / f"{stem}.kitti.txt", trajectory)
-        write_tum(self.path / f"{stem}.tum.txt", trajectory)
+    def write_trajectory(self, name: str, trajectory: Trajectory) -> None:
+        """Write one of the trajectories (``network``, ``optimised``, ``reference`` ...) in both formats."""
+        write_kitti(self.path / trajectory_file(name, "kitti"), trajectory)
+        write_tum(self.path / trajectory_file(name, "tum"), trajectory)
 
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Metrics:
         """The content of ``metrics.json``; without the file, the status of a killed run.
 
         Raises:
             RunError: the file is damaged.
         """
-        path = self.path / METRICS
         try:
-            return read_json(path, MetricsFile)
+            return Metrics.read(self.path / METRICS)
         except FileNotFoundError:
-            return {"status": "running", "reason": f"the run was killed before it wrote {METRICS}"}
+            return Metrics(schema_=1, status="running", reason=f"the run was killed before it wrote {METRICS}")
 
     def trajectory(self, name: str) -> Trajectory | None:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
-        stem = name if name == "reference" else f"trajectory_{name}"
-        path = self.path / f"{stem}.tum.txt"
+        path = self.path / trajectory_file(name, "tum")
         return read_trajectory(path, "tum") if path.exists() else None
 
     def require(self, name: str) -> Path:
@@ -151,6 +147,7 @@ class RunFolder:
 
     def _without_map(self) -> str:
         metrics = self.metrics()
-        numbers = metrics.get("map") or {}
-        reasons = numbers.get("triangles_reason"), metrics.get("map_reason"), metrics.get("reason")
-        return next((reason for reason in reasons if reason), "it ran without a map")
+        triangles = metrics.map.triangles
+        if triangles == MISSING:
+            return metrics.failure or "it ran without a map"
+        return triangles.reason if isinstance(triangles, Missing) else "it ran without a map"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from slam.formats.geographic import write_geojson, write_kml
@@ -14,38 +12,30 @@ from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
-from slam.results.summary import null
+from slam.results.metrics import GpsErrors, GpsMetrics, Origin
+from slam.runtime.run_files import GEOJSON, KML
+from slam.runtime.storage.record import Missing
 
-GEOJSON = "trajectory_optimised.geojson"
-KML = "trajectory_optimised.kml"
 
-
-def gps_metrics(result: Estimate, in_graph: bool) -> dict[str, Any]:
+def gps_metrics(result: Estimate, in_graph: bool) -> GpsMetrics | Missing:
     """Distances of odometry and optimised trajectory from the fixes, and the place of the first camera."""
     location = result.location
     if not isinstance(location, Location):
-        return null("gps", "no GPS track was given" if location is None else location.reason)
+        return Missing("no GPS track was given" if location is None else location.reason)
     T_enu_first = location.T_enu_world @ result.optimised.T_world_camera[0]
     latitude, longitude, height = location.fixes.frame.places(T_enu_first[None, :3, 3])[0].tolist()
     ahead = T_enu_first[:3, 2]
-    origin = {
-        "latitude_deg": latitude,
-        "longitude_deg": longitude,
-        "altitude_m": height,
-        "heading_deg": float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0),
-    }
+    heading = float(np.rad2deg(np.arctan2(ahead[0], ahead[1])) % 360.0)
     aligned = gps.align(location.fixes, result.odometry.T_world_camera, result.odometry.stamps)
-    alone = (
-        null("odometry", aligned.reason)
+    return GpsMetrics(
+        fixes=len(location.fixes.stamps),
+        in_graph=in_graph,
+        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=height, heading_deg=heading),
+        odometry=Missing(aligned.reason)
         if isinstance(aligned, MeasurementFailure)
-        else {"odometry": _errors(location.fixes, aligned, result.odometry)}
+        else _errors(location.fixes, aligned, result.odometry),
+        optimised=_errors(location.fixes, location.T_enu_world, result.optimised),
     )
-    beside = _errors(location.fixes, location.T_enu_world, result.optimised)
-    return {
-        "gps": {"fixes": len(location.fixes.stamps), "in_graph": in_graph, "origin": origin}
-        | alone
-        | {"optimised": beside}
-    }
 
 
 def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
@@ -58,12 +48,12 @@ def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
     write_kml(folder.path / KML, name, places)
 
 
-def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> dict[str, float]:
+def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:
     antenna = fixes.antenna(T_enu_world @ trajectory.T_world_camera, trajectory.stamps)
     apart = antenna - fixes.points
     level = np.linalg.norm(apart[:, :2], axis=1)
-    return {
-        "horizontal_rmse_m": float(np.sqrt((level**2).mean())),
-        "horizontal_median_m": float(np.median(level)),
-        "vertical_rmse_m": float(np.sqrt((apart[:, 2] ** 2).mean())),
-    }
+    return GpsErrors(
+        horizontal_rmse_m=float(np.sqrt((level**2).mean())),
+        horizontal_median_m=float(np.median(level)),
+        vertical_rmse_m=float(np.sqrt((apart[:, 2] ** 2).mean())),
+    )

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from slam.evaluation.map import OUTLIER_M, compare, pose_similarity, statistics
-from slam.evaluation.surface import RANGE_M, Indices, Mask, Surface, SurfaceTruth, backprojected, stretches
-from slam.frames import Intrinsics, Sequence
+from slam.evaluation.map import OUTLIER_M, PlacedMetrics, ScaledMetrics, compare, placed_metrics, pose_similarity
+from slam.evaluation.surface import RANGE_M, Indices, Surface, SurfaceTruth, backprojected, stretches
+from slam.frames import Intrinsics, Mask, Sequence
 from slam.frontend.lidar_odometry import readable_scan
 from slam.geometry.se3 import FloatArray, Similarity, apply, invert
 from slam.pipeline.estimate import Estimate
-from slam.results.summary import null
+from slam.results.metrics import MapErrors
 from slam.runtime.errors import SlamError
 from slam.sequences.continued import recording_of, unused_scans
 
 logger = logging.getLogger(__name__)
 
-_ERRORS = ("accuracy_median_m", "accuracy_90_m", "outlier_share", "completeness", "f_score", "precision", "recall")
-_NAMES = (*_ERRORS, "in_field", "by_distance")
 NEAREST_M = 0.1  # z-depth of a LiDAR point that can be in the image
 _DEPTH_RANGE_M = 50.0
 _MOST_PIXELS = 70_000  # of a depth map; larger ones are sampled
@@ -162,13 +160,7 @@ def find_truth(sequence: Sequence) -> SurfaceTruth | str:
     return f"the true surface is not known: {why}"
 
 
-def no_map_errors(reason: str) -> dict[str, Any]:
-    """Every number of the map's error as missing."""
-    names = (*_NAMES, "truth", "evaluated_m", "with_scale")
-    return {key: value for name in names for key, value in null(name, reason).items()}
-
-
-def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> dict[str, Any]:
+def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, sequence: Sequence) -> MapErrors:
     """Errors of a map moved to the truth by one rigid motion, and under ``with_scale`` by a similarity.
 
     ``pieces`` iterates over the points of the map, ``(P, 3)`` each; of a long drive only those near the stretches that
@@ -176,7 +168,7 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
     """
     truth = find_truth(sequence)
     if isinstance(truth, str):
-        return no_map_errors(truth)
+        return MapErrors.missing(truth)
     assert sequence.reference is not None
     fits = {
         "rigid": pose_similarity(sequence.reference, result.optimised.T_world_camera, with_scale=False),
@@ -192,12 +184,14 @@ def map_errors(pieces: Callable[[], Iterator[FloatArray]], result: Estimate, seq
         found = compare(truth, sequence.reference, placed)
     except SlamError as error:
         logger.warning("the error of the map is not known: %s", error)
-        return no_map_errors(str(error))
+        return MapErrors.missing(str(error))
     if truth.distance is None and len(found.distances["with_scale"].to_map) == 0:
-        return no_map_errors("no point of the true surface is known near the images")
-    scaled = {"scale": fits["with_scale"].scale} | statistics(found.distances["with_scale"])
-    rigid = _unknown_scale() if unmetric else statistics(found.distances["rigid"])
-    return {**rigid, "truth": truth.name, "evaluated_m": found.length_m, "with_scale": scaled}
+        return MapErrors.missing("no point of the true surface is known near the images")
+    with_scale = placed_metrics(ScaledMetrics, found.distances["with_scale"], scale=fits["with_scale"].scale)
+    more = {"truth": truth.name, "evaluated_m": found.length_m, "with_scale": with_scale}
+    if unmetric:
+        return MapErrors(**dict(PlacedMetrics.missing("lengths are not in metres: see with_scale")) | more)
+    return placed_metrics(MapErrors, found.distances["rigid"], **more)
 
 
 def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> FloatArray:
@@ -207,8 +201,3 @@ def _placed(pieces: Iterator[FloatArray], fit: Similarity, cameras: cKDTree) -> 
         moved = fit.scale * points @ fit.R_a_b.T + fit.t_a_b
         near.append(moved[np.isfinite(cameras.query(moved, distance_upper_bound=RANGE_M + OUTLIER_M)[0])])
     return np.concatenate(near)
-
-
-def _unknown_scale() -> dict[str, Any]:
-    reason = "lengths are not in metres: see with_scale"
-    return {key: value for name in _NAMES for key, value in null(name, reason).items()}

@@ -1,177 +1,291 @@
-"""The content of ``metrics.json`` (``docs/outputs.md``)."""
+"""``metrics.json`` and ``loops.json``: their keys, how they are written and read (``docs/outputs.md``)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
+from pydantic import Field
 
-from erfsfm.evaluation.pose_metrics import (
-    SnippetErrors,
-    snippet_errors,
-    snippet_from_network,
-    snippets_from_trajectory,
-)
-from slam.evaluation.coverage import coverage
-from slam.evaluation.trajectory import trajectory_metrics
-from slam.formats.trajectory import Trajectory, associate
-from slam.frames import Sequence
-from slam.frontend.failure import MeasurementFailure
-from slam.frontend.lidar_odometry import LidarPath
-from slam.geometry.se3 import umeyama
-from slam.pipeline.doubts import DOUBLED, doubled_frames
-from slam.pipeline.estimate import Estimate
-from slam.results.folder import TRAJECTORIES, RunFolder
-from slam.results.gps import gps_metrics
-from slam.results.summary import (
-    SCHEMA,
-    Provenance,
-    describe_frames,
-    describe_gaps,
-    describe_sequence,
-    describe_timing,
-    finite,
-    null,
-)
-from slam.sequences.continued import unused_scans
+from slam.config.sections import ScaleMode
+from slam.evaluation.depth import DepthMetrics
+from slam.evaluation.map import PlacedMetrics, ScaledMetrics
+from slam.evaluation.trajectory import TrajectoryMetrics
+from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record, known
+
+METRES = "metres"
+CAMERA_HEIGHTS = "camera heights"
 
 
-def lidar_trajectory(result: Estimate) -> Trajectory | None:
-    """LiDAR odometry with the stamps of its frames."""
-    if not isinstance(result.lidar, LidarPath):
-        return None
-    return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
+class Recording(Record):
+    """Options that name the recording; none for the embedded street."""
+
+    dataset: Known[str] = MISSING
+    camera: Known[str] = MISSING
+    gps: Known[str] = MISSING
+    sequence: Known[str] = MISSING
+    frames: Known[str] = MISSING
 
 
-def _lidar_metrics(result: Estimate, sequence: Sequence) -> dict[str, Any]:
-    """Errors of LiDAR odometry at its frames."""
-    path, lidar = result.lidar, lidar_trajectory(result)
-    if isinstance(path, MeasurementFailure):
-        return null("lidar", path.reason)
-    if path is None or lidar is None:
-        return null("lidar", unused_scans(sequence) or "the sequence has no LiDAR scans")
-    reference = None if result.reference is None else result.reference.select(path.frames).rebased()
-    return {"lidar": trajectory_metrics(lidar, reference)}
+class Provenance(Record):
+    """Version, command, weights and their training data, the noise model beside them, and where depth comes from."""
+
+    version: Known[str] = MISSING
+    commit: Known[str] = MISSING
+    command: Known[str] = MISSING
+    seed: Known[Count] = MISSING
+    device: Known[str] = MISSING
+    weights: Known[str] = MISSING
+    weights_sha256: Known[str] = MISSING
+    noise_sha256: Known[str] = MISSING
+    weights_licence: Known[str] = MISSING
+    trained_on: Known[list[str]] = MISSING
+    leak: Known[bool] = MISSING
+    depth_source: Known[str] = MISSING
+    depth_sha256: Known[str] = MISSING
+    recording: Known[Recording] = MISSING
 
 
-def estimate_metrics(
-    result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
-) -> dict[str, Any]:
-    """All metrics before the map is fused; a missing number is null with its reason."""
-    reference = result.reference
-    trajectories = {
-        "network": trajectory_metrics(result.network, reference, _network_snippets(result)),
-        "odometry": trajectory_metrics(result.odometry, reference),
-        "optimised": trajectory_metrics(result.optimised, reference),
-        **_lidar_metrics(result, sequence),
-    }
-    doubled = dict.fromkeys(doubled_frames(result.drive), DOUBLED)
-    metrics: dict[str, Any] = finite(
-        {
-            "schema": SCHEMA,
-            "status": "estimated",
-            "reason": "the run has not ended, or was killed while it made the map",
-            "provenance": provenance.described(),
-            "sequence": describe_sequence(sequence, reference.length_m if reference is not None else None)
-            | describe_gaps(result.drive.interpolated)
-            | {"doubled": describe_frames(doubled)}
-            | {"unreadable_scans": describe_frames(_unreadable_scans(result))}
-            | {"continued_at": result.first}
-            | {"segments": [asdict(segment) for segment in result.drive.segments]},
-            "timing": describe_timing(result.stopwatch, len(sequence) - result.first),
-            "scale": _scale(result),
-            "trajectories": trajectories,
-            **gps_metrics(result, gps_in_graph),
-            "graph": _graph(result),
-            "loops": result.loops.summary(),
-            **_tracking(result),
-            **_depth_error(result),
-            **null("depth", "the run ended before its map was whole"),
-            **null("map", "the run ended before its map was whole"),
-        }
-    )
-    return metrics
+class Stretch(Record):
+    """Frames ``first`` to ``last`` and what is about them."""
+
+    first: Count
+    last: Count
+    reason: str
 
 
-def _unreadable_scans(result: Estimate) -> Mapping[int, str]:
-    """Frames whose LiDAR scan was left out of the odometry, with the reason."""
-    return result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
+class SequenceMetrics(Record):
+    """Size of the sequence and its true length; interpolated (``bridged``) and doubled frames, segments."""
+
+    name: Known[str] = MISSING
+    frames: Known[Count] = MISSING
+    length_m: Known[float] = MISSING
+    fps: Known[float] = MISSING
+    bridged_frames: Known[Count] = MISSING
+    bridged: Known[list[Stretch]] = MISSING
+    doubled: Known[list[Stretch]] = MISSING
+    unreadable_scans: Known[list[Stretch]] = MISSING
+    continued_at: Known[Count] = MISSING
+    segments: Known[list[Stretch]] = MISSING
 
 
-def _tracking(result: Estimate) -> dict[str, Any]:
-    """Keyframes, their maps, and what became of them."""
-    drive = result.drive
-    if not drive.maps:
-        return null("tracking", "this drive has no map of keyframes: it is measured from step to step")
-    return {
-        "tracking": {
-            "keyframes": sum(len(segment.map.keyframes) for segment in drive.maps),
-            "maps": len(set(drive.map_poses.segments.values())),
-            "events": [asdict(event) for event in drive.events],
-        }
-    }
+class Timing(Record):
+    """Seconds, frames a second over the whole run, processor seconds, peak memory, seconds by stage."""
+
+    seconds_total: Known[float] = MISSING
+    frames_per_second: Known[float] = MISSING
+    cpu_seconds: Known[float] = MISSING
+    peak_rss_mb: Known[float] = MISSING
+    stages: Known[dict[str, float]] = MISSING
 
 
-def _depth_error(result: Estimate) -> dict[str, Any]:
-    """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
-    curve, unit = result.state.odometry.depth_error.curve(), float(np.median(result.scale.per_frame))
-    if not curve:
-        return null("depth_error", "no step triangulated corners with learned depth")
-    keys = ("depth", "bias", "sigma", "corners")
-    return {"depth_error": [dict(zip(keys, (unit * depth, *rest), strict=True)) for depth, *rest in curve]}
+class ScaleMetrics(Record):
+    """Unit of length, and the factor from the networks' unit to it."""
+
+    mode: Known[ScaleMode] = MISSING
+    unit: Known[str] = MISSING
+    value: Known[float] = MISSING
+    spread: Known[float] = MISSING
+    frames_used: Known[Count] = MISSING
 
 
-def whole_metrics(
-    metrics: dict[str, Any], result: Estimate, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
-) -> dict[str, Any]:
-    """The metrics of a complete run: those of the estimate, with depth, the map and the final timing."""
-    timing = describe_timing(result.stopwatch, len(sequence) - result.first)
-    rest = {"timing": timing, "depth": depth, "map": map_summary}
-    whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)
-    return {key: value for key, value in whole.items() if key not in ("reason", "depth_reason", "map_reason")}
+class Trajectories(Record):
+    """Errors by trajectory."""
+
+    network: Known[TrajectoryMetrics] = MISSING
+    odometry: Known[TrajectoryMetrics] = MISSING
+    optimised: Known[TrajectoryMetrics] = MISSING
+    lidar: Known[TrajectoryMetrics] = MISSING
 
 
-def trajectory_metrics_of(folder: RunFolder) -> dict[str, Any]:
-    """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
-    reference = folder.trajectory("reference")
-    numbers: dict[str, Any] = {}
-    for name in TRAJECTORIES:
-        estimate = folder.trajectory(name)
-        if estimate is None:
-            numbers |= null(name, "the run did not write this trajectory")
-        elif reference is None:
-            numbers[name] = trajectory_metrics(estimate, None)
-        else:
-            numbers[name] = trajectory_metrics(*associate(estimate, reference))
-    return numbers
+class Origin(Record):
+    """Place and heading of the first camera on the earth."""
+
+    latitude_deg: Known[float] = MISSING
+    longitude_deg: Known[float] = MISSING
+    altitude_m: Known[float] = MISSING
+    heading_deg: Known[float] = MISSING
 
 
-def _network_snippets(result: Estimate) -> SnippetErrors | None:
-    """The paper's protocol on the network's snippet poses; None without truth or with other snippets."""
-    snippets = result.drive.snippets
-    if result.reference is None or len(snippets[0].sources) != 4:
-        return None
-    predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
-    return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
+class GpsErrors(Record):
+    """Distances of a trajectory from the fixes."""
+
+    horizontal_rmse_m: Known[float] = MISSING
+    horizontal_median_m: Known[float] = MISSING
+    vertical_rmse_m: Known[float] = MISSING
 
 
-def _scale(result: Estimate) -> dict[str, Any]:
-    scale, estimate = result.scale, result.scale.estimate
-    named = {"mode": scale.mode, "unit": scale.unit}
-    if isinstance(estimate, MeasurementFailure):
-        return named | null("value", estimate.reason)
-    return named | {"value": estimate.value, "spread": estimate.spread, "frames_used": estimate.frames_used}
+class GpsMetrics(Record):
+    """The run beside its GPS track."""
+
+    fixes: Known[Count] = MISSING
+    in_graph: Known[bool] = MISSING
+    origin: Known[Origin] = MISSING
+    odometry: Known[GpsErrors] = MISSING
+    optimised: Known[GpsErrors] = MISSING
 
 
-def _graph(result: Estimate) -> dict[str, Any]:
-    """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
-    summary: dict[str, Any] = {"nodes": len(result.optimised), "factors": len(result.graph.relative_poses)}
-    if result.reference is None:
-        return summary | null("coverage", "the sequence has no true poses")
-    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
-    if not aligned.scale > 0:
-        return summary | null("coverage", "the estimate does not move: the truth cannot be scaled to it")
-    covered = coverage(result.graph.relative_poses, result.reference.T_world_camera, aligned.scale)
-    return summary | {"coverage": covered.overall, "coverage_by_source": covered.by_source}
+class Coverage(Record):
+    """Share of factors inside so many per cent of their stated noise, and their number where they are of one source."""
+
+    factors: Known[Count] = MISSING
+    inside_50: Known[float] = Field(default=MISSING, alias="50")
+    inside_90: Known[float] = Field(default=MISSING, alias="90")
+    inside_95: Known[float] = Field(default=MISSING, alias="95")
+
+
+class GraphMetrics(Record):
+    """Size of the graph and coverage of its noise."""
+
+    nodes: Known[Count] = MISSING
+    factors: Known[Count] = MISSING
+    coverage: Known[Coverage] = MISSING
+    coverage_by_source: Known[dict[str, Coverage]] = MISSING
+
+
+class LoopEnds(Record):
+    """A loop by its frames."""
+
+    from_: Count = Field(alias="from")
+    to: Count
+    reason: str = ""
+
+
+class AcceptedLoop(LoopEnds):
+    """A loop with its measured relative pose ``(4, 4)``."""
+
+    T_from_to: Known[list[list[float]]] = MISSING
+
+
+class LoopsFile(Record):
+    """``loops.json``, as far as it is read back."""
+
+    accepted: Known[list[AcceptedLoop]] = MISSING
+    rejected_left_out: Known[Count] = MISSING
+
+
+class LoopMetrics(Record):
+    """Loops by how far they came."""
+
+    candidates: Known[Count] = MISSING
+    verified: Known[Count] = MISSING
+    accepted: Known[Count] = MISSING
+    rejected: Known[list[LoopEnds]] = MISSING
+
+
+class Event(Record):
+    """What became of the tracking of keyframes at a frame."""
+
+    frame: Count
+    event: str
+    other: Count | None = None
+    support: Count | None = None
+
+
+class TrackingMetrics(Record):
+    """Keyframes and their maps."""
+
+    keyframes: Known[Count] = MISSING
+    maps: Known[Count] = MISSING
+    events: Known[list[Event]] = MISSING
+
+
+class LearnedDepthError(Record):
+    """Bias and relative sigma of learned depth at one depth."""
+
+    depth: Known[float] = MISSING
+    bias: Known[float] = MISSING
+    sigma: Known[float] = MISSING
+    corners: Known[float] = MISSING
+
+
+class DepthOfKeyframes(Record):
+    """Errors of the keyframes' depth, as learned and refined."""
+
+    network: Known[DepthMetrics] = MISSING
+    refined: Known[DepthMetrics] = MISSING
+
+
+class MapSizes(Record):
+    """Sizes of the map, and what filters took."""
+
+    triangles: Known[Count] = MISSING
+    points: Known[Count] = MISSING
+    blocks: Known[Count] = MISSING
+    submaps: Known[Count] = MISSING
+    frames_fused: Known[Count] = MISSING
+    frames_left_out: Known[Count] = MISSING
+    voxel_size: Known[float] = MISSING
+    filters: Known[dict[str, float]] = MISSING
+    floater_share: Known[float] = MISSING
+    double_wall_share: Known[float] = MISSING
+
+
+class MapErrors(PlacedMetrics):
+    """Errors of the map by the best truth that there is, after a rigid motion and after one with a scale."""
+
+    truth: Known[str] = MISSING
+    evaluated_m: Known[float] = MISSING
+    with_scale: Known[ScaledMetrics] = MISSING
+
+
+class MapMetrics(MapErrors, MapSizes):
+    """The map: its sizes and its errors."""
+
+
+class Metrics(Record):
+    """``metrics.json``, however far the run came."""
+
+    schema_: Annotated[Literal[1], Field(alias="schema")] = 1
+    status: Literal["running", "estimated", "ok", "failed"] = "ok"
+    reason: Known[str] = MISSING
+    provenance: Known[Provenance] = MISSING
+    sequence: Known[SequenceMetrics] = MISSING
+    timing: Known[Timing] = MISSING
+    scale: Known[ScaleMetrics] = MISSING
+    trajectories: Known[Trajectories] = MISSING
+    gps: Known[GpsMetrics] = MISSING
+    graph: Known[GraphMetrics] = MISSING
+    loops: Known[LoopMetrics] = MISSING
+    tracking: Known[TrackingMetrics] = MISSING
+    depth_error: Known[list[LearnedDepthError]] = MISSING
+    depth: Known[DepthOfKeyframes] = MISSING
+    map: Known[MapMetrics] = MISSING
+
+    @classmethod
+    def of_begun_run(cls, provenance: Provenance) -> Metrics:
+        """Those of a run until its trajectories are whole."""
+        reason = "the run has not ended, or was killed before its trajectories were written"
+        return cls(schema_=1, status="running", reason=reason, provenance=provenance)
+
+    def changed(self, **values: Any) -> Metrics:
+        """With other values; None takes one out."""
+        own = {name: getattr(self, name) for name in self.model_fields_set} | values
+        return Metrics(**{name: value for name, value in own.items() if value is not None})
+
+    @property
+    def failure(self) -> str:
+        """Why the run failed or did not end, in one line; empty if it is whole."""
+        return "" if self.status == "ok" else " ".join((known(self.reason) or "no reason recorded").split())
+
+    @property
+    def unit(self) -> str:
+        """``metres``, ``camera heights``, or ``the networks' own unit`` where no road was found."""
+        return known(self.scale.unit) or METRES
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.unit == METRES
+
+    def unit_notes(self) -> list[str]:
+        """Notes on the unit of length."""
+        if self.scale.mode == "none" and self.unit == CAMERA_HEIGHTS:
+            return [
+                "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
+                "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres. "
+                "For metres: camera_height_m in camera.yaml, a GPS track or scale.mode=known."
+            ]
+        if self.is_metric:
+            return []
+        why = self.scale.value.reason if isinstance(self.scale.value, Missing) else MISSING.reason
+        return [f"No scale was found ({why}): lengths are in {self.unit}, not in metres."]

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-LOG = "run.log"
-
 
 class RunLog(logging.Handler):
     """Buffers records until there is a file, then writes each at once.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
+"""Is told the stage of long work, how many of its items are done, and of how many."""
 
 
 class progress_bar:  # noqa: N801 - reads as the function it stands for

@@ -45,7 +45,7 @@ LOOPS_CLOSED = 43
 
 
 def check(run: RunFolder, measured: Measured) -> None:
-    metrics = run.metrics()
+    metrics = run.metrics().tree()
     align = metrics["trajectories"]["optimised"]["align"]
     assert metrics["scale"]["mode"] == "camera-height"
     assert align["7dof"]["ate_rmse_m"] < SLACK * measured.ate_7dof_m
@@ -56,7 +56,7 @@ def check(run: RunFolder, measured: Measured) -> None:
 @pytest.mark.data
 def test_two_seconds_are_as_right_after_the_graph_as_before(data_root: Path, tmp_path: Path) -> None:
     options = {"weights": "sim", "frames": "0:20", "overrides": QUICK, "output": tmp_path / "run"}
-    found = run_slam(data_root / "kitti_odometry", "02", **options).metrics()["trajectories"]
+    found = run_slam(data_root / "kitti_odometry", "02", **options).metrics().tree()["trajectories"]
     before, after = (found[kind]["align"]["none"]["ate_rmse_m"] for kind in ("odometry", "optimised"))
     assert after < 1.2 * before < 0.3
 
@@ -75,4 +75,4 @@ def test_kitti(data_root: Path, tmp_path: Path, measured: Measured) -> None:
 def test_the_embedded_loop(tmp_path: Path, measured: Measured) -> None:
     run = run_slam(weights=measured.weights, overrides=QUICK, output=tmp_path / "run")
     check(run, measured)
-    assert run.metrics()["loops"]["accepted"] > LOOPS_CLOSED / SLACK
+    assert run.metrics().tree()["loops"]["accepted"] > LOOPS_CLOSED / SLACK

@@ -28,7 +28,7 @@ def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Calla
 def test_a_drive_at_full_size(data_root: Path, tmp_path: Path) -> None:
     root = data_root / "kitti_odometry_original"
     run = run_slam(root, "00", frames="0:25", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE)
-    assert run.metrics()["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.5
+    assert run.metrics().tree()["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.5
 
 
 @pytest.mark.data
@@ -37,7 +37,7 @@ def test_a_road_whose_far_corners_learned_depth_sees_too_near(data_root: Path, t
     """Most corners are far there: with one length for all distances the near ones were outliers, and ATE was 3.2 m."""
     root = data_root / "failures" / "kitti03_full"
     run = run_slam(root, "03", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE)
-    assert run.metrics()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] < 0.25
+    assert run.metrics().tree()["trajectories"]["optimised"]["align"]["7dof"]["ate_rmse_m"] < 0.25
 
 
 @pytest.mark.data

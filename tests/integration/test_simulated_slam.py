@@ -66,7 +66,7 @@ def drive(sequence: Rendered | Excerpt, seed: int, *overrides: str) -> Estimate:
 
 
 def ate(estimate: Trajectory, result: Estimate) -> float:
-    return float(trajectory_metrics(estimate, result.reference)["align"]["7dof"]["ate_rmse_m"])
+    return float(trajectory_metrics(estimate, result.reference).align.dof7.ate_rmse_m)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import pytest
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
 MakeRun = Callable[..., RunFolder]
@@ -73,7 +74,7 @@ def map_errors(median_m: float) -> dict[str, Any]:
 
 def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool = True) -> dict[str, Any]:
     """``metrics.json`` as in section 7 of the design."""
-    truth = "the sequence has no true poses"
+    truth, unit = "the sequence has no true poses", "camera heights" if mode == "none" else "metres"
     unknown = {"snippet5": None, "snippet5_reason": truth, "align": None, "align_reason": truth}
     unknown |= {"evo": None, "evo_reason": truth}
     numbers = {"network": 6.21, "odometry": 2.43, "optimised": 0.87}
@@ -109,7 +110,7 @@ def metrics_of(leak: bool = False, mode: str = "camera-height", reference: bool 
             "peak_rss_mb": 1432.1,
             "stages": {"read": 3.1, "depth network": 24.0, "pose network": 11.2, "geometry": 9.8, "map": 11.9},
         },
-        "scale": {"mode": mode, "value": 1.0 if mode == "none" else 1.6503},
+        "scale": {"mode": mode, "unit": unit, "value": 1.0 if mode == "none" else 1.6503},
         "trajectories": trajectories,
         "graph": {"nodes": 300, "factors": 1483, "coverage": {"50": 0.47, "90": 0.88, "95": 0.93}}
         if reference
@@ -142,7 +143,7 @@ def make_run(tmp_path: Path) -> MakeRun:
         folder = RunFolder.create(tmp_path / name, tmp_path, "sim")
         stamps = 0.1 * np.arange(300)
         for each, (step_m, yaw_bias) in GEOMETRY.items():
-            folder.write_trajectory(f"trajectory_{each}", Trajectory(stamps, drive(300, step_m, yaw_bias)))
+            folder.write_trajectory(each, Trajectory(stamps, drive(300, step_m, yaw_bias)))
         if reference:
             folder.write_trajectory("reference", Trajectory(stamps, drive(300, 1.0, 0.0)))
         folder.write_text("graph.g2o", G2O)
@@ -150,7 +151,9 @@ def make_run(tmp_path: Path) -> MakeRun:
         folder.write_text("map_cloud.ply", PLY)
         folder.write_text("config.yaml", "scale:\n  mode: auto\n")
         folder.write_text("loops.json", '{"accepted": [{"from": 295, "to": 2}], "rejected": []}\n')
-        folder.write_metrics(metrics if metrics is not None else metrics_of(reference=reference))
+        folder.write_metrics(
+            Metrics.model_validate(metrics if metrics is not None else metrics_of(reference=reference))
+        )
         return folder
 
     return make

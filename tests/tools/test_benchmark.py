@@ -21,6 +21,8 @@ from scipy.spatial.transform import Rotation
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import from_rotation_vector, invert
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics, Provenance, ScaleMetrics, SequenceMetrics
+from slam.runtime.storage.record import Missing
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -68,10 +70,10 @@ def summary(tools: Callable[[str], ModuleType]) -> ModuleType:
     return tools("benchmarking.summary")
 
 
-def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[str, Any]:
+def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
     """The metrics of a run that the tables read."""
     alignments = {how: {"ate_rmse_m": ate, "scale": 1.1, "r_rel_deg_per_100m": 0.5} for how in ("6dof", "7dof")}
-    return {
+    tree = {
         "status": "ok",
         "provenance": {"leak": False},
         "sequence": {"frames": 100, "length_m": 90.0},
@@ -82,11 +84,13 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> dict[st
             "peak_rss_mb": 500.0,
             "stages": stages,
         },
+        "scale": {"mode": "camera-height", "unit": "metres", "value": 1.0},
         "trajectories": {name: {"align": alignments} for name in ("network", "odometry", "optimised")},
         "graph": {"coverage": {"95": 0.9}},
         "loops": {"accepted": 3},
         "map": {"triangles": None, "triangles_reason": "no map"},
     }
+    return Metrics.model_validate(tree)
 
 
 @pytest.fixture
@@ -133,7 +137,7 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
 ) -> None:
     results = results_of(plan, work, job, {"default": [1.0, 3.0]})
-    results.append(work.JobResult(replace(job, seed=2), {}, "abc", "out of memory"))
+    results.append(work.JobResult(replace(job, seed=2), Missing("out of memory"), "abc", "out of memory"))
     text = page.accuracy_tables(results)
     *_, head, row = cells(text)
     assert row[head.index("ATE 7-dof, optimised")] == "2.00 ± 1.41"
@@ -144,14 +148,14 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
 def test_errors_relative_to_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     run = metrics(ate=0.9)
-    run["trajectories"]["network"] = {"align": {"7dof": {"ate_rmse_m": 3.6}}}
+    slower = metrics(ate=3.6).trajectories.network
+    run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
     derived = derived_metrics.derive_metrics(tmp_path, run)
-    shares = derived["network_percent"], derived["optimised_percent"], derived["of_network"]
+    shares = derived.network_percent, derived.optimised_percent, derived.of_network
     assert shares == pytest.approx((4.0, 1.0, 0.25))
-    assert derived["false_loops"] is None
-    assert derived["false_loops_reason"] == "the sequence has no true poses"
-    run["sequence"] = {"length_m": None, "length_m_reason": "no truth"}
-    assert derived_metrics.derive_metrics(tmp_path, run)["optimised_percent_reason"] == "no truth"
+    assert derived.false_loops == Missing("the sequence has no true poses")
+    run = run.changed(sequence=SequenceMetrics(length_m=Missing("no truth")))
+    assert derived_metrics.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
 
 
 @pytest.mark.parametrize(
@@ -169,15 +173,14 @@ def test_true_and_false_loops(
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
     derived = derived_metrics.derive_metrics(tmp_path, metrics())
-    assert (derived["true_loops"], derived["false_loops"]) == (1 - false, false)
-    for mode, value in (("none", 1.0), ("gps", None)):
-        in_heights = metrics() | {"scale": {"mode": mode, "value": value}}
-        assert derived_metrics.derive_metrics(tmp_path, in_heights)["true_loops"] is None
+    assert (derived.true_loops, derived.false_loops) == (1 - false, false)
+    in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
+    assert isinstance(derived_metrics.derive_metrics(tmp_path, in_heights).true_loops, Missing)
 
 
 def test_a_leak_is_reported(page: ModuleType, work: ModuleType, job: Any) -> None:
     assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
-    leaky = metrics() | {"provenance": {"leak": True}}
+    leaky = metrics().changed(provenance=Provenance(leak=True))
     assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.JobResult(job, leaky, "abc")])
 
 
@@ -227,7 +230,7 @@ def test_only_successful_runs_of_the_same_sources_are_kept(
         code = next(codes)
         if code == 0:
             (job.place / "run").mkdir()
-            (job.place / "run" / "metrics.json").write_text(json.dumps(metrics()))
+            (job.place / "run" / "metrics.json").write_text(metrics().to_json())
         return subprocess.CompletedProcess(words, code, "", "")
 
     monkeypatch.setattr(work, "revision", lambda: "abc")
@@ -303,6 +306,6 @@ def test_maps_need_depth_maps_beside_the_images_and_name_every_part(
     assert len(jobs) == 2 * len(plan.MAPS)
     assert "--sequence" in jobs[0].arguments and "--sequence" not in jobs[1].arguments
     errors = {"accuracy_median_m": 0.1, "accuracy_90_m": 0.5, "completeness": 0.8, "f_score": {"0.2": 0.7, "0.5": 0.9}}
-    results = [work.JobResult(job, {"map": errors | {"submaps": 3}}, "abc") for job in jobs]
+    results = [work.JobResult(job, Metrics.model_validate({"map": errors | {"submaps": 3}}), "abc") for job in jobs]
     text = page.maps_tables(results)
     assert "| loop 610 | default | no sky | 0.100 | 0.50 |" in text and "drive_0013" in text

@@ -8,7 +8,8 @@ from statistics import fmean, median, stdev
 from benchmarking.metric_definitions import MetricDefinition
 from benchmarking.work import JobResult
 
-from slam.results.comparison import MISSING, lookup
+from slam.results.error_columns import DASH
+from slam.runtime.storage.record import Missing
 
 Label = Callable[[JobResult], str]
 Cell = Callable[[Sequence[JobResult]], str]
@@ -58,18 +59,18 @@ def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence
 
 def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]) -> str:
     """Median and the largest or smallest of some numbers."""
-    return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else MISSING
+    return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else DASH
 
 
 def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
     """The values of a metric, without the results that lack it."""
-    found = (lookup(o.metrics, *definition.path)[0] for o in results)
-    return [value for value in found if value is not None]
+    found = (definition.value(o) for o in results)
+    return [value for value in found if not isinstance(value, Missing)]
 
 
 def mean(found: Sequence[float], decimals: int) -> str:
     """Mean of some numbers."""
-    return f"{fmean(found):.{decimals}f}" if found else MISSING
+    return f"{fmean(found):.{decimals}f}" if found else DASH
 
 
 def drive(o: JobResult) -> str:

@@ -48,6 +48,7 @@ from benchmarking.metric_definitions import (
     TIME,
     TRIANGLES,
     MetricDefinition,
+    stage_seconds,
     stages,
 )
 from benchmarking.picture import drawable
@@ -55,7 +56,8 @@ from benchmarking.plan import EVERYTHING, GROWTH
 from benchmarking.summary import summary_table
 from benchmarking.work import JobResult
 
-from slam.results.comparison import MISSING, lookup
+from slam.results.error_columns import DASH
+from slam.runtime.storage.record import Missing, known
 
 PICTURE = "images/trajectories.png"  # beside the page
 PAGE = """# Benchmarks
@@ -163,7 +165,7 @@ def against_everything(definition: MetricDefinition, results: Sequence[JobResult
     def cell(group: Sequence[JobResult]) -> str:
         pairs = [(value, *base.get(key(o), [])) for o in group for value in values([o], definition)]
         ratios = [pair[0] / pair[1] for pair in pairs if len(pair) == 2 and min(pair) > 0]
-        return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else MISSING
+        return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else DASH
 
     return cell
 
@@ -182,7 +184,7 @@ def rest_share(group: Sequence[JobResult]) -> str:
 def stage_ms(stage: str) -> Cell:
     """Milliseconds a frame."""
     return lambda group: mean(
-        [1e3 * _stage(o, stage) / o.metrics["sequence"]["frames"] for o in group if not o.reason], 2
+        [1e3 * _stage(o, stage) / frames for o in group if (frames := known(o.metrics.sequence.frames))], 2
     )
 
 
@@ -190,12 +192,12 @@ def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition])
     """Leaks, reasons of missing numbers, and failed runs, a line each."""
     lines: dict[str, None] = {}
     for o in (o for o in results if not o.reason):
-        if lookup(o.metrics, "provenance", "leak")[0]:
+        if o.metrics.provenance.leak is True:
             lines[f"LEAK: weights {o.job.weights} saw frames of {o.job.drive.name} in training."] = None
         for definition in definitions:
-            value, reason = lookup(o.metrics, *definition.path)
-            if value is None:
-                lines[f"{MISSING} {definition.title}, {o.job.drive.name}: {reason}."] = None
+            value = definition.value(o)
+            if isinstance(value, Missing):
+                lines[f"{DASH} {definition.title}, {o.job.drive.name}: {value.reason}."] = None
     lines |= {f"Failed: {o.job.title}: {o.reason}": None for o in results if o.reason}
     return "\n" + "".join(f"\n- {line}" for line in lines)
 
@@ -226,8 +228,8 @@ def with_section(page: str, new: str) -> str:
 
 
 def _stage(o: JobResult, stage: str) -> float:
-    return float(o.metrics["timing"]["stages"].get(stage, 0.0))
+    return known(stage_seconds(o, stage)) or 0.0
 
 
 def _seconds(o: JobResult) -> float:
-    return float(o.metrics["timing"]["seconds_total"])
+    return known(o.metrics.timing.seconds_total) or math.nan

@@ -17,27 +17,41 @@ from pathlib import Path
 from typing import Any
 
 from benchmarking import plan
-from benchmarking.derived_metrics import derive_metrics
+from benchmarking.derived_metrics import DerivedMetrics, derive_metrics
 from benchmarking.plan import BenchmarkSequence, Job
 
 from slam.commands.batch import cluster
 from slam.commands.batch.cluster import Spread
-from slam.results.comparison import failure
+from slam.results.metrics import Metrics
+from slam.runtime.run_files import GRAPH, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.record import MISSING, Missing
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
-BULKY = ("map_mesh.ply", "map_cloud.ply", "places.npz", "graph.g2o")  # removed after a run: no table reads them
+BULKY = (MAP_MESH, MAP_CLOUD, PLACES, GRAPH)  # removed after a run: no table reads them
+
+
+@dataclass(frozen=True)
+class ProcessMetrics:
+    """Seconds of the whole command, load of the machine before, and time of a frame."""
+
+    seconds: float
+    load: float
+    ms_per_frame: float
+    cpu_ms_per_frame: float
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """``metrics.json`` of a job with its derived metrics, or the reason of its failure."""
+    """The metrics of a job, those derived from them and those of its process, or the reason of its failure."""
 
     job: Job
-    metrics: Mapping[str, Any]
+    metrics: Metrics | Missing
     commit: str
     reason: str = ""
+    derived: DerivedMetrics | Missing = MISSING
+    process: ProcessMetrics | Missing = MISSING
 
 
 def simulate(drive: BenchmarkSequence) -> None:
@@ -74,19 +88,18 @@ def job_result(job: Job) -> JobResult:
 
 
 def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
-    metrics = _read(job.place / "run" / "metrics.json")
-    reason = (failure(metrics) if metrics else "") or record.get("reason", "the benchmark was interrupted")
-    commit = record.get("commit", "")
+    commit, folder = record.get("commit", ""), job.place / "run"
+    reason = record.get("reason", "the benchmark was interrupted")
+    metrics = Metrics.read(folder / METRICS) if (folder / METRICS).is_file() else Metrics()
+    reason = metrics.failure or reason
+    frames, seconds, cpu = metrics.sequence.frames, metrics.timing.seconds_total, metrics.timing.cpu_seconds
+    if isinstance(frames, Missing) or isinstance(seconds, Missing) or isinstance(cpu, Missing):
+        reason = reason or f"its {METRICS} has no timing"
+        return JobResult(job, Missing(reason), commit, reason)
     if reason:
-        return JobResult(job, {}, commit, reason)
-    timing, frames = metrics["timing"], metrics["sequence"]["frames"]
-    process = {
-        "seconds": record["seconds"],
-        "load": record["load"],
-        "ms_per_frame": 1e3 * timing["seconds_total"] / frames,
-        "cpu_ms_per_frame": 1e3 * timing["cpu_seconds"] / frames,
-    }
-    return JobResult(job, metrics | {"process": process, "derived": derive_metrics(job.place / "run", metrics)}, commit)
+        return JobResult(job, Missing(reason), commit, reason)
+    process = ProcessMetrics(record["seconds"], record["load"], 1e3 * seconds / frames, 1e3 * cpu / frames)
+    return JobResult(job, metrics, commit, "", derive_metrics(folder, metrics), process)
 
 
 def _slam(*arguments: str) -> list[str]:

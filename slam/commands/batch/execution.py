@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from slam.commands.batch.cluster import Spread
 from slam.commands.batch.manifest import Drive
@@ -117,11 +117,10 @@ def _thread_limits(threads: int) -> dict[str, str]:
 def _is_whole(folder: Path, arguments: list[str]) -> bool:
     """Whether a folder holds the whole run of this command."""
     try:
-        metrics: dict[str, Any] = RunFolder(folder).metrics()
+        metrics = RunFolder(folder).metrics()
     except SlamError:
         return False
-    command = metrics.get("provenance", {}).get("command")
-    return metrics.get("status") == "ok" and command == shlex.join(["erfsfm-slam", *arguments])
+    return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
 
 
 def _reason(code: int, log: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -12,36 +12,38 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from slam.commands.batch.execution import Outcome
-from slam.results.comparison import METRES, MISSING, lookup, unit_of_lengths, written
+from slam.results.error_columns import written
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import REPORT
 from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.record import Missing, known
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 CSV = "drives.csv"
 PAGE = "index.html"
-_ALIGNED = ("trajectories", "optimised", "align")
 _FIRST = ("drive", "status", "reason")
-# column, its place in metrics.json (but the unit of lengths), decimals on the page
-_COLUMNS: tuple[tuple[str, tuple[str, ...], int], ...] = (
-    ("sequence", ("sequence", "name"), 0),
-    ("frames", ("sequence", "frames"), 0),
-    ("length_m", ("sequence", "length_m"), 0),
-    ("scale", ("scale", "mode"), 0),
-    ("unit", ("unit",), 0),
-    ("ate_6dof_m", (*_ALIGNED, "6dof", "ate_rmse_m"), 3),
-    ("ate_7dof_m", (*_ALIGNED, "7dof", "ate_rmse_m"), 3),
-    ("t_rel_percent", (*_ALIGNED, "7dof", "t_rel_percent"), 2),
-    ("r_rel_deg_per_100m", (*_ALIGNED, "7dof", "r_rel_deg_per_100m"), 3),
-    ("interpolated_frames", ("sequence", "bridged_frames"), 0),
-    ("loops", ("loops", "accepted"), 0),
-    ("map_triangles", ("map", "triangles"), 0),
-    ("leak", ("provenance", "leak"), 0),
-    ("seconds", ("timing", "seconds_total"), 1),
-    ("frames_per_second", ("timing", "frames_per_second"), 1),
-    ("peak_rss_mb", ("timing", "peak_rss_mb"), 0),
+# column, its value, decimals on the page
+_COLUMNS: tuple[tuple[str, Callable[[Metrics], object], int], ...] = (
+    ("sequence", lambda m: m.sequence.name, 0),
+    ("frames", lambda m: m.sequence.frames, 0),
+    ("length_m", lambda m: m.sequence.length_m, 0),
+    ("scale", lambda m: m.scale.mode, 0),
+    ("unit", lambda m: m.unit, 0),
+    ("ate_6dof_m", lambda m: m.trajectories.optimised.align.dof6.ate_rmse_m if m.is_metric else Missing(), 3),
+    ("ate_7dof_m", lambda m: m.trajectories.optimised.align.dof7.ate_rmse_m, 3),
+    ("t_rel_percent", lambda m: m.trajectories.optimised.align.dof7.t_rel_percent, 2),
+    ("r_rel_deg_per_100m", lambda m: m.trajectories.optimised.align.dof7.r_rel_deg_per_100m, 3),
+    ("interpolated_frames", lambda m: m.sequence.bridged_frames, 0),
+    ("loops", lambda m: m.loops.accepted, 0),
+    ("map_triangles", lambda m: m.map.triangles, 0),
+    ("leak", lambda m: m.provenance.leak, 0),
+    ("seconds", lambda m: m.timing.seconds_total, 1),
+    ("frames_per_second", lambda m: m.timing.frames_per_second, 1),
+    ("peak_rss_mb", lambda m: m.timing.peak_rss_mb, 0),
 )
 _TEMPLATES = Environment(loader=PackageLoader("slam", "commands/batch"), autoescape=True, undefined=StrictUndefined)
 
@@ -107,26 +109,18 @@ def failure_table(outcomes: Sequence[Outcome]) -> Table:
 
 def _row(outcome: Outcome) -> dict[str, Any]:
     row: dict[str, Any] = {"drive": outcome.drive.name, "status": outcome.status, "reason": outcome.reason}
-    metrics: dict[str, Any] = {}
-    if outcome.status != "failed":
-        metrics = RunFolder(outcome.folder).metrics()
-        metrics["unit"] = unit_of_lengths(metrics)
-    row |= {name: lookup(metrics, *place)[0] for name, place, _ in _COLUMNS}
-    return row if row["unit"] == METRES else row | {"ate_6dof_m": None}
+    if outcome.status == "failed":
+        return row | {name: None for name, _, _ in _COLUMNS}
+    metrics = RunFolder(outcome.folder).metrics()
+    return row | {name: known(value(metrics)) for name, value, _ in _COLUMNS}
 
 
 def _cells(outcome: Outcome, row: dict[str, Any], output: Path) -> tuple[str, str, list[str]]:
     """Name, address of the report (empty without one), and numbers of a run."""
-    report = outcome.folder / "report.html"
+    report = outcome.folder / REPORT
     address = quote(os.path.relpath(report, output.absolute())) if report.is_file() else ""
     return outcome.drive.name, address, [_text(row[name], decimals) for name, _, decimals in _COLUMNS]
 
 
 def _text(value: Any, decimals: int) -> str:
-    return (
-        MISSING
-        if value is None
-        else {True: "yes", False: "no"}[value]
-        if isinstance(value, bool)
-        else written(value, decimals)
-    )
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else written(value, decimals)

@@ -44,7 +44,6 @@ def export(
     """
     from slam.commands.exports.export import export as export_run
     from slam.commands.exports.options import ExportOptions, parse_crop, parse_origin
-    from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
 
     options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
@@ -52,5 +51,5 @@ def export(
     with progress_bar() as progress:
         written = export_run(folder, what, output, up, options, progress)
     typer.echo(f"{what} of {run} in {written}")
-    for note in unit_notes(folder.metrics()):
+    for note in folder.metrics().unit_notes():
         typer.echo(note)

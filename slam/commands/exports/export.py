@@ -24,13 +24,15 @@ from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry import se3
-from slam.loops.places import PLACES, Places
-from slam.results.comparison import CAMERA_HEIGHTS, METRES, lookup, unit_of_lengths
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
+from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
+from slam.runtime.progress import Progress
+from slam.runtime.run_files import ESTIMATE, GRAPH, PLACES
 from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.record import known
 
-Progress = Callable[[str, int, int], None]
 Writer = Callable[[Path, Ply], None]
 
 _WRITERS: dict[str, dict[str, Writer]] = {
@@ -79,7 +81,7 @@ def export(
         write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
         write(output, _trajectory(folder, up))
     elif what == "graph":
-        source = folder.require("graph.g2o")
+        source = folder.require(GRAPH)
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     elif what == "colmap":
@@ -122,7 +124,7 @@ def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOpti
 
 
 def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:
-    unit = unit_of_lengths(folder.metrics())
+    unit = folder.metrics().unit
     if options.origin is not None and unit != METRES:
         raise RunError(f"a place on the earth needs metres, but this run's lengths are in {unit}: leave --origin")
     with map_file(folder, "mesh", progress) as source:
@@ -134,7 +136,7 @@ def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, prog
 def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
     if output.suffix.lower() not in (".yaml", ".pgm"):
         raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
-    unit = unit_of_lengths(folder.metrics())
+    unit = folder.metrics().unit
     if unit not in (METRES, CAMERA_HEIGHTS):
         raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
     with map_file(folder, "mesh", progress) as source:
@@ -161,15 +163,13 @@ def _rotated(ply: Ply, up: str) -> Ply:
 
 def _trajectory(folder: RunFolder, up: str) -> Trajectory:
     """The optimised trajectory in the given axes."""
-    folder.require("trajectory_optimised.tum.txt")
+    folder.require(ESTIMATE)
     trajectory = folder.trajectory("optimised")
     if trajectory is None:
         raise RunError(f"{folder.path} has no optimised trajectory: run the sequence again")
-    frames, _ = lookup(folder.metrics(), "sequence", "frames")
+    frames = known(folder.metrics().sequence.frames)
     if frames is not None and frames != len(trajectory):
-        raise RunError(
-            f"{folder.path}: trajectory_optimised.tum.txt is damaged: it has {len(trajectory)} rows for {frames} frames"
-        )
+        raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     if up != "y-down":
         T_up_world = se3.make(R_UP_WORLDS[up], np.zeros(3))
         trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from slam.config.sections import load_stored
-from slam.mapping.submap import FOLDER, Submap, submap_paths
+from slam.mapping.submap import Submap, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
+from slam.runtime.progress import Progress
+from slam.runtime.run_files import CONFIG, MAP_CLOUD, MAP_MESH, SUBMAPS
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[str, int, int], None]
+MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
 
 
 def has_map(folder: RunFolder, what: str) -> bool:
     """Whether a run has a ``mesh`` or ``cloud``, or submaps of which one can be made."""
-    return (folder.path / f"map_{what}.ply").is_file() or bool(submap_paths(folder.path / FOLDER))
+    return (folder.path / MAPS[what]).is_file() or bool(submap_paths(folder.path / SUBMAPS))
 
 
 @contextmanager
@@ -30,15 +32,15 @@ def map_file(folder: RunFolder, what: str, progress: Progress | None = None) -> 
     Raises:
         SlamError: the run has neither it nor submaps, or these are damaged or hold no surface.
     """
-    paths = submap_paths(folder.path / FOLDER)
-    if (folder.path / f"map_{what}.ply").is_file() or not paths:
-        yield folder.require(f"map_{what}.ply")
+    paths = submap_paths(folder.path / SUBMAPS)
+    if (folder.path / MAPS[what]).is_file() or not paths:
+        yield folder.require(MAPS[what])
         return
     logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
-    settings = load_stored(folder.require("config.yaml"), "mapping").mapping
+    settings = load_stored(folder.require(CONFIG), "mapping").mapping
     voxel_size = float(Submap.read(paths[0]).voxel_size)  # which follows the scene where no metres were known
     surface = MapSurface(paths, settings.in_unit(voxel_size / settings.voxel_size_m), progress)
     with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
-        path = Path(temporary) / f"map_{what}.ply"
+        path = Path(temporary) / MAPS[what]
         (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)
         yield path

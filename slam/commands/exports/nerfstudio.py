@@ -17,11 +17,12 @@ from slam.formats.trajectory import Trajectory, nearest_stamps
 from slam.formats.transforms import TRANSFORMS, write_transforms
 from slam.frames import Image, Sequence
 from slam.geometry.se3 import FloatArray
-from slam.loops.places import PLACES, Places
-from slam.results.comparison import lookup
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove, write_atomically
+from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import frame_range
@@ -105,9 +106,9 @@ def _recording(folder: RunFolder, trajectory: Trajectory, dataset: Path | None) 
 def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list[int | None]:
     """Frames by their stamps; by their order where the recording continues another and its stamps were shifted."""
     metrics, stamps = folder.metrics(), np.asarray(sequence.stamps)
-    first, _ = lookup(metrics, "sequence", "continued_at")
+    first = known(metrics.sequence.continued_at)
     if first:
-        named, _ = lookup(metrics, "provenance", "recording", "frames")
+        named = known(metrics.provenance.recording.frames)
         start, stop = frame_range(named or ":", len(stamps))
         added = trajectory.stamps[first:]
         last = stamps[start:stop][-len(added) :]
@@ -127,24 +128,22 @@ def _rows(folder: RunFolder, trajectory: Trajectory, sequence: Sequence) -> list
 
 def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
     """Arguments of `open_sequence`, as recorded by the run."""
-    recorded, _ = lookup(folder.metrics(), "provenance", "recording")
-    if recorded is None and dataset is None:
+    recorded = folder.metrics().provenance.recording
+    if isinstance(recorded, Missing) and dataset is None:
         raise RunError(f"{folder.path} does not record where its images are: give --dataset ROOT")
-    recorded = recorded or {}
-    camera = Path(recorded["camera"]) if "camera" in recorded else None
+    camera = None if isinstance(recorded.camera, Missing) else Path(recorded.camera)
     if dataset is None:
-        place = Path(recorded["dataset"]) if "dataset" in recorded else None
+        place = None if isinstance(recorded.dataset, Missing) else Path(recorded.dataset)
     else:
         place = dataset
         if camera is not None and not (camera.exists() or is_field_of_view(camera)):
             camera = None  # it may have moved with the images
-    return {"dataset": place, "name": recorded.get("sequence"), "camera": camera}
+    return {"dataset": place, "name": known(recorded.sequence), "camera": camera}
 
 
 def interpolated(folder: RunFolder) -> set[int]:
     """Frames of a run without a usable image."""
-    gaps, _ = lookup(folder.metrics(), "sequence", "bridged")
-    return {k for gap in gaps or () for k in range(gap["first"], gap["last"] + 1)}
+    return {k for gap in folder.metrics().sequence.bridged for k in range(gap.first, gap.last + 1)}
 
 
 def _write_image(path: Path, image: Image) -> None:

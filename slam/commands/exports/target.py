@@ -9,10 +9,11 @@ from slam.commands.exports.raster import RASTER_FILES, is_own_raster
 from slam.formats.colmap import MODEL_FILES, is_own_model
 from slam.formats.ros_map import describes_map
 from slam.formats.transforms import TRANSFORMS, is_own_scene
-from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
-from slam.results.replaced import check_replaced, check_replaced_trajectory
+from slam.results.output_file import check_replaced, check_replaced_trajectory
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import CONFIG
+from slam.runtime.storage.record import known
 
 _FOLDERS = {"colmap": "a COLMAP model", "nerfstudio": "a scene", "raster": "a raster"}
 _NAMES = {
@@ -62,9 +63,8 @@ def check_target(folder: RunFolder, what: str, output: Path) -> None:
 
 def _is_in_recording(folder: RunFolder, output: Path) -> bool:
     """Whether a file lies in the folder that was run, and was there before the run."""
-    began = folder.path / "config.yaml"
+    began = folder.path / CONFIG
     if not began.is_file() or output.stat().st_mtime > began.stat().st_mtime:
         return False
-    recording, _ = lookup(folder.metrics(), "provenance", "recording")
-    dataset = (recording or {}).get("dataset")
+    dataset = known(folder.metrics().provenance.recording.dataset)
     return dataset is not None and output.resolve().is_relative_to(Path(dataset).resolve())

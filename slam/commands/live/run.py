@@ -33,7 +33,7 @@ from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.results.folder import RunFolder
-from slam.results.output import check_output
+from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_rerun

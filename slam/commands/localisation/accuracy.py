@@ -13,7 +13,6 @@ from slam.commands.localisation.localiser import Localisation, image_paths
 from slam.evaluation.map import pose_similarity
 from slam.formats.trajectory import read_trajectory
 from slam.geometry.se3 import FloatArray, Similarity, invert, rotation_angle
-from slam.results.comparison import is_metric
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
 
@@ -60,7 +59,7 @@ class MapTruth:
         if reference is None or optimised is None or len(reference) != len(optimised):
             raise RunError(f"{run.path} has no reference, so that no error can be computed: leave out --truth")
         T_true_camera, T_world_camera = reference.T_world_camera, optimised.T_world_camera
-        with_scale = not is_metric(run.metrics())
+        with_scale = not run.metrics().is_metric
         return cls(T_world_camera, T_true_camera, pose_similarity(T_true_camera, T_world_camera, with_scale))
 
     def error(self, found: Localisation, T_true_image: FloatArray) -> PoseError | None:

@@ -39,9 +39,8 @@ def localize(
     from slam.commands.localisation.accuracy import MapTruth, summary, summary_line, true_poses
     from slam.commands.localisation.localiser import image_numbers, localise
     from slam.commands.localisation.tables import localisation_json, localisation_table, write_localisations
-    from slam.results.comparison import unit_notes
     from slam.results.folder import RunFolder
-    from slam.results.replaced import check_replaced_trajectory
+    from slam.results.output_file import check_replaced_trajectory
     from slam.runtime.errors import RunError
 
     run_folder = RunFolder.open(map)
@@ -63,7 +62,7 @@ def localize(
         typer.echo(json.dumps(localisation_json(found, errors), indent=2))
     else:
         print_table(localisation_table(found, errors))
-        for note in unit_notes(run_folder.metrics()):
+        for note in run_folder.metrics().unit_notes():
             typer.echo(note)
         if errors is not None:
             typer.echo(summary_line(summary(errors)))

@@ -20,12 +20,13 @@ from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
 from slam.loops.thresholds import LoopThresholds
 from slam.loops.verification import LoopVerifier, matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
+from slam.runtime.run_files import CONFIG, PLACES
 from slam.sequences.camera_file import beside, explicit_camera, is_field_of_view, read_explicit
 from slam.sequences.excerpt import frame_range
 from slam.sequences.images import ImageFiles
@@ -86,7 +87,7 @@ def localise(
         )
     localiser = Localiser(
         places,
-        load_stored(run.require("config.yaml"), "loops").loops,
+        load_stored(run.require(CONFIG), "loops").loops,
         None if own_camera is None else _pinhole(own_camera),
     )
     undistortion = Undistortion(own_camera) if own_camera is not None and own_camera.is_distorted else None

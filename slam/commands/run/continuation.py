@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from erfsfm.inference import overlapping
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
-from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
-from slam.results.comparison import lookup
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.results.folder import RunFolder
-from slam.results.output import UNFINISHED
+from slam.results.metrics import Metrics, Provenance, Recording
 from slam.runtime.errors import ConfigError, RunError
+from slam.runtime.run_files import CONFIG, DRIVE, UNFINISHED
+from slam.runtime.storage.record import Missing, known
 
 logger = logging.getLogger(__name__)
 
@@ -25,43 +25,40 @@ _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops", "windo
 
 
 def provenance_to_resume(
-    continues: Path, known: Mapping[str, Any], output: Path | None, recording: Mapping[str, str]
-) -> dict[str, Any] | None:
+    continues: Path, metrics: Metrics, output: Path | None, recording: Recording
+) -> Provenance | None:
     """What a run that did not end was run on, where it is to go on in its own folder; else None.
 
     Args:
         continues: its folder.
-        known: its ``metrics.json``.
+        metrics: of that run.
         output: where to write; None or the same folder to go on.
         recording: the options that name the recording; none, or those of the run.
 
     Raises:
         RunError: it was killed before it wrote what it is run on.
     """
-    if known.get("status", "ok") == "ok" or (output is not None and output.resolve() != continues.resolve()):
+    if metrics.status == "ok" or (output is not None and output.resolve() != continues.resolve()):
         return None
-    provenance = known.get("provenance")
-    if provenance is None or provenance.get("recording") is None:
+    provenance = metrics.provenance
+    if isinstance(provenance, Missing) or isinstance(provenance.recording, Missing):
         raise RunError(f"{continues} does not record what it was run on: run the sequence again")
-    return dict(provenance) if not recording or recording == provenance["recording"] else None
+    return provenance if not recording.tree() or recording == provenance.recording else None
 
 
-def inputs_to_continue(
-    folder: Path, known: Mapping[str, Any], gps: Path | None, seed: int | None
-) -> tuple[Path | None, int]:
-    """GPS track and seed for the frames that follow a run: as given, else by ``known``, its ``metrics.json``.
+def inputs_to_continue(folder: Path, metrics: Metrics, gps: Path | None, seed: int | None) -> tuple[Path | None, int]:
+    """GPS track and seed for the frames that follow a run: as given, else by the metrics of that run.
 
     Raises:
         RunError: its track is not there any more.
     """
-    provenance = known.get("provenance")
-    track, _ = lookup(provenance, "recording", "gps")
+    track = known(metrics.provenance.recording.gps)
     if gps is None and track is not None:
         gps = Path(track)
         if not gps.exists():
             raise RunError(f"{folder} was run with the GPS track {gps}, which is not there: give it with --gps FILE")
         logger.info("the GPS track of %s holds for the frames that follow: %s", folder, gps)
-    return gps, (lookup(provenance, "seed")[0] or 0) if seed is None else seed
+    return gps, (known(metrics.provenance.seed) or 0) if seed is None else seed
 
 
 def settings_to_resume(folder: Path, config: str | Path | None, overrides: Sequence[str]) -> SlamConfig:
@@ -70,7 +67,7 @@ def settings_to_resume(folder: Path, config: str | Path | None, overrides: Seque
     Raises:
         ConfigError: another change.
     """
-    if not (folder / "config.yaml").is_file():
+    if not (folder / CONFIG).is_file():
         return load_config(config, overrides)  # it was killed before its first frame
     return settings_to_continue(folder, config, overrides)
 
@@ -84,8 +81,8 @@ def settings_to_continue(folder: Path, config: str | Path | None, overrides: Seq
     """
     if config is not None:
         raise ConfigError(f"the configuration of {folder} is used to continue it: leave out --config")
-    own = load_config(RunFolder(folder).require("config.yaml"))
-    settings = load_config(folder / "config.yaml", overrides)
+    own = load_config(RunFolder(folder).require(CONFIG))
+    settings = load_config(folder / CONFIG, overrides)
     # another path may lead to the same source, or to more files of it: its identity is compared later
     depth = settings.depth.model_copy(update={"source": own.depth.source, "refine": own.depth.refine})
     compared = settings.model_copy(update={"depth": depth})
@@ -115,10 +112,9 @@ def require_other_output(continues: Path, output: Path | None) -> None:
         )
 
 
-def warn_of_other_noise(folder: Path, known: Mapping[str, Any], noise_sha256: str | None) -> None:
-    """Say that a run, by its ``metrics.json``, had another noise model: its whole drive is solved by the new one."""
-    provenance = known.get("provenance") or {}
-    if "noise_sha256" in provenance and provenance["noise_sha256"] != noise_sha256:
+def warn_of_other_noise(folder: Path, before: Provenance | Missing, now: Provenance) -> None:
+    """Say that a run had another noise model: its whole drive is solved by the new one."""
+    if known(before.noise_sha256) != known(now.noise_sha256):
         logger.warning(
             "noise.yaml of the weights is not that of %s: the whole drive is solved with the new one", folder
         )

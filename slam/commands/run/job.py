@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,23 +17,24 @@ from slam.config.sections import SlamConfig, dump_yaml
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
-from slam.loops.places import PLACES, Places
-from slam.pipeline.batch import Progress, SlamPipeline
+from slam.loops.places import Places
+from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.observer import FrontEndState, Observer
 from slam.results.depth import DepthQuality
+from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places
 from slam.results.map import write_map
-from slam.results.metrics import estimate_metrics, lidar_trajectory, whole_metrics
-from slam.results.output import ESTIMATE
+from slam.results.metrics import Metrics, Provenance
 from slam.results.report.map_view import write_map_views
 from slam.results.report.page import DepthExample, write_report
 from slam.results.report.rerun import write_rerun
-from slam.results.run_log import LOG, RunLog
-from slam.results.summary import Provenance, as_json, describe_start
+from slam.results.run_log import RunLog
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.progress import Progress
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, PLACES
 from slam.sequences.continued import Continued
 
 
@@ -75,7 +77,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
     Raises:
         SlamError, ErfsfmError: one line.
     """
-    folder.write_metrics(describe_start(job.provenance))
+    folder.write_metrics(Metrics.of_begun_run(job.provenance))
     try:
         log.begin(folder.path / LOG)
         with limit_library_threads():
@@ -94,7 +96,7 @@ def complete(job: Job, folder: RunFolder, log: RunLog, ignore_signals: Callable[
 
 def _run(job: Job, folder: RunFolder) -> None:
     """Estimate, then map, then report; each is on disk before the next begins."""
-    folder.write_text("config.yaml", dump_yaml(job.settings))
+    folder.write_text(CONFIG, dump_yaml(job.settings))
     stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
     # a run does not go on without the images of a live drive, nor in a folder without those before its own
@@ -110,9 +112,10 @@ def _run(job: Job, folder: RunFolder) -> None:
         stream.finish(estimate, folder.path)
     quality = DepthQuality(job.recording, estimate.scale.is_metric)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
-    numbers = write_map(folder, result, job.recording, job.progress)
-    depth = quality.summary(job.settings.depth.refine != "none")
-    folder.write_metrics(whole_metrics(metrics, result, job.recording, numbers, depth))
+    map_metrics = write_map(folder, result, job.recording, job.progress)
+    depth = quality.metrics(job.settings.depth.refine != "none")
+    timing = timing_of(result.stopwatch, len(job.recording) - result.first)
+    folder.write_metrics(metrics.changed(status="ok", reason=None, timing=timing, depth=depth, map=map_metrics))
     output = job.settings.output
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
@@ -135,15 +138,15 @@ def _checkpoints(job: Job, folder: Path) -> CheckpointWriter | None:
 def _write_estimate(folder: RunFolder, result: Estimate, job: Job) -> None:
     """Trajectories, graph, loops and places."""
     for name in ("network", "odometry", "optimised"):
-        folder.write_trajectory(f"trajectory_{name}", getattr(result, name))
+        folder.write_trajectory(name, getattr(result, name))
     if result.reference is not None:
         folder.write_trajectory("reference", result.reference)
     write_places(folder, result, job.recording.name)
     lidar = lidar_trajectory(result)
     if lidar is not None:
-        folder.write_trajectory("trajectory_lidar", lidar)
-    result.graph.write_g2o(folder.path / "graph.g2o")
-    folder.write_text("loops.json", as_json(result.loops.details()))
+        folder.write_trajectory("lidar", lidar)
+    result.graph.write_g2o(folder.path / GRAPH)
+    folder.write_text(LOOPS, json.dumps(result.loops.details(), indent=2, allow_nan=False))
     folder.write(PLACES, _places(result, job.recording.intrinsics).write)
 
 
@@ -162,8 +165,8 @@ def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseExceptio
     reason = str(error) if known else " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
     log.failed(reason)
     with suppress(SlamError, OSError):
-        folder.write_metrics(folder.metrics() | {"status": "failed", "reason": reason})
+        folder.write_metrics(folder.metrics().changed(status="failed", reason=reason))
         if job.stream is not None and folder.trajectory("odometry") is None:
-            folder.write_trajectory("trajectory_odometry", job.stream.tracked())
+            folder.write_trajectory("odometry", job.stream.tracked())
         if job.settings.output.report:
             write_report(folder, [], None)

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
 from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass
@@ -29,17 +29,19 @@ from slam.commands.run.continuation import (
 from slam.commands.run.job import Job, complete
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
-from slam.pipeline.batch import Progress, SlamPipeline
+from slam.pipeline.batch import SlamPipeline
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.folder import RunFolder
-from slam.results.output import check_output, whole_place
+from slam.results.metrics import Provenance, Recording
+from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
-from slam.results.summary import Provenance
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_rerun
+from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
+from slam.runtime.storage.record import MISSING, Missing, known
 from slam.sequences.catalogue import open_sequence
 from slam.sequences.excerpt import Excerpt
 from slam.sequences.gps import read_gps
@@ -144,37 +146,39 @@ def run_slam(
 
 def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
     """Check everything, then make the folder of a new run, or go on in that of one that did not end."""
-    known: dict[str, Any] = {}
+    before: Provenance | Missing = MISSING
     if request.continues is not None:
-        _, known = RunFolder.open_with_metrics(request.continues)
-        provenance = provenance_to_resume(request.continues, known, request.output, _recording(request))
+        _, metrics = RunFolder.open_with_metrics(request.continues)
+        provenance = provenance_to_resume(request.continues, metrics, request.output, _recording(request))
         if provenance is not None:
             lock.take(whole_place(request.continues))
             return _resume(request, request.continues, provenance)
-        if _recording(request) == {}:
+        if not _recording(request).tree():
             raise RunError(
                 f"name the frames that follow those of {request.continues} (--dataset, --frames): only what did not "
                 "end goes on without, in its own folder"
             )
         require_other_output(request.continues, request.output)
-        gps, seed = inputs_to_continue(request.continues, known, request.gps, request.seed)
+        gps, seed = inputs_to_continue(request.continues, metrics, request.gps, request.seed)
+        before = metrics.provenance
         request = replace(request, gps=gps, seed=seed)
     job = _prepare(request)
     if request.continues is not None:
-        warn_of_other_noise(request.continues, known, job.provenance.noise_sha256)
+        warn_of_other_noise(request.continues, before, job.provenance)
     return job, RunFolder.create(request.output, Path(job.settings.output.root), job.recording.name, lock)
 
 
-def _resume(request: RunRequest, place: Path, provenance: dict[str, Any]) -> tuple[Job, RunFolder]:
+def _resume(request: RunRequest, place: Path, before: Provenance) -> tuple[Job, RunFolder]:
     """A run that did not end, on what it was run on, from its last kept state."""
-    named = provenance["recording"]
-    files = {name: Path(named[name]) if name in named else None for name in ("dataset", "camera", "gps")}
-    words = {name: named.get(name) for name in ("sequence", "frames")}
-    weights = provenance["weights"] if request.weights == "default" else request.weights
-    seed = provenance["seed"] if request.seed is None else request.seed
+    recording = before.recording
+    places = {"dataset": recording.dataset, "camera": recording.camera, "gps": recording.gps}
+    files = {name: None if isinstance(place, Missing) else Path(place) for name, place in places.items()}
+    words = {"sequence": known(recording.sequence), "frames": known(recording.frames)}
+    weights = (known(before.weights) or "default") if request.weights == "default" else request.weights
+    seed = known(before.seed) if request.seed is None else request.seed
     same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
     job = _prepare(same, place)
-    warn_of_other_noise(place, {"provenance": provenance}, job.provenance.noise_sha256)
+    warn_of_other_noise(place, before, job.provenance)
     logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
     return job, RunFolder.resume(place)
 
@@ -252,7 +256,7 @@ def provenance_of(
         device=str(networks.device),
         weights=from_anywhere(request.weights) if is_folder else str(request.weights),
         weights_sha256=networks.sha256,
-        noise_sha256=networks.noise_sha256 or None,
+        noise_sha256=networks.noise_sha256 or Missing("no noise.yaml was measured with these weights"),
         weights_licence=networks.record.licence,
         trained_on=networks.record.trained_on,
         leak=bool(networks.leaks(recording.provenance())),
@@ -262,10 +266,10 @@ def provenance_of(
     )
 
 
-def _recording(request: RunRequest) -> dict[str, str]:
+def _recording(request: RunRequest) -> Recording:
     """The options that name the recording."""
     files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
     named = {name: Path(path) for name, path in files.items() if path is not None}
     places = {name: from_anywhere(path) for name, path in named.items()}
     words = {"sequence": request.sequence, "frames": request.frames}
-    return places | {name: word for name, word in words.items() if word is not None}
+    return Recording(**places | {name: word for name, word in words.items() if word is not None})

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from slam.results.comparison import lookup
+from slam.evaluation.map import Ring, SurfaceMetrics
+from slam.results.metrics import MapSizes, Metrics
 from slam.results.report.plots import figure_style
-from slam.results.report.tables import Cell, Metrics, Table, notes_on, number
+from slam.results.report.tables import Cell, Table, notes_on, number
+from slam.runtime.storage.record import Missing, known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ERRORS: tuple[tuple[tuple[str, ...], str], ...] = (
-    (("accuracy_median_m",), "accuracy, median (m)"),
-    (("accuracy_90_m",), "accuracy, 90 % (m)"),
-    (("outlier_share",), "over 1 m"),
-    (("completeness",), "completeness, 0.3 m"),
-    (("f_score", "0.2"), "F-score, 0.2 m"),
-    (("f_score", "0.5"), "F-score, 0.5 m"),
-)
+_Value = Callable[[SurfaceMetrics | Missing], float | Missing]
+_ERRORS: dict[str, _Value] = {
+    "accuracy, median (m)": lambda m: m.accuracy_median_m,
+    "accuracy, 90 % (m)": lambda m: m.accuracy_90_m,
+    "over 1 m": lambda m: m.outlier_share,
+    "completeness, 0.3 m": lambda m: m.completeness,
+    "F-score, 0.2 m": lambda m: m.f_score.m02,
+    "F-score, 0.5 m": lambda m: m.f_score.m05,
+}
 _FILTERS = {
     "unknown": "no depth",
     "border": "left, right and upper border of the image (mapping.border)",
@@ -40,78 +43,80 @@ _TRUTHS = {
 
 def map_sizes(metrics: Metrics) -> Table | None:
     """Every count of the map; None without one, and the reason alone where fusion was left out."""
-    numbers, _ = lookup(metrics, "map")
-    if numbers is None:
+    found = metrics.map
+    if isinstance(found, Missing):
         return None
-    if numbers.get("triangles") is None:
-        return Table((), [], notes=notes_on([f"map: {lookup(numbers, 'triangles')[1]}"]))
-    counted = ("triangles", "points", "blocks")
-    keys = [key for key, value in numbers.items() if key in counted or isinstance(value, int)]
-    names = [key.replace("_", " ") for key in keys]
-    cells = [number(numbers, key) for key in keys]
-    missing = [f"{name}: {cell.tooltip}" for name, cell in zip(names, cells) if cell.tooltip]
-    return Table(["", *names], [[Cell("map"), *cells]], notes=notes_on(missing))
+    if isinstance(found.triangles, Missing):
+        return Table((), [], notes=notes_on([f"map: {found.triangles.reason}"]))
+    counts = {name: getattr(found, name) for name in MapSizes.model_fields if name in found.model_fields_set}
+    cells = {
+        name.replace("_", " "): number(value)
+        for name, value in counts.items()
+        if isinstance(value, int) or name in ("points", "blocks")
+    }
+    missing = [f"{name}: {cell.tooltip}" for name, cell in cells.items() if cell.tooltip]
+    return Table(["", *cells], [[Cell("map"), *cells.values()]], notes=notes_on(missing))
 
 
 def map_filters(metrics: Metrics) -> Table | None:
     """The share of pixels that each filter took before fusion, and what cleaning the mesh took; None without a map."""
-    filters, _ = lookup(metrics, "map", "filters")
+    filters = known(metrics.map.filters)
     if filters is None:
         return None
     rows: list[Sequence[Cell] | str] = [
         [Cell(name), Cell(f"{share:.1%}"), Cell(_FILTERS.get(name, ""))] for name, share in filters.items()
     ]
     rows.append([Cell("fused"), Cell(f"{1 - sum(filters.values()):.1%}"), Cell("what the filters left")])
-    for key, name, what in (
-        ("floater_share", "floaters", "of the mesh: small loose pieces, left out (mapping.min_component_triangles)"),
-        ("double_wall_share", "double walls", "of the mesh's area: a parallel surface 0.3 to 2 m before it"),
+    loose = "of the mesh: small loose pieces, left out (mapping.min_component_triangles)"
+    double = "of the mesh's area: a parallel surface 0.3 to 2 m before it"
+    for name, part, what in (
+        ("floaters", metrics.map.floater_share, loose),
+        ("double walls", metrics.map.double_wall_share, double),
     ):
-        share, _ = lookup(metrics, "map", key)
-        if share is not None:
-            rows.append([Cell(name), Cell(f"{share:.1%}"), Cell(what)])
-    shares, _ = lookup(metrics, "map", "double_wall_share_at_loops")
-    if shares is not None:
-        what = "of the two submaps that most loops join: by the odometry, then at the poses of the map"
-        rows.append([Cell("double walls there"), Cell(f"{shares['before']:.1%}, {shares['after']:.1%}"), Cell(what)])
+        if not isinstance(part, Missing):
+            rows.append([Cell(name), Cell(f"{part:.1%}"), Cell(what)])
     return Table(["filter", "share", "of the keyframes' pixels, one filter after another"], rows)
 
 
 def map_errors_table(metrics: Metrics) -> Table | None:
     """Errors of the map under both alignments, and by distance from the camera; None without a map."""
-    numbers, _ = lookup(metrics, "map")
-    if numbers is None or numbers.get("triangles") is None:
+    found = metrics.map
+    if isinstance(found, Missing) or isinstance(found.triangles, Missing):
         return None
-    scaled, _ = lookup(numbers, "with_scale")
-    truth, reason = lookup(numbers, "truth")
-    if truth is None:
-        return Table((), [], notes=notes_on([f"error of the map: {reason}"]))
-    rows: list[Sequence[Cell] | str] = [_row("one rigid motion", numbers)]
-    if lookup(numbers, "in_field", "share")[0] not in (None, 1.0):
-        rows.append(_row("where the scanner looked", numbers["in_field"]))
-    rows.append(_row("with one scale", scaled))
-    bins = _bins(numbers)
-    if bins:
-        rows.append("By distance from the nearest camera" + ("" if _is_rigid(numbers) else ", with one scale"))
-        rows += [_row(f"{ring['from_m']:.0f} to {ring['to_m']:.0f} m", ring) for ring in bins]
-    length = number(numbers, "evaluated_m").text
-    words = f"Against {_TRUTHS.get(truth, truth)}, {length} m of road. Map where no surface was measured is an error."
-    missing = dict.fromkeys(lookup(numbers, *path)[1] for path, _ in _ERRORS)
-    return Table(["", *(name for _, name in _ERRORS)], rows, notes=[words, *notes_on(missing)])
+    if isinstance(found.truth, Missing):
+        return Table((), [], notes=notes_on([f"error of the map: {found.truth.reason}"]))
+    rows: list[Sequence[Cell] | str] = [_row("one rigid motion", found)]
+    if not isinstance(found.in_field.share, Missing) and found.in_field.share != 1.0:
+        rows.append(_row("where the scanner looked", found.in_field))
+    rows.append(_row("with one scale", found.with_scale))
+    rings = _rings(metrics)
+    if rings:
+        is_rigid = not isinstance(found.by_distance, Missing)
+        rows.append("By distance from the nearest camera" + ("" if is_rigid else ", with one scale"))
+        rows += [_row(f"{known(ring.from_m):.0f} to {known(ring.to_m):.0f} m", ring) for ring in rings]
+    length = number(found.evaluated_m).text
+    truth = _TRUTHS.get(found.truth, found.truth)
+    words = f"Against {truth}, {length} m of road. Map where no surface was measured is an error."
+    missing = (number(value(found)).tooltip for value in _ERRORS.values())
+    return Table(["", *_ERRORS], rows, notes=[words, *notes_on(missing)])
 
 
 def map_error_figure(metrics: Metrics) -> Figure:
     """Accuracy, completeness and F-scores over the distance from the nearest camera."""
-    bins = _bins(metrics["map"])
+    rings = _rings(metrics)
     with figure_style() as new_figure:
         figure = new_figure(figsize=(7.4, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
-        _draw(left, bins, (("accuracy_median_m",), "median"), color="#0072b2", linestyle="-")
-        _draw(left, bins, (("accuracy_90_m",), "90 %"), color="#e69f00", linestyle="--")
+        _draw(left, rings, "accuracy, median (m)", label="median", color="#0072b2", linestyle="-")
+        _draw(left, rings, "accuracy, 90 % (m)", label="90 %", color="#e69f00", linestyle="--")
         left.set(xlabel="distance from the camera (m)", ylabel="distance to the true surface (m)", yscale="log")
         left.yaxis.set_major_formatter("{x:g}")
-        _draw(right, bins, (("completeness",), "completeness, 0.3 m"), color="#0072b2", linestyle="-")
-        _draw(right, bins, (("f_score", "0.5"), "F-score, 0.5 m"), color="#e69f00", linestyle="--")
-        _draw(right, bins, (("f_score", "0.2"), "F-score, 0.2 m"), color="#009e73", linestyle=":")
+        for name, colour, line in (
+            ("completeness, 0.3 m", "#0072b2", "-"),
+            ("F-score, 0.5 m", "#e69f00", "--"),
+            ("F-score, 0.2 m", "#009e73", ":"),
+        ):
+            _draw(right, rings, name, label=name, color=colour, linestyle=line)
         right.set(xlabel="distance from the camera (m)", ylim=(0.0, 1.02))
         for axes in (left, right):
             axes.set_xlim(left=0)
@@ -121,27 +126,23 @@ def map_error_figure(metrics: Metrics) -> Figure:
 
 def has_map_curve(metrics: Metrics) -> bool:
     """Whether the error of the map is known at two distances or more."""
-    numbers, _ = lookup(metrics, "map")
-    known = [] if numbers is None else [ring for ring in _bins(numbers) if ring.get("accuracy_median_m") is not None]
-    return len(known) > 1
+    return sum(not isinstance(ring.accuracy_median_m, Missing) for ring in _rings(metrics)) > 1
 
 
-def _draw(axes: Axes, bins: Sequence[Metrics], line: tuple[tuple[str, ...], str], **look: Any) -> None:
-    path, label = line
-    values = [(0.5 * (ring["from_m"] + ring["to_m"]), lookup(ring, *path)[0]) for ring in bins]
-    known = [(middle, value) for middle, value in values if value is not None]
-    axes.plot([middle for middle, _ in known], [value for _, value in known], marker="o", label=label, **look)
+def _draw(axes: Axes, rings: Sequence[Ring], name: str, **look: Any) -> None:
+    points = []
+    for ring in rings:
+        low, high, value = known(ring.from_m), known(ring.to_m), known(_ERRORS[name](ring))
+        if low is not None and high is not None and value is not None:
+            points.append((0.5 * (low + high), value))
+    axes.plot([middle for middle, _ in points], [value for _, value in points], marker="o", **look)
 
 
-def _row(name: str, numbers: Mapping[str, Any] | None) -> list[Cell]:
-    return [Cell(name), *(number(numbers or {}, *path, decimals=3) for path, _ in _ERRORS)]
+def _row(name: str, errors: SurfaceMetrics | Missing) -> list[Cell]:
+    return [Cell(name), *(number(value(errors), 3) for value in _ERRORS.values())]
 
 
-def _is_rigid(numbers: Mapping[str, Any]) -> bool:
-    return lookup(numbers, "by_distance")[0] is not None
-
-
-def _bins(numbers: Mapping[str, Any]) -> list[Metrics]:
+def _rings(metrics: Metrics) -> list[Ring]:
     """The curve of the rigidly moved map, or of the scaled one where lengths are not in metres."""
-    found, _ = lookup(numbers, "by_distance") if _is_rigid(numbers) else lookup(numbers, "with_scale", "by_distance")
-    return list(found or [])
+    rigid = metrics.map.by_distance
+    return list(metrics.map.with_scale.by_distance if isinstance(rigid, Missing) else rigid)

@@ -14,8 +14,7 @@ from slam.results.report.map_picture import MapScene
 from slam.results.report.map_viewer import MapViewer, map_viewer
 from slam.results.report.plots import length_unit, map_figure
 from slam.runtime.errors import RunError
-
-MAP_MESH, MAP_ABOVE, MAP_DRIVER = "map_mesh.ply", "map_above.png", "map_driver.png"
+from slam.runtime.run_files import MAP_ABOVE, MAP_DRIVER, MAP_MESH
 
 _MOST_TRIANGLES = 1_000_000  # of the picture from above
 _NEAR = 100.0  # the driver sees that far, in the whole mesh

@@ -7,19 +7,18 @@ import io
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from slam.evaluation.drift import REFERENCE
 from slam.formats.trajectory import Trajectory
 from slam.frames import DepthMap, Image
-from slam.results.comparison import failure, lookup, unit_notes
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 from slam.results.report import tables as report_tables
 from slam.results.report.map_report import has_map_curve, map_error_figure, map_errors_table, map_filters, map_sizes
-from slam.results.report.map_view import MAP_ABOVE, MAP_DRIVER, MapViews
+from slam.results.report.map_view import MapViews
 from slam.results.report.plots import (
     depth_figure,
     drift_figure,
@@ -28,17 +27,16 @@ from slam.results.report.plots import (
     trajectories_of,
     trajectory_figure,
 )
-from slam.results.report.tables import Cell, Table
+from slam.results.report.tables import Cell, Table, number
 from slam.runtime.errors import SlamError
+from slam.runtime.run_files import LOOPS, MEANINGS, REFERENCE, REPORT
+from slam.runtime.storage.record import MISSING, Missing, known
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 logger = logging.getLogger(__name__)
 
-Metrics = Mapping[str, Any]
-
-REPORT = "report.html"
 _TEMPLATES = Environment(
     loader=PackageLoader("slam", "results/report"),
     autoescape=True,
@@ -47,27 +45,6 @@ _TEMPLATES = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_MEANINGS = {
-    "config.yaml": "resolved configuration",
-    "metrics.json": "every number of this page",
-    "trajectory_optimised.geojson": "optimised trajectory on the earth",
-    "trajectory_optimised.kml": "the same for Google Earth",
-    "trajectory_network": "raw network poses, chained",
-    "trajectory_odometry": "front end fused, no loops",
-    "trajectory_optimised": "after the pose graph",
-    "trajectory_lidar": "KISS-ICP on the LiDAR scans",
-    "reference": "ground truth",
-    "graph.g2o": "pose graph",
-    "loops.json": "accepted and rejected loops",
-    "places.npz": "features of places, for localize",
-    "drive.zip": "measurements of every frame, for run --continue",
-    "keyframes.npz": "keyframes of the map, for run --continue",
-    "map_mesh.ply": "map as a mesh, y down",
-    "map_cloud.ply": "map as a coloured cloud, y down",
-    MAP_ABOVE: "the map from above",
-    MAP_DRIVER: "the map from the driver's seat",
-    "run.log": "log of the run",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,15 +82,15 @@ def write_report(
         RunError: ``metrics.json`` is damaged.
     """
     metrics = folder.metrics()
-    name = str(lookup(metrics, "sequence", "name")[0] or folder.path.resolve().name)
+    name = known(metrics.sequence.name) or folder.path.resolve().name
     trajectories, unit = _trajectories(folder), length_unit(folder)
     page = _TEMPLATES.get_template("page.html.j2").render(
         name=name,
-        failure=failure(metrics),
-        leak=lookup(metrics, "provenance", "leak")[0],
-        version=lookup(metrics, "provenance", "version")[0] or "",
-        unit_notes=unit_notes(metrics),
-        key_numbers=[] if failure(metrics) else report_tables.key_numbers(metrics),
+        failure=metrics.failure,
+        leak=metrics.provenance.leak is True,
+        version=known(metrics.provenance.version) or "",
+        unit_notes=metrics.unit_notes(),
+        key_numbers=[] if metrics.failure else report_tables.key_numbers(metrics),
         what_ran=report_tables.what_ran(metrics),
         trajectories=_trajectory_picture(trajectories, unit),
         errors=report_tables.errors(metrics),
@@ -129,9 +106,9 @@ def write_report(
         map_filters=map_filters(metrics),
         map_errors=map_errors_table(metrics),
         map_curve=_map_curve(metrics),
-        no_map=_absence(metrics, "map"),
-        loops=report_tables.loops(metrics, folder.path / "loops.json"),
-        no_loops=_absence(metrics, "loops"),
+        no_map=_absence(metrics, metrics.map),
+        loops=report_tables.loops(metrics, folder.path / LOOPS),
+        no_loops=_absence(metrics, metrics.loops),
         tracking=report_tables.tracking(metrics),
         graph=report_tables.graph(metrics),
         timing=report_tables.timing(metrics),
@@ -141,10 +118,11 @@ def write_report(
     folder.write_text(REPORT, page)
 
 
-def _absence(metrics: Metrics, name: str) -> str:
+def _absence(metrics: Metrics, part: object) -> str:
     """Why a run has no such part; empty where it has one, or failed before."""
-    part, reason = lookup(metrics, name)
-    return "" if part is not None or (failure(metrics) and name not in metrics) else reason
+    if not isinstance(part, Missing) or (metrics.failure and part == MISSING):
+        return ""
+    return part.reason
 
 
 def _trajectory_picture(trajectories: Mapping[str, Trajectory], unit: str) -> Picture | None:
@@ -168,9 +146,9 @@ def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]
     yield _drawn(lambda: drift_figure(trajectories), "Drift over segment length", caption)
 
 
-def _depth_error(metrics: Mapping[str, Any]) -> Table | None:
+def _depth_error(metrics: Metrics) -> Table | None:
     """Error of learned depth over distance; None where it was not measured."""
-    rows, _ = lookup(metrics, "depth_error")
+    rows = list(metrics.depth_error)
     if not rows:
         return None
     words = (
@@ -178,8 +156,12 @@ def _depth_error(metrics: Mapping[str, Any]) -> Table | None:
         "compared with image geometry. It is zero on average, for its scale is measured step by step."
     )
     head = ("learned depth", "bias", "relative sigma", "corners")
-    cells = [(f"{r['depth']:.1f}", f"{r['bias']:+.2f}", f"{r['sigma']:.2f}", f"{r['corners']:.0f}") for r in rows]
-    return Table(head, [[Cell(text) for text in row] for row in cells], notes=[words])
+    cells = [[number(row.depth, 1), _signed(row.bias), number(row.sigma, 2), number(row.corners)] for row in rows]
+    return Table(head, cells, notes=[words])
+
+
+def _signed(value: float | Missing) -> Cell:
+    return number(value) if isinstance(value, Missing) else Cell(f"{value:+.2f}")
 
 
 def _depth_picture(examples: Sequence[DepthExample]) -> Picture | None:
@@ -216,9 +198,8 @@ def _files(folder: RunFolder) -> Table | None:
     rows = []
     for path in sorted(folder.path.iterdir()):
         if path.is_file() and not path.name.startswith(".") and path.name != REPORT:
-            meaning = _MEANINGS.get(path.name) or _MEANINGS.get(path.name.partition(".")[0], "")
             size = _size(path.stat().st_size)
-            rows.append([Cell(path.name, address=quote(path.name)), Cell(meaning), Cell(size)])
+            rows.append([Cell(path.name, address=quote(path.name)), Cell(MEANINGS.get(path.name, "")), Cell(size)])
     return Table((), rows, "words") if rows else None
 
 

@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from erfsfm.common.figure_file import require_figure, save_figure
-from slam.evaluation.drift import REFERENCE, aligned, estimates, segment_drifts, travelled
+from slam.evaluation.drift import aligned, estimates, segment_drifts
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import DepthMap, Image
-from slam.results.comparison import METRES, unit_of_lengths
-from slam.results.folder import TRAJECTORIES, RunFolder
+from slam.geometry.se3 import path_distance
+from slam.results.folder import RunFolder
+from slam.results.metrics import METRES
 from slam.results.report.map_picture import AerialView
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import REFERENCE, TRAJECTORIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -109,7 +111,7 @@ def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit
         estimate, truth = associate(trajectory, reference)
         error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
         label, look = _LOOKS[name]
-        axes.plot(travelled(truth), error, label=label, **look)
+        axes.plot(path_distance(truth.T_world_camera), error, label=label, **look)
     axes.set(xlabel="distance travelled (m)", ylabel="position error (m), 7 dof")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
@@ -252,7 +254,7 @@ def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, 
 
 def length_unit(run: RunFolder) -> str:
     """The unit of a run's trajectories and map, for the axes of a plot."""
-    unit = unit_of_lengths(run.metrics())
+    unit = run.metrics().unit
     return "m" if unit == METRES else unit
 
 

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from slam.results.comparison import (
+from slam.results.error_columns import (
     ALIGNED_ATE,
+    COLUMNS,
+    DASH,
     EVO_DIFFERENCE,
-    MISSING,
-    NOT_RECORDED,
     R_REL,
     SNIPPET_ATE,
     SNIPPET_RE,
-    STATISTICS,
     T_REL,
     ErrorColumn,
-    failure,
-    lookup,
+    Errors,
     written,
 )
-from slam.results.folder import TRAJECTORIES
-from slam.results.schema import LoopsFile
+from slam.results.metrics import GpsErrors, LoopsFile, Metrics, Stretch
 from slam.runtime.errors import RunError
-from slam.runtime.storage.json_file import read_json
-
-Metrics = Mapping[str, Any]
+from slam.runtime.run_files import TRAJECTORIES
+from slam.runtime.storage.record import NOT_RECORDED, Missing, known
 
 
 @dataclass(frozen=True)
@@ -51,8 +47,8 @@ class Table:
     notes: Sequence[str] = field(default_factory=tuple)
 
 
-ALIGNMENTS = ("none", "first", "scale", "6dof", "7dof")
 MOST_LOOPS = 40
+_ALIGNMENTS = {"dof6": "6dof", "dof7": "7dof"}
 _STAGES = {"journal": "journal, from which run --continue goes on"}
 _PER_ALIGNMENT = (
     ("ate_rmse_m", "ATE RMSE, m", 3),
@@ -64,24 +60,24 @@ _PER_ALIGNMENT = (
 )
 
 
-def number(metrics: Metrics, *path: str, decimals: int = 0) -> Cell:
-    """A number of the metrics as a cell; a dash with its reason as a tooltip where there is none."""
-    value, reason = lookup(metrics, *path)
-    words = f"{value:,}" if isinstance(value, int) else written(value, decimals)
-    return Cell(words, reason, "missing" if reason else "")
+def number(value: Any, decimals: int = 0) -> Cell:
+    """A value of the metrics as a cell; a dash with its reason as a tooltip where it is missing."""
+    if isinstance(value, Missing):
+        return Cell(DASH, value.reason, "missing")
+    return Cell(f"{value:,}" if isinstance(value, int) else written(value, decimals))
 
 
 def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
     """The key numbers that there are: name, value and unit of each."""
-    best = ("trajectories", "optimised")
+    best = metrics.trajectories.optimised
     wanted = [
-        ("Position error", number(metrics, *best, "align", "7dof", "ate_rmse_m", decimals=2), "m, 7 dof"),
-        ("Drift, t_rel", number(metrics, *best, *T_REL.path, decimals=2), "%"),
-        ("Path", number(metrics, "sequence", "length_m"), "m"),
-        ("Frames", number(metrics, "sequence", "frames"), ""),
-        ("Speed", number(metrics, "timing", "frames_per_second", decimals=1), "frames/s"),
-        ("Loops accepted", number(metrics, "loops", "accepted"), ""),
-        ("Map triangles", number(metrics, "map", "triangles"), ""),
+        ("Position error", number(best.align.dof7.ate_rmse_m, 2), "m, 7 dof"),
+        ("Drift, t_rel", number(T_REL.value(best), 2), "%"),
+        ("Path", number(metrics.sequence.length_m), "m"),
+        ("Frames", number(metrics.sequence.frames), ""),
+        ("Speed", number(metrics.timing.frames_per_second, 1), "frames/s"),
+        ("Loops accepted", number(metrics.loops.accepted), ""),
+        ("Map triangles", number(metrics.map.triangles), ""),
     ]
     return [(name, cell, unit) for name, cell, unit in wanted if cell.style != "missing"]
 
@@ -89,88 +85,89 @@ def key_numbers(metrics: Metrics) -> list[tuple[str, Cell, str]]:
 def what_ran(metrics: Metrics) -> Table:
     """Sequence, weights, scale and command; a run that failed early has fewer rows."""
 
-    def text(*path: str, decimals: int = 1, unit: str = "") -> str:
-        value, reason = lookup(metrics, *path)
-        return f"{MISSING} ({reason})" if value is None else f"{written(value, decimals)}{unit}"
+    def text(value: Any, decimals: int = 1, unit: str = "", most: int | None = None) -> str:
+        missing = f"{DASH} ({value.reason})" if isinstance(value, Missing) else ""
+        return missing or f"{written(value, decimals)[:most]}{unit}"
 
-    seen, _ = lookup(metrics, "provenance", "trained_on")
-    leak, _ = lookup(metrics, "provenance", "leak")
-    sha256, noise = text("provenance", "weights_sha256"), text("provenance", "noise_sha256")
+    sequence, scale, ran = metrics.sequence, metrics.scale, metrics.provenance
+    noise = text(ran.noise_sha256, most=16)
     rows = [
-        ("Sequence", f"{text('sequence', 'name')}, {text('sequence', 'frames')} frames"),
-        ("Interpolated frames", _frames(metrics, "bridged") or "none"),
-        *([("Doubled frames", doubled)] if (doubled := _frames(metrics, "doubled")) else []),
-        *([("LiDAR scans left out", left_out)] if (left_out := _frames(metrics, "unreadable_scans")) else []),
-        ("True length", text("sequence", "length_m", unit=" m")),
-        ("Frame rate", text("sequence", "fps", unit=" frames/s")),
-        ("Scale", f"mode {text('scale', 'mode')}, value {text('scale', 'value', decimals=4)}"),
-        ("Speed", text("timing", "frames_per_second", unit=" frames/s over the whole run")),
-        ("Weights", f"{text('provenance', 'weights')}, sha256 {sha256 if MISSING in sha256 else sha256[:16]}"),
-        ("Noise of the poses", noise if MISSING in noise else f"noise.yaml, sha256 {noise[:16]}"),
+        ("Sequence", f"{text(sequence.name)}, {text(sequence.frames)} frames"),
+        ("Interpolated frames", _stretches(sequence.bridged) or "none"),
+        *([("Doubled frames", doubled)] if (doubled := _stretches(sequence.doubled)) else []),
+        *([("LiDAR scans left out", left_out)] if (left_out := _stretches(sequence.unreadable_scans)) else []),
+        ("True length", text(sequence.length_m, unit=" m")),
+        ("Frame rate", text(sequence.fps, unit=" frames/s")),
+        ("Scale", f"mode {text(scale.mode)}, value {text(scale.value, 4)}"),
+        ("Speed", text(metrics.timing.frames_per_second, unit=" frames/s over the whole run")),
+        ("Weights", f"{text(ran.weights)}, sha256 {text(ran.weights_sha256, most=16)}"),
+        ("Noise of the poses", noise if DASH in noise else f"noise.yaml, sha256 {noise}"),
         ("Depth", _depth_source(metrics)),
-        ("Licence of the weights", text("provenance", "weights_licence")),
-        ("Trained on", _shortened([str(name) for name in seen]) if seen else MISSING),
-        ("Leak", {True: "yes: trained on this sequence", False: "none known"}.get(leak, MISSING)),
-        ("Command", text("provenance", "command")),
-        ("Seed, device", f"{text('provenance', 'seed')}, {text('provenance', 'device')}"),
-        ("Version, commit", f"{text('provenance', 'version')}, {text('provenance', 'commit')}"),
+        ("Licence of the weights", text(ran.weights_licence)),
+        ("Trained on", _shortened(list(ran.trained_on)) or DASH),
+        ("Leak", {True: "yes: trained on this sequence", False: "none known", None: DASH}[known(ran.leak)]),
+        ("Command", text(ran.command)),
+        ("Seed, device", f"{text(ran.seed)}, {text(ran.device)}"),
+        ("Version, commit", f"{text(ran.version)}, {text(ran.commit)}"),
     ]
-    recorded = [row for row in rows if NOT_RECORDED not in row[1]] if failure(metrics) else rows
+    recorded = [row for row in rows if NOT_RECORDED not in row[1]] if metrics.failure else rows
     return Table((), _texts(recorded), "words")
 
 
 def gps(metrics: Metrics) -> Table | None:
     """Distances from the GPS track; None without one."""
-    if lookup(metrics, "gps")[0] is None:
+    found = metrics.gps
+    if isinstance(found, Missing):
         return None
-    columns = ("horizontal_rmse_m", "horizontal_median_m", "vertical_rmse_m")
-    rows = [
-        [Cell(name), *(number(metrics, "gps", name, column, decimals=2) for column in columns)]
-        for name in ("odometry", "optimised")
-    ]
-    fixes, in_graph = lookup(metrics, "gps", "fixes")[0], lookup(metrics, "gps", "in_graph")[0]
-    use = "factors of the pose graph: the optimised row is no independent test" if in_graph else "not in the pose graph"
-    notes = [f"{fixes} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
-    return Table(("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m"), rows, notes=notes)
+
+    def row(name: str, errors: GpsErrors | Missing) -> list[Cell]:
+        values = (errors.horizontal_rmse_m, errors.horizontal_median_m, errors.vertical_rmse_m)
+        return [Cell(name), *(number(value, 2) for value in values)]
+
+    factors = "factors of the pose graph: the optimised row is no independent test"
+    use = factors if found.in_graph is True else "not in the pose graph"
+    notes = [f"{known(found.fixes)} fixes, {use}. Both trajectories are turned and moved onto the track, not scaled."]
+    head = ("", "horizontal RMSE, m", "horizontal median, m", "vertical RMSE, m")
+    return Table(head, [row("odometry", found.odometry), row("optimised", found.optimised)], notes=notes)
 
 
 def no_errors(metrics: Metrics) -> str:
     """Why no trajectory has an error; empty where one has, or where nothing was evaluated."""
-    places = [("trajectories", name, *each.path) for each in STATISTICS for name in _evaluated(metrics)]
-    if not places or any(lookup(metrics, *place)[0] is not None for place in places):
-        return ""
-    return lookup(metrics, *places[0])[1]
+    values = [column.value(errors) for column in COLUMNS for errors in _evaluated(metrics).values()]
+    missing = [value.reason for value in values if isinstance(value, Missing)]
+    return missing[0] if values and len(missing) == len(values) else ""
 
 
 def errors(metrics: Metrics) -> Table | None:
     """Every trajectory against the truth, a column each; None where nothing was evaluated."""
-    known = _evaluated(metrics)
-    if not known or no_errors(metrics):
+    evaluated = _evaluated(metrics)
+    if not evaluated or no_errors(metrics):
         return None
 
-    def row(statistic: ErrorColumn) -> list[Cell]:
-        values = [lookup(metrics, "trajectories", name, *statistic.path) for name in known]
-        cells = _cells(values, statistic.decimals, mark_best=statistic is not EVO_DIFFERENCE)
-        if statistic.path[0] == "snippet5":
-            spread = (*statistic.path[:-1], statistic.path[-1].replace("_mean", "_std"))
-            stds = (lookup(metrics, "trajectories", name, *spread)[0] for name in known)
-            cells = [
-                cell if std is None else replace(cell, text=f"{cell.text} ± {written(std, statistic.decimals)}")
-                for cell, std in zip(cells, stds)
-            ]
-        return [Cell(statistic.name), *cells]
+    def row(column: ErrorColumn) -> list[Cell]:
+        values = [column.value(each) for each in evaluated.values()]
+        numbers = {value for value in values if not isinstance(value, Missing)}
+        least = min(numbers) if column is not EVO_DIFFERENCE and len(numbers) > 1 else None
+        cells = [number(value, column.decimals) for value in values]
+        styles = ["best" if value == least else cell.style for value, cell in zip(values, cells)]
+        texts = [column.text(each) for each in evaluated.values()]
+        return [
+            Cell(column.name),
+            *(Cell(text, cell.tooltip, style) for text, cell, style in zip(texts, cells, styles)),
+        ]
 
     rows: list[Sequence[Cell] | str] = [
         "Snippets of five frames, each with its own scale; ATE is norm / 5",
-        *(row(statistic) for statistic in (SNIPPET_ATE, SNIPPET_RE)),
+        *(row(column) for column in (SNIPPET_ATE, SNIPPET_RE)),
         "Whole trajectory: position error in metres, by alignment",
-        *(row(statistic) for statistic in ALIGNED_ATE),
+        *(row(column) for column in ALIGNED_ATE),
         "KITTI segments of 100 to 800 m",
-        *(row(statistic) for statistic in (T_REL, R_REL)),
+        *(row(column) for column in (T_REL, R_REL)),
         "Cross-check",
         row(EVO_DIFFERENCE),
     ]
-    return Table(["", *known], rows, notes=["Bold: the best of a row.", *notes_on(_missing_errors(metrics, known))])
+    notes = ["Bold: the best of a row.", *notes_on(_missing_errors(metrics))]
+    return Table(["", *evaluated], rows, notes=notes)
 
 
 def alignments(metrics: Metrics) -> Table | None:
@@ -178,72 +175,66 @@ def alignments(metrics: Metrics) -> Table | None:
     if no_errors(metrics):
         return None
     rows: list[Sequence[Cell] | str] = []
-    for name in TRAJECTORIES:
-        place = ("trajectories", name, "align")
-        if lookup(metrics, *place)[0] is None:
+    for name, found in _evaluated(metrics).items():
+        if isinstance(found.align, Missing):
             continue
         rows.append(name)
-        for how in ALIGNMENTS:
-            cells = [number(metrics, *place, how, key, decimals=decimals) for key, _, decimals in _PER_ALIGNMENT]
-            rows.append([Cell(how), *cells])
+        for how, each in found.align:
+            cells = [number(getattr(each, key), decimals) for key, _, decimals in _PER_ALIGNMENT]
+            rows.append([Cell(_ALIGNMENTS.get(how, how)), *cells])
     return Table(["alignment", *(label for _, label, _ in _PER_ALIGNMENT)], rows) if rows else None
 
 
 def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
     """``counts`` of loops, ``reasons`` of those that are missing, and a ``table`` of the accepted and the rejected."""
-    tree, _ = lookup(metrics, "loops")
-    if tree is None:
+    found = metrics.loops
+    if isinstance(found, Missing):
         return None
-    stages, details = ("candidates", "verified", "accepted"), _details(loops_file)
-    groups = (("accepted", details.get("accepted", [])), ("rejected", tree.get("rejected") or []))
-    rows = [
-        (str(loop.get("from")), str(loop.get("to")), verdict, str(loop.get("reason") or ""))
-        for verdict, entries in groups
-        for loop in entries
-        if isinstance(loop, Mapping)
-    ]
-    left_out = details.get("rejected_left_out")
+    stages = {"candidates": found.candidates, "verified": found.verified, "accepted": found.accepted}
+    details = _details(loops_file)
+    groups = (("accepted", details.accepted), ("rejected", found.rejected))
+    rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group]
+    left_out = known(details.rejected_left_out)
     where = loops_file.name + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
     more = [f"{len(rows) - MOST_LOOPS} more in {where}."] if len(rows) > MOST_LOOPS else []
     head = ("from frame", "to frame", "verdict", "reason")
     return {
-        "counts": ", ".join(f"{number(tree, stage).text} {stage}" for stage in stages),
-        "reasons": notes_on(lookup(tree, stage)[1] for stage in stages),
+        "counts": ", ".join(f"{number(value).text} {stage}" for stage, value in stages.items()),
+        "reasons": notes_on(number(value).tooltip for value in stages.values()),
         "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
     }
 
 
 def tracking(metrics: Metrics) -> dict[str, Any] | None:
     """``counts`` of keyframes and maps, and a ``table`` of what became of them; None without keyframes."""
-    tree, _ = lookup(metrics, "tracking")
-    if tree is None:
+    found = metrics.tracking
+    if isinstance(found, Missing):
         return None
     rows = [
-        tuple("" if event.get(key) is None else str(event[key]) for key in ("frame", "event", "other", "support"))
-        for event in tree.get("events") or []
-        if isinstance(event, Mapping)
+        ["" if value is None else str(value) for value in (event.frame, event.event, event.other, event.support)]
+        for event in found.events
     ]
     more = [f"{len(rows) - MOST_LOOPS} more in metrics.json."] if len(rows) > MOST_LOOPS else []
     head = ("frame", "event", "at the place of frame", "points or loops")
     return {
-        "counts": f"{number(tree, 'keyframes').text} keyframes, {number(tree, 'maps').text} maps",
+        "counts": f"{number(found.keyframes).text} keyframes, {number(found.maps).text} maps",
         "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
     }
 
 
 def graph(metrics: Metrics) -> dict[str, Any] | None:
     """``nodes`` and ``factors`` of the pose graph, and its ``coverage`` or the ``reasons`` why there is none."""
-    if lookup(metrics, "graph")[0] is None:
+    found = metrics.graph
+    if isinstance(found, Missing):
         return None
-    size = {key: number(metrics, "graph", key).text for key in ("nodes", "factors")}
-    coverage, reason = lookup(metrics, "graph", "coverage")
-    if coverage is None:
-        return size | {"coverage": None, "reasons": notes_on([f"coverage: {reason}"])}
+    size = {"nodes": number(found.nodes).text, "factors": number(found.factors).text}
+    coverage = found.coverage
+    if isinstance(coverage, Missing):
+        return size | {"coverage": None, "reasons": notes_on([f"coverage: {coverage.reason}"])}
     rows = []
-    for level in ("50", "90", "95"):
-        ratio, why = lookup(coverage, level)
-        shown = MISSING if ratio is None else f"{100 * ratio:.0f} %"
-        rows.append([Cell(f"inside the {level} % quantile"), Cell(shown, why, "missing" if why else "")])
+    for level, ratio in ((50, coverage.inside_50), (90, coverage.inside_90), (95, coverage.inside_95)):
+        shown = number(ratio) if isinstance(ratio, Missing) else Cell(f"{100 * ratio:.0f} %")
+        rows.append([Cell(f"inside the {level} % quantile"), shown])
     words = (
         "Fraction of factors whose error at the truth lies inside a quantile of their stated noise. A fraction below "
         "its quantile means sigmas that are too small, one above it sigmas that are too large."
@@ -253,36 +244,42 @@ def graph(metrics: Metrics) -> dict[str, Any] | None:
 
 def timing(metrics: Metrics) -> Table | None:
     """Seconds by stage, the longest first; None where nothing was timed."""
-    stages, _ = lookup(metrics, "timing", "stages")
+    stages = known(metrics.timing.stages)
     if not stages:
         return None
     timed = sum(stages.values())
-    total = max(float(lookup(metrics, "timing", "seconds_total")[0] or 0.0), timed, 1e-9)
+    total = max(known(metrics.timing.seconds_total) or 0.0, timed, 1e-9)
     stages = {_STAGES.get(name, name): seconds for name, seconds in stages.items()} | {"everything else": total - timed}
     longest = max(*stages.values(), 1e-9)
     rows = [
         [Cell(name), Cell(f"{seconds:.1f} s"), Cell(f"{100 * seconds / total:.0f} %"), _bar(seconds / longest)]
         for name, seconds in sorted(stages.items(), key=lambda item: -item[1])
     ]
-    memory, processor = (number(metrics, "timing", key).text for key in ("peak_rss_mb", "cpu_seconds"))
+    memory, processor = (number(each).text for each in (metrics.timing.peak_rss_mb, metrics.timing.cpu_seconds))
     words = f"{total:.1f} s in all, {processor} s of processor time, at most {memory} MiB of memory."
     return Table(("stage", "time", "share", ""), rows, notes=[words])
 
 
-def _evaluated(metrics: Metrics) -> list[str]:
-    return [name for name in TRAJECTORIES if lookup(metrics, "trajectories", name)[0] is not None]
+def _all_errors(metrics: Metrics) -> dict[str, Errors]:
+    return {name: getattr(metrics.trajectories, name) for name in TRAJECTORIES}
 
 
-def _missing_errors(metrics: Metrics, known: Sequence[str]) -> list[str]:
+def _evaluated(metrics: Metrics) -> dict[str, Errors]:
+    return {name: errors for name, errors in _all_errors(metrics).items() if not isinstance(errors, Missing)}
+
+
+def _missing_errors(metrics: Metrics) -> list[str]:
     """What of the errors is missing, by reason."""
     missing: dict[str, list[str]] = {}
-    for statistic in (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, EVO_DIFFERENCE):
-        for name in known:
-            why = lookup(metrics, "trajectories", name, *statistic.path)[1]
-            missing.setdefault(why, []).append(f"{statistic.name} of {name}")
-    for name in TRAJECTORIES:
-        missing.setdefault(lookup(metrics, "trajectories", name)[1], []).append(f"{name} trajectory")
-    return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items() if why]
+    for column in COLUMNS:
+        for name, errors in _evaluated(metrics).items():
+            value = column.value(errors)
+            if isinstance(value, Missing):
+                missing.setdefault(value.reason, []).append(f"{column.name} of {name}")
+    for name, errors in _all_errors(metrics).items():
+        if isinstance(errors, Missing):
+            missing.setdefault(errors.reason, []).append(f"{name} trajectory")
+    return [f"{', '.join(what) if len(what) <= 4 else 'others'}: {why}" for why, what in missing.items()]
 
 
 def _texts(rows: Iterable[Sequence[str]]) -> list[list[Cell]]:
@@ -293,43 +290,31 @@ def _bar(ratio: float) -> Cell:
     return Cell("", style="track", bar=100.0 * min(max(ratio, 0.0), 1.0))
 
 
-def _cells(values: Sequence[tuple[Any, str]], decimals: int, mark_best: bool) -> list[Cell]:
-    """Cells of a row of errors; the smallest of several is marked."""
-    numbers = [value for value, _ in values if value is not None]
-    least = min(numbers) if mark_best and len(set(numbers)) > 1 else None
-    cells = []
-    for value, reason in values:
-        style = "missing" if value is None else "best" if value == least else ""
-        cells.append(Cell(written(value, decimals), reason, style))
-    return cells
-
-
 def notes_on(reasons: Iterable[str]) -> list[str]:
     """One line with the reasons of missing numbers, each once; none where nothing is missing."""
     distinct = [reason for reason in dict.fromkeys(reasons) if reason]
-    return [f"{MISSING}  {'; '.join(distinct)}."] if distinct else []
+    return [f"{DASH}  {'; '.join(distinct)}."] if distinct else []
 
 
-def _details(loops_file: Path) -> dict[str, Any]:
+def _details(loops_file: Path) -> LoopsFile:
     """``loops.json``; empty where the file is missing or damaged."""
     try:
-        return read_json(loops_file, LoopsFile)
+        return LoopsFile.read(loops_file)
     except (OSError, RunError):
-        return {}
+        return LoopsFile()
 
 
 def _depth_source(metrics: Metrics) -> str:
-    name, reason = lookup(metrics, "provenance", "depth_source")
-    sha256, _ = lookup(metrics, "provenance", "depth_sha256")
-    if name is None:
-        return f"{MISSING} ({reason})"
+    name = metrics.provenance.depth_source
+    if isinstance(name, Missing):
+        return f"{DASH} ({name.reason})"
+    sha256 = known(metrics.provenance.depth_sha256)
     return "by these weights" if name == "network" else f"{name}, sha256 {str(sha256)[:16]}"
 
 
-def _frames(metrics: Metrics, name: str) -> str:
-    """Consecutive frames of a list of the sequence, with the reason of the first."""
-    found, _ = lookup(metrics, "sequence", name)
-    return _shortened([f"{gap['first']} to {gap['last']}: {gap['reason']}" for gap in found or ()])
+def _stretches(found: list[Stretch] | Missing) -> str:
+    """Consecutive frames, with the reason of the first."""
+    return _shortened([f"{each.first} to {each.last}: {each.reason}" for each in found])
 
 
 def _shortened(names: Sequence[str], most: int = 12) -> str:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 from erfsfm.common import files
 from slam.runtime.errors import SlamError
-
-# some keyframes of a pass that has not ended (`slam.pipeline.checkpoint`)
-KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")
 
 
 def write_atomically(

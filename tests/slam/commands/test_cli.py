@@ -183,7 +183,7 @@ def test_run_prints_table_licence_and_place(call: Call, kitti_root: Path, tiny_w
     assert "sim, scale none" in out and "networks' own unit" in out
     assert "none, untrained" in out and "LEAK" not in out
     assert "6 frames in" in out and "my run" in out and "report.html" not in out
-    metrics = RunFolder.open(Path("my run")).metrics()
+    metrics = RunFolder.open(Path("my run")).metrics().tree()
     assert metrics["provenance"]["seed"] == 5
     assert shlex.split(metrics["provenance"]["command"]) == [
         "erfsfm-slam",
@@ -217,7 +217,7 @@ def test_run_stamps_a_leak_and_prints_json(call: Call, kitti_root: Path, leaky_w
     arguments = ["run", "--dataset", kitti_root, "--weights", leaky_weights, "--frames", "0:6", *QUICK]
     assert "LEAK" in call(*arguments)[1]
     code, out, _ = call(*arguments, "--json", "--output", "again")
-    assert code == 0 and json.loads(out) == RunFolder.open(Path("again")).metrics()
+    assert code == 0 and json.loads(out) == RunFolder.open(Path("again")).metrics().tree()
     assert Path("results/latest").resolve().name.endswith("_sim")
 
 
@@ -230,7 +230,7 @@ def test_a_run_that_breaks_off_is_one_line_and_a_failed_folder(
     code, out, err = call("run", "--dataset", root, "--weights", tiny_weights, "--output", "run", *QUICK)
     assert code == 1 and out == "" and err.startswith("erfsfm-slam: ") and "000004.png" in err
     assert err.count("\n") == 1
-    assert RunFolder.open(Path("run")).metrics()["status"] == "failed"
+    assert RunFolder.open(Path("run")).metrics().tree()["status"] == "failed"
 
 
 def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,14 +12,14 @@ def test_no_truth_gives_no_numbers() -> None:
     errors = DepthErrors()
     errors.add(TRUTH, np.zeros_like(TRUTH))
     errors.add(TRUTH, np.full_like(TRUTH, 81.0))
-    assert errors.summary() is None
+    assert errors.metrics() is None
 
 
 def test_numbers_of_a_constant_error() -> None:
     errors = DepthErrors()
     errors.add(TRUTH * 1.1, TRUTH)
     errors.add(TRUTH * 0.7, TRUTH)
-    summary = errors.summary()
+    summary = errors.metrics().tree()
     assert summary is not None
     assert summary["abs_rel"] == pytest.approx(0.2)
     assert summary["median_rel"] == pytest.approx(0.2)
@@ -33,7 +33,7 @@ def test_correct_sigmas_cover() -> None:
     errors = DepthErrors()
     for _ in range(20):
         errors.add(TRUTH * np.exp(rng.normal(0, 0.05, TRUTH.shape)), TRUTH, np.full_like(TRUTH, 0.05))
-    summary = errors.summary()
+    summary = errors.metrics().tree()
     assert summary is not None
     for level in (50, 90, 95):
         assert summary["coverage"][str(level)] == pytest.approx(level / 100, abs=0.02)
@@ -43,7 +43,7 @@ def test_truth_of_another_size_meets_the_nearest_pixel() -> None:
     depth = np.repeat(np.arange(1.0, 11.0, dtype=np.float32), 4)[None].repeat(8, axis=0)  # (8, 40)
     errors = DepthErrors()
     errors.add(depth, np.repeat(np.repeat(depth, 2, axis=0), 2, axis=1))
-    summary = errors.summary()
+    summary = errors.metrics().tree()
     assert summary is not None and summary["abs_rel"] == 0
 
 
@@ -55,18 +55,18 @@ def test_pixels_without_an_estimate_are_not_compared() -> None:
     depth[2], sigma[2] = 30, np.inf
     errors = DepthErrors()
     errors.add(depth, truth, sigma)
-    summary = errors.summary()
+    summary = errors.metrics().tree()
     assert summary is not None and summary["abs_rel"] == pytest.approx(0.1, rel=1e-5)
     assert (summary["coverage"]["50"], summary["coverage"]["90"]) == (0.0, 1.0)
     nothing = DepthErrors()
     nothing.add(np.zeros((4, 4), np.float32), truth)
-    assert nothing.summary() is None
+    assert nothing.metrics() is None
 
 
 def test_of_a_long_drive_evenly_spread_frames_are_held() -> None:
     errors = DepthErrors()
     for k in range(3001):
         errors.add(TRUTH * (1 + k / 3000), TRUTH)
-    summary = errors.summary()
+    summary = errors.metrics().tree()
     assert summary is not None and 250 <= summary["frames"] <= 500
     assert summary["abs_rel"] == pytest.approx(0.5, abs=0.01)

@@ -58,8 +58,13 @@ def ate(metrics: dict[str, Any]) -> dict[str, float | None]:
     return {name: record["ate_rmse_m"] for name, record in metrics["align"].items()}
 
 
+def metrics_of(*given: Any, **named: Any) -> dict[str, Any]:
+    """T as ``metrics.json`` has it."""
+    return trajectory_metrics(*given, **named).tree()
+
+
 def test_a_perfect_estimate() -> None:
-    metrics = trajectory_metrics(trajectory(drive()), trajectory(drive()))
+    metrics = metrics_of(trajectory(drive()), trajectory(drive()))
     check_shape(metrics)
     for record in metrics["align"].values():
         assert record["scale"] == pytest.approx(1.0)
@@ -75,7 +80,7 @@ def test_a_known_similarity_under_each_alignment() -> None:
     truth = drive()
     turn, move = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([5.0, -6.0, 7.0])
     estimate = se3.Similarity(1 / 2.5, turn, move).apply_to_poses(truth)
-    metrics = trajectory_metrics(trajectory(estimate), trajectory(truth))
+    metrics = metrics_of(trajectory(estimate), trajectory(truth))
     check_shape(metrics)
     positions = truth[:, :3, 3]
     as_written = np.linalg.norm(estimate[:, :3, 3] - positions, axis=1)
@@ -100,7 +105,7 @@ def test_a_known_similarity_under_each_alignment() -> None:
 def test_a_noisy_estimate_agrees_with_evo() -> None:
     rng = np.random.default_rng(7)
     noise = se3.from_rotation_vector(rng.normal(scale=0.02, size=(400, 3)), rng.normal(scale=0.5, size=(400, 3)))
-    metrics = trajectory_metrics(trajectory(drive() @ noise), trajectory(drive()))
+    metrics = metrics_of(trajectory(drive() @ noise), trajectory(drive()))
     assert 0.5 < metrics["evo"]["ape_rmse_m_7dof"] < 1.0
     assert metrics["evo"]["ape_rmse_m_7dof"] == pytest.approx(metrics["align"]["7dof"]["ate_rmse_m"], abs=1e-9)
     assert metrics["evo"]["difference"] < 1e-6
@@ -110,7 +115,7 @@ def test_hand_values_of_segments_and_steps() -> None:
     """A straight line whose estimate is 2 % long and turns 0.001 rad a metre about its own axis of motion."""
     truth, estimate = line(251), line(251, 1.02)
     estimate[:, :3, :3] = Rotation.from_rotvec(np.outer(0.001 * np.arange(251), [0.0, 0.0, 1.0])).as_matrix()
-    record = trajectory_metrics(trajectory(estimate), trajectory(truth))["align"]["first"]
+    record = metrics_of(trajectory(estimate), trajectory(truth))["align"]["first"]
     # A segment of L m ends at the first frame beyond: L + 1 steps. Starts 0 to 140 hold 100 m, 0 to 40 200 m.
     share = (15 * 101 / 100 + 5 * 201 / 200) / 20
     assert record["t_rel_percent"] == pytest.approx(2.0 * share, rel=1e-9)
@@ -121,7 +126,7 @@ def test_hand_values_of_segments_and_steps() -> None:
 
 @pytest.mark.parametrize(("frames", "fits"), [(100, False), (101, False), (103, True)])
 def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
-    record = trajectory_metrics(trajectory(line(frames)), trajectory(line(frames)))["align"]["none"]
+    record = metrics_of(trajectory(line(frames)), trajectory(line(frames)))["align"]["none"]
     assert (record["t_rel_percent"] is not None) == fits
     if not fits:
         assert record["t_rel_percent_reason"] == f"no segment of 100 m fits into the path of {frames - 1}.0 m"
@@ -129,21 +134,21 @@ def test_short_paths_have_no_segments(frames: int, fits: bool) -> None:
 
 
 def test_without_a_reference_every_number_has_a_reason() -> None:
-    metrics = trajectory_metrics(trajectory(drive(10)), None)
+    metrics = metrics_of(trajectory(drive(10)), None)
     check_shape(metrics)
     assert metrics["snippet5"]["count_reason"] == "there is no reference trajectory"
     assert set(ate(metrics).values()) == {None}
-    given = trajectory_metrics(trajectory(drive(10)), None, SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
+    given = metrics_of(trajectory(drive(10)), None, SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
     assert given["snippet5"] == {"ate_mean": 0.1, "ate_std": 0.2, "re_mean": 0.3, "re_std": 0.4, "count": 5}
 
 
 def test_direct_snippets_replace_cut_ones() -> None:
-    metrics = trajectory_metrics(trajectory(drive(10)), trajectory(drive(10)), SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
+    metrics = metrics_of(trajectory(drive(10)), trajectory(drive(10)), SnippetErrors(0.1, 0.2, 0.3, 0.4, 5))
     assert metrics["snippet5"]["ate_mean"] == 0.1
 
 
 def test_an_estimate_that_stands_still_has_no_scale() -> None:
-    metrics = trajectory_metrics(trajectory(np.tile(drive(3)[2], (300, 1, 1))), trajectory(drive(300)))
+    metrics = metrics_of(trajectory(np.tile(drive(3)[2], (300, 1, 1))), trajectory(drive(300)))
     check_shape(metrics)
     for name in ("scale", "7dof"):
         assert metrics["align"][name]["scale"] is None
@@ -154,7 +159,7 @@ def test_an_estimate_that_stands_still_has_no_scale() -> None:
 
 
 def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
-    metrics = trajectory_metrics(trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))))
+    metrics = metrics_of(trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))))
     check_shape(metrics)
     errors = ate(metrics)
     assert errors["scale"] is None
@@ -165,7 +170,7 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
     assert snippets["ate_mean"] is None and snippets["ate_std"] is None
     assert "the reference does not move" in snippets["ate_mean_reason"]
     assert snippets["re_mean"] > 0 and snippets["count"] == 16  # rotations have no scale
-    direct = trajectory_metrics(
+    direct = metrics_of(
         trajectory(drive(20)), trajectory(np.tile(np.eye(4), (20, 1, 1))), SnippetErrors(0.0, 0.0, 0.3, 0.4, 5)
     )
     assert direct["snippet5"]["ate_mean"] is None and direct["snippet5"]["re_mean"] == 0.3
@@ -174,12 +179,12 @@ def test_a_reference_that_stands_still_cannot_be_scaled_to() -> None:
 def test_a_camera_that_turns_on_the_spot_has_errors_of_rotation() -> None:
     turning = np.tile(np.eye(4), (20, 1, 1))
     turning[:, :3, :3] = Rotation.from_rotvec(np.outer(np.deg2rad(np.arange(20)), [0, 1, 0])).as_matrix()
-    metrics = trajectory_metrics(trajectory(np.tile(np.eye(4), (20, 1, 1))), trajectory(turning))
+    metrics = metrics_of(trajectory(np.tile(np.eye(4), (20, 1, 1))), trajectory(turning))
     assert metrics["align"]["first"]["rpe_rot_deg"] == pytest.approx(1.0)
 
 
 def test_a_straight_line_is_measured_though_evo_fails() -> None:
-    metrics = trajectory_metrics(trajectory(line(120, 0.5)), trajectory(line(120)))
+    metrics = metrics_of(trajectory(line(120, 0.5)), trajectory(line(120)))
     check_shape(metrics)
     assert metrics["align"]["7dof"]["scale"] == pytest.approx(2.0)
     assert metrics["align"]["7dof"]["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
@@ -189,7 +194,7 @@ def test_a_straight_line_is_measured_though_evo_fails() -> None:
 
 @pytest.mark.parametrize(("frames", "known"), [(1, set()), (2, {"none", "first"})])
 def test_one_and_two_frames(frames: int, known: set[str]) -> None:
-    metrics = trajectory_metrics(trajectory(line(frames)), trajectory(line(frames, 2.0)))
+    metrics = metrics_of(trajectory(line(frames)), trajectory(line(frames, 2.0)))
     check_shape(metrics)
     assert {name for name, value in ate(metrics).items() if value is not None} == known
     assert metrics["snippet5"]["count"] == 0
@@ -199,7 +204,7 @@ def test_one_and_two_frames(frames: int, known: set[str]) -> None:
 def test_a_lost_estimate_is_no_number() -> None:
     lost = drive(20)
     lost[11, 0, 3] = np.nan
-    metrics = trajectory_metrics(trajectory(lost), trajectory(drive(20)))
+    metrics = metrics_of(trajectory(lost), trajectory(drive(20)))
     check_shape(metrics)
     assert "not finite" in metrics["align"]["none"]["ate_rmse_m_reason"]
 
@@ -235,7 +240,7 @@ def test_evo_writes_nothing_to_the_home_folder(tmp_path: Path) -> None:
         "assert 'evo' not in sys.modules and 'torch' not in sys.modules\n"
         "T = np.tile(np.eye(4), (9, 1, 1)); T[:, :3, 3] = np.random.rand(9, 3)\n"
         "t = Trajectory(np.arange(9.0), T)\n"
-        "assert trajectory_metrics(t, t)['evo']['difference'] < 1e-6\n"
+        "assert trajectory_metrics(t, t).evo.difference < 1e-6\n"
         "assert 'evo' in sys.modules\n"
     )
     environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -293,7 +298,7 @@ def golden(data_root: Path) -> dict[str, Any]:
     """T of the public trajectories of sequences 09 and 10."""
     folder = data_root / "golden"
     return {
-        name: trajectory_metrics(
+        name: metrics_of(
             read_trajectory(folder / f"dfvo_stereo_{name}.txt"), read_trajectory(folder / f"reference_{name}.txt")
         )
         for name in ("09", "10")

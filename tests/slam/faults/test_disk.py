@@ -202,7 +202,7 @@ def test_a_state_that_cannot_be_kept_is_one_warning(
     with FailingDisk("write", 0, tmp_path / "out").mounted():
         assert call(main, words) == 0
     assert caplog.text.count("is not kept any more") == 1
-    assert RunFolder.open(tmp_path / "out" / "run").metrics()["status"] == "ok"
+    assert RunFolder.open(tmp_path / "out" / "run").metrics().tree()["status"] == "ok"
 
 
 def test_a_real_disk_that_is_full(
@@ -241,7 +241,7 @@ def test_a_cache_on_a_full_disk_is_one_warning(
     with FailingDisk("write", 2, tmp_path / "cache").mounted():
         assert call(main, [*words, "--cache", tmp_path / "cache"]) == 0
     assert caplog.text.count("the cache is not written any more") == 1
-    assert RunFolder.open(tmp_path / "out" / "run").metrics()["status"] == "ok"
+    assert RunFolder.open(tmp_path / "out" / "run").metrics().tree()["status"] == "ok"
 
 
 def test_a_full_folder_for_temporary_files_is_one_line(

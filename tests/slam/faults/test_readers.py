@@ -36,9 +36,8 @@ from slam.formats.trajectory import Trajectory, read_trajectory
 from slam.geometry import se3
 from slam.loops.places import Places
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.results.schema import LoopsFile, MetricsFile
+from slam.results.metrics import LoopsFile, Metrics
 from slam.runtime.storage.cache import DiskCache
-from slam.runtime.storage.json_file import read_json
 from slam.sequences.catalogue import open_sequence
 
 
@@ -99,8 +98,8 @@ READERS = (
     Reader("TUM poses", "run/trajectory_optimised.tum.txt", read_trajectory, _is_trajectory),
     Reader("TUM images", "tum/rgb.txt", lambda path: open_sequence(path.parent, None, None, None), _is_sequence),
     Reader("OXTS packet", "packet.txt", read_packet, lambda packet: bool(np.isfinite(packet).all())),
-    Reader("metrics.json", "run/metrics.json", lambda path: read_json(path, MetricsFile)),
-    Reader("loops.json", "run/loops.json", lambda path: read_json(path, LoopsFile)),
+    Reader("metrics.json", "run/metrics.json", Metrics.read),
+    Reader("loops.json", "run/loops.json", LoopsFile.read),
     Reader("places.npz", "run/places.npz", Places.read),
     Reader("drive.zip", "run/drive.zip", SessionCheckpoint.read),
     Reader("keyframes.npz", "run/keyframes.npz", lambda path: SessionCheckpoint.open(path.parent)),

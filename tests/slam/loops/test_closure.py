@@ -51,7 +51,7 @@ def is_false(loop: Loop, T_true: FloatArray) -> bool:
 
 
 def ate(result: Estimate, name: str) -> float:
-    return float(trajectory_metrics(getattr(result, name), result.reference)["align"]["7dof"]["ate_rmse_m"])
+    return float(trajectory_metrics(getattr(result, name), result.reference).align.dof7.ate_rmse_m)
 
 
 @functools.cache

@@ -7,9 +7,10 @@ import pytest
 
 from slam.config.sections import MappingConfig
 from slam.mapping.store import TILE_BLOCKS, SubmapStore
-from slam.mapping.submap import BLOCK_SIDE, FOLDER, Submap, remove_submaps, submap_paths
+from slam.mapping.submap import BLOCK_SIDE, Submap, remove_submaps, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.runtime.errors import RunError
+from slam.runtime.run_files import SUBMAPS
 
 
 def test_submaps_merge_to_the_surface_of_one(street_map):
@@ -50,17 +51,17 @@ def test_tiles_are_joined_without_a_seam(street_map):
 
 def test_finished_submaps_outlive_the_process_that_made_them(street_map, tmp_path):
     street_map(tmp_path, submap_m=6.0)  # its last frames are not in a finished submap
-    paths = submap_paths(tmp_path / FOLDER)
+    paths = submap_paths(tmp_path / SUBMAPS)
     assert len(paths) == 2
     surface = MapSurface(paths, MappingConfig())
     assert surface.triangles > 1000 and SubmapStore(paths).fused < 18
-    remove_submaps(tmp_path / FOLDER)
+    remove_submaps(tmp_path / SUBMAPS)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_submap_is_one_line(street_map, tmp_path):
     street_map(tmp_path, submap_m=5.0)
-    path = submap_paths(tmp_path / FOLDER)[0]
+    path = submap_paths(tmp_path / SUBMAPS)[0]
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(RunError, match=r"submap_00000\.npz is damaged"):
         Submap.read(path)

@@ -92,7 +92,7 @@ def run(drive: LevelRoad, *overrides: str, noise: OracleNoise = NO_NOISE, depth_
 
 
 def ate(estimate: Trajectory, reference: Trajectory | None) -> float:
-    return float(trajectory_metrics(estimate, reference)["align"]["7dof"]["ate_rmse_m"])
+    return float(trajectory_metrics(estimate, reference).align.dof7.ate_rmse_m)
 
 
 def test_exact_predictions_give_the_true_trajectory() -> None:

@@ -15,12 +15,12 @@ from erfsfm.pose_noise import file_sha256
 from slam import Slam, run_slam
 from slam.config.sections import load_config
 from slam.frames import Frame
-from slam.pipeline.checkpoint import DRIVE, KEYFRAMES, SessionCheckpoint
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
-from slam.results import folder as run_folder
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.storage.json_file import read_json
+from slam.runtime.run_files import DRIVE, KEYFRAMES
 from slam.sequences.catalogue import open_sequence
 from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
@@ -70,11 +70,12 @@ def test_every_file_has_the_bytes_of_a_run_in_one_go(
     whole: RunFolder, begun: RunFolder, go_on: Callable[..., RunFolder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
-    monkeypatch.setattr(run_folder, "read_json", lambda path, kind: read.append(path) or read_json(path, kind))
+    read_metrics = Metrics.read
+    monkeypatch.setattr(Metrics, "read", lambda path: read.append(path) or read_metrics(path))
     continued = go_on()
     assert read.count(begun.path / "metrics.json") == 1
     assert [name for name in SAME if (continued.path / name).read_bytes() != (whole.path / name).read_bytes()] == []
-    metrics, wanted = continued.metrics(), whole.metrics()
+    metrics, wanted = continued.metrics().tree(), whole.metrics().tree()
     assert (metrics["sequence"].pop("continued_at"), wanted["sequence"].pop("continued_at")) == (8, 0)
     for part in ("sequence", "scale", "trajectories", "graph", "loops"):
         assert rounded(metrics[part]) == rounded(wanted[part])
@@ -91,7 +92,7 @@ def test_the_seed_and_the_gps_track_of_the_run_hold(kitti_root: Path, tmp_path: 
     before = run(kitti_root, tmp_path / "before", "0:8", **options).path
     continued = run(kitti_root, tmp_path / "after", "8:", overrides=(), continues=before)
     assert (continued.path / "graph.g2o").read_bytes() == (once.path / "graph.g2o").read_bytes()
-    metrics, wanted = continued.metrics(), once.metrics()
+    metrics, wanted = continued.metrics().tree(), once.metrics().tree()
     assert metrics["gps"]["fixes"] == wanted["gps"]["fixes"] == 14
     assert (metrics["provenance"]["seed"], metrics["provenance"]["recording"]["gps"]) == (7, str(track))
     track.unlink()
@@ -106,14 +107,14 @@ def test_frames_that_follow_have_their_true_depth(tmp_path: Path) -> None:
     write_kitti_root(street, root, depth=True, lidar=True)
     settings = ["output.report=false", "mapping.min_weight=1", "output.keep=keyframes"]
     before = run(root, tmp_path / "before", "0:7", overrides=settings).path
-    metrics = run(root, tmp_path / "after", "8:", overrides=(), continues=before).metrics()
+    metrics = run(root, tmp_path / "after", "8:", overrides=(), continues=before).metrics().tree()
     assert metrics["map"]["truth"] == "depth maps" and metrics["map"]["with_scale"]["accuracy_median_m"] < 1
     assert 0 < metrics["map"]["with_scale"]["in_field"]["share"] < 1
     assert 0 < metrics["depth"]["network"]["abs_rel"] < 0.5
     reason = metrics["trajectories"]["lidar_reason"]
     assert reason == "LiDAR scans are not used where a drive continues another folder"
     shutil.rmtree(root / "sequences/sim/depth_2")
-    metrics = run(root, tmp_path / "without", "8:", overrides=(), continues=before).metrics()
+    metrics = run(root, tmp_path / "without", "8:", overrides=(), continues=before).metrics().tree()
     assert all(reason in metrics[part][f"{name}_reason"] for part, name in (("map", "truth"), ("depth", "network")))
 
 
@@ -165,7 +166,7 @@ def test_without_kept_keyframes_the_map_begins_at_the_checkpoint(
     (bare / KEYFRAMES).unlink()
     continued = go_on(continues=bare)
     assert "the map begins at frame 8" in caplog.text
-    assert continued.metrics()["map"]["blocks"] < whole.metrics()["map"]["blocks"]
+    assert continued.metrics().tree()["map"]["blocks"] < whole.metrics().tree()["map"]["blocks"]
     assert (continued.path / "graph.g2o").read_bytes() == (whole.path / "graph.g2o").read_bytes()
 
 
@@ -208,14 +209,14 @@ def test_the_noise_of_the_poses_is_named_and_another_one_is_said(
     weights = Path(shutil.copytree(find_weights(WEIGHTS), tmp_path / "weights"))
     options: dict[str, Any] = {"weights": weights, "overrides": ["geometry.enabled=false", "mapping.enabled=false"]}
     before = run(kitti_root, tmp_path / "before", "0:8", **options)
-    sha256 = before.metrics()["provenance"]["noise_sha256"]
+    sha256 = before.metrics().tree()["provenance"]["noise_sha256"]
     assert sha256 == file_sha256(weights / "noise.yaml")
     assert sha256[:16] in (before.path / "report.html").read_text()
     options |= {"overrides": (), "continues": before.path}
     run(kitti_root, tmp_path / "same", "8:", **options)
     assert "noise.yaml of the weights is not that of" not in caplog.text
     (weights / "noise.yaml").unlink()
-    provenance = run(kitti_root, tmp_path / "other", "8:", **options).metrics()["provenance"]
+    provenance = run(kitti_root, tmp_path / "other", "8:", **options).metrics().tree()["provenance"]
     assert "noise.yaml of the weights is not that of" in caplog.text
     assert (provenance["noise_sha256"], provenance["noise_sha256_reason"]) == (None, NO_NOISE)
 

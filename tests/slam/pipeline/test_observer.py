@@ -139,7 +139,7 @@ def run_on(damage: Damage) -> tuple[Estimate, str]:
 
 
 def ate(result: Estimate) -> float:
-    return float(trajectory_metrics(result.optimised, result.reference)["align"]["7dof"]["ate_rmse_m"])
+    return float(trajectory_metrics(result.optimised, result.reference).align.dof7.ate_rmse_m)
 
 
 DAMAGES = [black, noise, repeated, repeated_as_jpeg, missing, unreadable]

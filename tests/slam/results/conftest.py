@@ -36,7 +36,7 @@ def map_views(plain: Ply, tmp_path_factory: pytest.TempPathFactory) -> MapViews:
     write_ply(folder.path / "map_mesh.ply", plain)
     T_world_camera = np.tile(np.eye(4), (60, 1, 1))
     T_world_camera[:, 2, 3] = np.arange(60.0)
-    folder.write_trajectory("trajectory_optimised", Trajectory(np.arange(60.0), T_world_camera))
+    folder.write_trajectory("optimised", Trajectory(np.arange(60.0), T_world_camera))
     views = write_map_views(folder, 2000)
     assert views is not None
     assert (folder.path / "map_above.png").read_bytes() == views.above

@@ -38,7 +38,7 @@ def with_depth(tmp_path) -> RecordedSequence:
 def test_stored_depth_is_read_and_compared(tmp_path) -> None:
     quality = DepthQuality(with_depth(tmp_path), is_metric=True)
     quality.add(keyframe())
-    summary = quality.summary(is_refined=True)
+    summary = quality.metrics(is_refined=True).tree()
     assert summary["network"]["abs_rel"] == 0
     assert abs(summary["refined"]["abs_rel"] - 0.1) < 1e-4
     assert summary["refined"]["coverage"].keys() == {"50", "90", "95"}
@@ -56,7 +56,7 @@ def test_a_depth_map_that_cannot_be_read_is_left_out_with_one_warning(tmp_path, 
     quality = DepthQuality(sequence, is_metric=True)
     for _ in range(2):
         quality.add(keyframe())
-    assert quality.summary(True)["network_reason"] == "the true depth of 2 keyframes cannot be read"
+    assert quality.metrics(True).network.reason == "the true depth of 2 keyframes cannot be read"
     assert len(caplog.messages) == 1 and "000002.png" in caplog.messages[0]
 
 
@@ -65,7 +65,7 @@ def test_every_missing_number_has_its_reason(tmp_path) -> None:
         quality = DepthQuality(sequence, metric)
         for one in keyframes:
             quality.add(one)
-        summary = quality.summary(is_refined)
+        summary = quality.metrics(is_refined).tree()
         return summary.get("network_reason"), summary.get("refined_reason")
 
     known = with_depth(tmp_path)

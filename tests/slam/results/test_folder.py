@@ -12,7 +12,9 @@ import pytest
 
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
+from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.runtime.errors import RunError
+from slam.runtime.storage.record import Missing
 
 MakeRun = Callable[..., RunFolder]
 
@@ -28,7 +30,7 @@ def test_new_folders_carry_the_sequence_and_latest_points_to_the_newest(tmp_path
 def begin(output: Path) -> RunFolder:
     """A new run into ``output``, before it has a trajectory."""
     folder = RunFolder.create(output, output.parent, "sim")
-    folder.write_metrics({"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}})
+    folder.write_metrics(Metrics.of_begun_run(Provenance(weights_sha256="00")))
     return folder
 
 
@@ -41,10 +43,10 @@ def test_an_earlier_run_stays_until_the_new_one_replaces_it(make_run: MakeRun) -
     (old / "notes.txt").write_text("what I saw")
     before = contents(old)
     new = begin(old)
-    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     assert new.path == old / "unfinished" and contents(old) == before
     new.publish()
-    assert new.path == old and RunFolder.open(old).metrics()["status"] == "running"
+    assert new.path == old and RunFolder.open(old).metrics().tree()["status"] == "running"
     own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
     assert {path.name for path in old.iterdir()} == {*own, "notes.txt"}
     new.publish()
@@ -74,7 +76,7 @@ def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
 ) -> None:
     old = make_run("mine").path
     new = begin(old)
-    new.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    new.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     replace, calls = Path.replace, iter(range(moved))
 
     def killed_later(path: Path, target: Path) -> Path:
@@ -85,9 +87,9 @@ def test_the_next_run_goes_on_where_a_kill_interrupted_the_replacement(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Path, "replace", killed_later)
         new.publish()
-    assert RunFolder.open(old).metrics()["status"] in ("ok", "running")
+    assert RunFolder.open(old).metrics().tree()["status"] in ("ok", "running")
     again = begin(old)
-    again.write_trajectory("trajectory_optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
+    again.write_trajectory("optimised", Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1))))
     again.publish()
     own = {"metrics.json", "trajectory_optimised.kitti.txt", "trajectory_optimised.tum.txt"}
     assert {path.name for path in old.iterdir()} == own
@@ -133,15 +135,14 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplo
     folder = make_run()
     RunFolder.open(folder.path)
     assert caplog.records == []
-    folder.write_metrics(
-        {"schema": 1, "status": "failed", "reason": "no space", "provenance": {"weights_sha256": "00"}}
-    )
+    failed = {"schema": 1, "status": "failed", "reason": "no space", "provenance": {"weights_sha256": "00"}}
+    folder.write_metrics(Metrics.model_validate(failed))
     RunFolder.open(folder.path)
     assert [record.getMessage() for record in caplog.records] == [
         f"{folder.path}: no space: files that are there are whole"
     ]
     (folder.path / "metrics.json").unlink()
-    assert RunFolder.open(folder.path).metrics()["status"] == "running"
+    assert RunFolder.open(folder.path).metrics().tree()["status"] == "running"
 
 
 def test_output_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:
@@ -168,7 +169,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path: Path) -> N
 def test_damaged_metrics_are_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text('{"status": ')
     with pytest.raises(RunError, match="is damaged"):
-        RunFolder.open(tmp_path).metrics()
+        RunFolder.open(tmp_path).metrics().tree()
 
 
 def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
@@ -187,9 +188,9 @@ def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
 def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -> None:
     folder = make_run()
     (folder.path / "map_mesh.ply").unlink()
-    folder.write_metrics(folder.metrics() | {"map": {"triangles": None, "triangles_reason": reason}})
+    folder.write_metrics(folder.metrics().changed(map=MapMetrics.missing(reason)))
     with pytest.raises(RunError, match=re.escape(f"has no map_mesh.ply: {reason}")):
         folder.require("map_mesh.ply")
-    folder.write_metrics(folder.metrics() | {"map": None, "map_reason": "the run ended before its map was whole"})
+    folder.write_metrics(folder.metrics().changed(map=Missing("the run ended before its map was whole")))
     with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
         folder.require("map_mesh.ply")

@@ -46,7 +46,7 @@ def test_the_recorded_track_of_a_drive(data_root: Path, tmp_path: Path) -> None:
     settings = ["scale.mode=gps", "mapping.enabled=false", "gps.sigma_m=0.2", "gps.vertical_sigma_m=0.2"]
     settings += ["gps.correlation_s=0", "gps.lever_arm_m=[0,-0.5,-1]"]
     folder = run_slam(drive, gps=tmp_path / "gps.csv", frames="0:60", overrides=settings, output=tmp_path / "run")
-    metrics = folder.metrics()
+    metrics = folder.metrics().tree()
     assert metrics["scale"]["mode"] == "gps" and metrics["gps"]["fixes"] == 59
     assert metrics["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.2
     assert metrics["gps"]["optimised"]["horizontal_median_m"] < 0.3

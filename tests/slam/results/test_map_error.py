@@ -61,7 +61,7 @@ def errors(
         optimised=SimpleNamespace(T_world_camera=T_world_camera),
         scale=Scale(mode, ScaleEstimate(1.0, 0.0, 9), np.ones(1), {}, unit),
     )
-    return map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence)
+    return map_errors(lambda: iter(np.array_split(points / scale, 3)), result, sequence).tree()
 
 
 def test_true_depth_at_true_poses_has_no_error(

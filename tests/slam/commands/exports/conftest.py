@@ -14,8 +14,9 @@ from slam.formats.ply import Ply, coloured_ply
 from slam.formats.trajectory import Trajectory
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
+from slam.runtime.run_files import PLACES
 
 CAMERA = Intrinsics(80, 48, 60.0, 61.0, 40.5, 22.25)
 FRAMES = 8
@@ -67,7 +68,7 @@ def make_recorded(tmp_path: Path, make_run: Callable[..., RunFolder], sheet: Ply
         folder = make_run("recorded", metrics)
         turns = np.tile([0.0, 0.02, 0.0], (FRAMES - 1, 1))
         poses = chain(from_rotation_vector(turns, np.tile([0.01, 0.0, 0.1], (FRAMES - 1, 1))))
-        folder.write_trajectory("trajectory_optimised", Trajectory(0.1 * np.arange(FRAMES), poses))
+        folder.write_trajectory("optimised", Trajectory(0.1 * np.arange(FRAMES), poses))
         write_ply(folder.path / "map_mesh.ply", sheet)
         write_ply(folder.path / "map_cloud.ply", Ply(sheet.vertices))
         folder.write(PLACES, Places(CAMERA, (), np.zeros((0, 4, 4))).write)

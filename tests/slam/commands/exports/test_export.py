@@ -14,9 +14,11 @@ from slam.commands.exports.options import R_UP_WORLDS
 from slam.formats.ply import read_ply_points
 from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.run_files import PLACES
 
 MakeRun = Callable[..., RunFolder]
 
@@ -157,9 +159,9 @@ def test_nothing_else_is_replaced(make_run: MakeRun, tmp_path: Path, what: str, 
     (tmp_path / "terrain").mkdir()
     (tmp_path / "terrain/raster.yaml").write_text("heights: my own\n")
     shutil.copy(folder.path / "reference.kitti.txt", tmp_path / "drive/truth.txt")
-    metrics = folder.metrics()
+    metrics = folder.metrics().tree()
     metrics["provenance"]["recording"] = {"dataset": str(tmp_path / "drive")}
-    folder.write_metrics(metrics)
+    folder.write_metrics(Metrics.model_validate(metrics))
     folder.write_text("config.yaml", "")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(RunError, match=why):

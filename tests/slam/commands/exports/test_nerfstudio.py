@@ -17,6 +17,7 @@ from slam.commands.exports.options import R_UP_WORLDS, ExportOptions
 from slam.formats.ply import Ply, read_ply
 from slam.geometry.se3 import invert
 from slam.results.folder import RunFolder
+from slam.results.metrics import Metrics, Provenance
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import open_sequence
@@ -69,7 +70,8 @@ def test_images_of_a_lens_are_undistorted(make_recorded: MakeRecorded, tmp_path:
     camera_file.write_text(camera_file.read_text() + "model: opencv\ndistortion: [-0.3, 0, 0, 0]\n")
     with pytest.raises(RunError, match="another camera"):
         export(folder, "nerfstudio", tmp_path / "scene")
-    from slam.loops.places import PLACES, Places
+    from slam.loops.places import Places
+    from slam.runtime.run_files import PLACES
 
     camera = open_sequence(tmp_path / "drive").intrinsics
     folder.write(PLACES, Places(camera, (), np.zeros((0, 4, 4))).write)
@@ -140,12 +142,12 @@ def lengthen(folder: RunFolder, rows: int, continued_at: int, frames: str | None
     from slam.formats.trajectory import Trajectory
 
     poses = np.tile(np.eye(4), (rows, 1, 1))
-    folder.write_trajectory("trajectory_optimised", Trajectory(0.1 * np.arange(rows), poses, True))
-    metrics = folder.metrics()
+    folder.write_trajectory("optimised", Trajectory(0.1 * np.arange(rows), poses, True))
+    metrics = folder.metrics().tree()
     metrics["sequence"] |= {"frames": rows, "continued_at": continued_at}
     if frames is not None:
         metrics["provenance"]["recording"]["frames"] = frames
-    folder.write_metrics(metrics)
+    folder.write_metrics(Metrics.model_validate(metrics))
 
 
 def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path: Path) -> None:
@@ -154,12 +156,10 @@ def test_a_run_of_a_part_finds_its_frames(make_recorded: MakeRecorded, tmp_path:
     folder = make_recorded()
     trajectory = folder.trajectory("optimised")
     assert trajectory is not None
-    folder.write_trajectory(
-        "trajectory_optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True)
-    )
-    metrics = folder.metrics()
+    folder.write_trajectory("optimised", Trajectory(trajectory.stamps[3:6], trajectory.T_world_camera[3:6], True))
+    metrics = folder.metrics().tree()
     metrics["sequence"]["frames"] = 3
-    folder.write_metrics(metrics)
+    folder.write_metrics(Metrics.model_validate(metrics))
     written = export(folder, "nerfstudio", tmp_path / "scene")
     shades = [int(cv2.imread(str(written / frame["file_path"]))[0, 0, 0]) for frame in scene(written)["frames"]]
     assert shades == [30, 40, 50]
@@ -187,7 +187,7 @@ def test_images_that_have_gone_are_one_line_and_a_new_place_is_taken(
 
 def test_a_run_that_does_not_say_where_its_images_are(make_recorded: MakeRecorded, tmp_path: Path) -> None:
     folder = make_recorded()
-    folder.write_metrics(folder.metrics() | {"provenance": {}})
+    folder.write_metrics(folder.metrics().changed(provenance=Provenance()))
     with pytest.raises(RunError, match="does not record where its images are: give --dataset ROOT"):
         export(folder, "nerfstudio", tmp_path / "scene")
 

@@ -20,6 +20,7 @@ from slam.formats.ros_map import FREE, OCCUPIED, UNKNOWN, write_ros_map
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
+from slam.results.metrics import ScaleMetrics
 from slam.runtime.errors import RunError
 
 CAMERA_HEIGHT = 1.65
@@ -167,10 +168,11 @@ def test_a_grid_without_metres_says_so(
     folder, output = make_recorded(), tmp_path / "map.yaml"
     words = ["export", str(folder.path), "--what", "occupancy", "--output", str(output)]
     for unit, note in (("camera heights", True), ("metres", False)):
-        folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "value": 9.8, "unit": unit}})
+        folder.write_metrics(folder.metrics().changed(scale=ScaleMetrics(mode="none", value=9.8, unit=unit)))
         app(words, standalone_mode=False)
         assert ("not in metres" in capsys.readouterr().out) == note
         assert output.read_text().startswith(f"# lengths in {unit}\n") and yaml.safe_load(output.read_text())
-    folder.write_metrics(folder.metrics() | {"scale": {"mode": "none", "unit": "the networks' own unit"}})
+    own = ScaleMetrics(mode="none", unit="the networks' own unit")
+    folder.write_metrics(folder.metrics().changed(scale=own))
     with pytest.raises(RunError, match="need metres or camera heights"):
         export(folder, "occupancy", output)

@@ -29,7 +29,6 @@ from slam.commands.live.run import LiveRequest, run_live
 from slam.commands.live.sequence import calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
-from slam.results.comparison import unit_notes
 from slam.runtime.errors import SequenceError, SlamError
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
@@ -84,7 +83,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     corrected = np.array(last["T_world_camera"])
     np.testing.assert_allclose(corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6)
     assert last["ended"] == "nothing came for 1.5 s" and last["dropped"] == 0
-    assert folder.metrics()["status"] == "ok"
+    assert folder.metrics().tree()["status"] == "ok"
 
 
 @pytest.mark.parametrize(("mode", "unit"), [("auto", None), ("none", "the networks' own unit")])
@@ -99,14 +98,14 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
     request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
     folder = run_live(request, messages.append)
-    recorded = folder.metrics()["scale"]
+    recorded = folder.metrics().tree()["scale"]
     assert (recorded["unit"], recorded["value"]) == ("the networks' own unit", None)
     *poses, last = messages
     assert last["unit"] == unit
     starting, known = ("starting", None, False), ("tracking", unit, True)
     said = [(each["state"], each["unit"], each["scale"] is not None) for each in poses]
     assert set(said) == ({starting} if unit is None else {starting, known})
-    assert ["networks' own unit" in note for note in unit_notes(folder.metrics())] == [True]
+    assert ["networks' own unit" in note for note in folder.metrics().unit_notes()] == [True]
 
 
 def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_run(
@@ -136,7 +135,7 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
     used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
     assert [message["stamp"] for message in poses] == pytest.approx(used) == last["stamps"]
     assert last["ended"].startswith("the source died") and "cannot be read any more" in last["ended"]
-    assert folder.metrics()["status"] == "ok" and folder.metrics()["sequence"]["frames"] == len(used)
+    assert folder.metrics().tree()["status"] == "ok" and folder.metrics().tree()["sequence"]["frames"] == len(used)
     said = caplog.text
     assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
 

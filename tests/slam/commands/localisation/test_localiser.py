@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,9 +21,11 @@ from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti
 from slam.frames import Frame, Image, Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
 from slam.loops.descriptors import FeatureExtractor
-from slam.loops.places import PLACES, Places
+from slam.loops.places import Places
 from slam.results.folder import RunFolder
+from slam.results.metrics import ScaleMetrics
 from slam.runtime.errors import RunError, SequenceError
+from slam.runtime.run_files import PLACES
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 
@@ -210,16 +211,13 @@ def test_a_folder_of_images_is_localised_in_a_run(run: RunFolder, album: Path, t
     np.testing.assert_allclose(written.positions[1], entries[1]["position"], atol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [{"mode": "none", "value": 1.0}, {"mode": "gps", "value": None}])
-def test_where_the_truth_is_known_errors_and_success_are_said(
-    run: RunFolder, album: Path, tmp_path: Path, scale: dict[str, Any]
-) -> None:
+def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, album: Path, tmp_path: Path) -> None:
     stamps = np.arange(60.0)
     run.write_trajectory("reference", Trajectory(stamps, reference()))
     scaled = reference().copy()
     scaled[:, :3, 3] *= UNIT
-    run.write_trajectory("trajectory_optimised", Trajectory(stamps, scaled))
-    run.write_metrics(run.metrics() | {"scale": scale})
+    run.write_trajectory("optimised", Trajectory(stamps, scaled))
+    run.write_metrics(run.metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0)))
     rows = reference()[[10, 25, 40, 50, 50]]
     rows[1, 0, 3] += 3.0  # a wrong truth
     write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(5.0), rows))

@@ -18,11 +18,11 @@ import pytest
 from slam import run_slam
 from slam.frames import Frame
 from slam.pipeline import batch
-from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint
+from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.observer import Observer
 from slam.results.folder import RunFolder
 from slam.runtime.errors import ConfigError, RunError, SequenceError, SlamError
-from slam.runtime.storage.files import KEYFRAMES_PART
+from slam.runtime.run_files import DRIVE, KEYFRAMES_PART
 
 KILLED = """
 import os, signal, sys
@@ -86,12 +86,12 @@ def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
     output = killed_at_ten(tmp_path / "run")
     assert kept(output) == [DRIVE, "keyframes-000004.npz", "keyframes-000008.npz"]
     monkeypatch.setattr(batch, "EVERY_FRAMES", 2)
-    metrics = run_slam(continues=output).metrics()
+    metrics = run_slam(continues=output).metrics().tree()
     assert (metrics["status"], metrics["sequence"]["frames"], metrics["sequence"]["continued_at"]) == ("ok", 13, 8)
     assert metrics["provenance"]["seed"] == 3
     for name in SAME:
         assert (output / name).read_bytes() == (whole / name).read_bytes(), name
-    assert metrics["map"] == RunFolder(whole).metrics()["map"]
+    assert metrics["map"] == RunFolder(whole).metrics().tree()["map"]
     assert {path.name for path in output.iterdir()} == {path.name for path in whole.iterdir()}
 
 
@@ -116,7 +116,7 @@ def test_states_are_kept_at_distances_that_grow(
         patched.setattr(Observer, "add", add_or_end)
         run_slam(kitti_root, "sim", output=output, **options)
     assert states == [*range(1, 12), 11]
-    metrics = run_slam(continues=output).metrics()
+    metrics = run_slam(continues=output).metrics().tree()
     assert metrics["sequence"]["continued_at"] == 11
     for name in SAME:
         assert (output / name).read_bytes() == (uninterrupted / name).read_bytes(), name
@@ -145,7 +145,7 @@ def test_it_goes_on_from_another_folder_and_says_once_that_it_did_not_end(
         patched.setattr(batch.SlamPipeline, "estimate", end)
         run_slam(kitti_root, "sim", weights="mine", frames="0:6", overrides=overrides, output=there / "run")
     monkeypatch.chdir(there)
-    assert run_slam(continues="run").metrics()["provenance"]["weights"] == str(here / "mine")
+    assert run_slam(continues="run").metrics().tree()["provenance"]["weights"] == str(here / "mine")
     assert len([record for record in caplog.records if "files that are there are whole" in record.message]) == 1
 
 
@@ -156,7 +156,7 @@ def test_it_can_be_killed_again_or_have_kept_nothing_yet(
     assert kept(output) == []
     (output / ".1.2.partial.graph.g2o").write_text("half")
     named: dict[str, Any] = {"weights": tiny_weights, "frames": "0:13", "output": output, "continues": output}
-    assert run_slam(kitti_root, "sim", **named).metrics()["sequence"]["continued_at"] == 0
+    assert run_slam(kitti_root, "sim", **named).metrics().tree()["sequence"]["continued_at"] == 0
     assert (output / SAME[0]).read_bytes() == (whole / SAME[0]).read_bytes()
     assert not list(output.glob(".*"))
     with pytest.raises(RunError, match="would be lost"):
@@ -165,8 +165,8 @@ def test_it_can_be_killed_again_or_have_kept_nothing_yet(
 
 def test_a_run_that_was_asked_to_end_goes_on(kill: Callable[..., Path], tmp_path: Path) -> None:
     output = kill(tmp_path / "run", 9, "SIGTERM", "mapping.enabled=false")
-    assert RunFolder.open(output).metrics()["status"] == "failed"
-    metrics = run_slam(continues=output).metrics()
+    assert RunFolder.open(output).metrics().tree()["status"] == "failed"
+    metrics = run_slam(continues=output).metrics().tree()
     assert (metrics["status"], metrics["sequence"]["continued_at"]) == ("ok", 8)
 
 

@@ -78,14 +78,14 @@ def test_the_report_and_the_log_describe_it(run: RunFolder) -> None:
 
 def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> None:
     """Cut from the chain they would be other numbers: poses of an untrained network are inconsistent."""
-    numbers = run.metrics()["trajectories"]
+    numbers = run.metrics().tree()["trajectories"]
     assert numbers["network"]["snippet5"]["ate_mean"] != numbers["odometry"]["snippet5"]["ate_mean"]
     assert numbers["network"]["snippet5"]["ate_mean"] > 0
 
 
 def test_weights_that_saw_the_sequence_are_stamped(reported: dict[str, Any], leaky_weights: Path) -> None:
     folder = run_slam(**reported | {"weights": leaky_weights})
-    assert folder.metrics()["provenance"]["leak"] is True
+    assert folder.metrics().tree()["provenance"]["leak"] is True
     assert ">LEAK<" in (folder.path / "report.html").read_text()
 
 
@@ -107,7 +107,7 @@ def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], t
     (output / "map_mesh.ply").write_text("of an older run")
     (output / "notes.txt").write_text("what I saw")
     run_slam(**quick | {"frames": "0:7"}, output=output)
-    assert RunFolder.open(output).metrics()["sequence"]["frames"] == 7
+    assert RunFolder.open(output).metrics().tree()["sequence"]["frames"] == 7
     assert not (output / "map_mesh.ply").exists()
     assert (output / "notes.txt").read_text() == "what I saw"
     assert not (tmp_path / "results").exists() and not (output / "unfinished").exists()
@@ -152,7 +152,7 @@ def test_an_unreadable_image_is_bridged_and_reported(
     folder = run_slam(**reported | {"dataset": root, "frames": None})
     (gap,) = check_run(folder.path)["sequence"]["bridged"]
     assert (gap["first"], gap["last"]) == (6, 6) and "000006.png is truncated" in gap["reason"]
-    assert folder.metrics()["sequence"]["bridged_frames"] == 1
+    assert folder.metrics().tree()["sequence"]["bridged_frames"] == 1
     for name in ("report.html", "run.log"):
         assert "000006.png is truncated" in (folder.path / name).read_text()
 
@@ -190,7 +190,7 @@ def test_however_a_run_ends_its_folder_has_the_reason(
     monkeypatch.setattr(SlamPipeline, "estimate", stop)
     with pytest.raises(type(error)):
         run_slam(**quick, output=tmp_path / "ended")
-    metrics = RunFolder.open(tmp_path / "ended").metrics()
+    metrics = RunFolder.open(tmp_path / "ended").metrics().tree()
     known = {"ValueError": "ValueError: a bug", "RunError": "x", "Terminated": "ended by SIGTERM"}
     wanted = known.get(type(error).__name__, type(error).__name__)
     assert (metrics["status"], metrics["reason"]) == ("failed", wanted)
@@ -246,4 +246,4 @@ def test_a_run_from_the_cache_runs_no_network_and_leaves_the_same_bytes(
     assert names == sorted(path.name for path in warm.path.iterdir())
     for name in set(names) - {"metrics.json", "run.log", "drive.zip"}:  # these hold times
         assert len({(run.path / name).read_bytes() for run in (plain, cold, warm)}) == 1, name
-    assert run("other", "geometry.max_corners=150").metrics()["status"] == "ok"
+    assert run("other", "geometry.max_corners=150").metrics().tree()["status"] == "ok"

@@ -17,10 +17,11 @@ import slam.commands.cli
 from slam import Slam, run_slam
 from slam.commands.localisation.localiser import localise
 from slam.config.sections import load_config
-from slam.loops.places import PLACES, Places
-from slam.pipeline.checkpoint import KEYFRAMES, read_keyframes
+from slam.loops.places import Places
+from slam.pipeline.checkpoint import read_keyframes
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
+from slam.runtime.run_files import KEYFRAMES, PLACES
 from slam.sequences.catalogue import open_sequence
 from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
 
@@ -100,7 +101,7 @@ def test_exact_depth_gives_a_run_of_the_right_scale_in_any_unit(
     assert metrics["map"]["triangles"] > 0
     assert f"png:{exact(world)}" in (pictures.path / "report.html").read_text()
     thirds = run(world, tmp_path / "npy", f"npy:{arrays}")
-    assert thirds.metrics()["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
+    assert thirds.metrics().tree()["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
     length = float(np.linalg.norm(positions(pictures)[-1]))
     np.testing.assert_allclose(positions(thirds), positions(pictures), atol=0.03 * length)
     (place,) = localise(world / "sequences/sim/image_2/000012.png", pictures)
@@ -112,7 +113,7 @@ def test_a_range_of_frames_and_a_blank_one(
 ) -> None:
     folder = shutil.copytree(arrays, tmp_path / "arrays")
     np.save(folder / "000016.npy", np.full((64, 208), np.nan, np.float32))
-    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics()
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", frames="6:24").metrics().tree()
     assert metrics["status"] == "ok" and "frame 10 has no known depth" in caplog.text
     assert metrics["scale"]["value"] == pytest.approx(1 / 3, rel=0.06)
 
@@ -143,7 +144,7 @@ def test_a_relative_network_is_aligned_in_each_frame(world: Path, tmp_path: Path
         disparity = np.where(depth > 0, 1 / np.maximum(depth, 0.1), 0)
         np.save(folder / f"{path.stem}.npy", rng.uniform(3, 30) * (disparity + 0.02).astype(np.float32))
     chosen = ["depth.kind=disparity", "depth.align=affine"]
-    metrics = run(world, tmp_path / "run", f"npy:{folder}", *chosen).metrics()
+    metrics = run(world, tmp_path / "run", f"npy:{folder}", *chosen).metrics().tree()
     assert metrics["trajectories"]["optimised"]["align"]["7dof"]["scale"] == pytest.approx(1.0, abs=0.08)
     assert metrics["scale"]["spread"] < 0.15
 
@@ -160,7 +161,7 @@ def test_a_drive_is_continued_with_the_same_source_alone(world: Path, arrays: Pa
     for path in sorted(arrays.glob("*.npy"))[12:]:
         shutil.copy(path, part)
     others = {"output": tmp_path / "other", "overrides": [f"depth.source=npy:{part}"]}
-    assert run_slam(world, "sim", **following, **others).metrics()["sequence"]["frames"] == 24
+    assert run_slam(world, "sim", **following, **others).metrics().tree()["sequence"]["frames"] == 24
     for override, message in {
         "depth.source=network": "other weights or another depth source",
         f"depth.source=png:{exact(world)}": "other weights or another depth source",

@@ -142,7 +142,7 @@ def test_a_run_that_breaks_off_leaves_an_earlier_one_and_stays_beside_it(
     broken = json.loads(after["unfinished/metrics.json"])
     assert broken["status"] == "failed" and "000003.png" in broken["reason"]
     assert b"the run failed" in after["unfinished/run.log"]
-    assert run_slam(**quick | {"frames": "0:9"}, output=output).metrics()["sequence"]["frames"] == 9
+    assert run_slam(**quick | {"frames": "0:9"}, output=output).metrics().tree()["sequence"]["frames"] == 9
     assert set(contents(output)) == set(before)
 
 
@@ -188,7 +188,7 @@ def test_a_terminated_run_has_its_reason(
     with pytest.raises(Terminated) as raised:
         run_slam(**quick, output=tmp_path / "run")
     assert raised.value.code == 128 + getattr(signal, name)
-    metrics = RunFolder.open(tmp_path / "run").metrics()
+    metrics = RunFolder.open(tmp_path / "run").metrics().tree()
     assert (metrics["status"], metrics["reason"]) == ("failed", f"ended by {name}")
     assert metrics["trajectories"]["optimised"]["align"] and metrics["map"] is None
 
@@ -226,7 +226,7 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
     output = tmp_path / "run"
     arguments = [str(quick["dataset"]), str(quick["weights"]), str(output)]
     assert subprocess.run([sys.executable, "-c", KILLED, *arguments], check=False).returncode == -signal.SIGKILL
-    assert RunFolder.open(output).metrics()["status"] == "estimated"
+    assert RunFolder.open(output).metrics().tree()["status"] == "estimated"
     images = quick["dataset"] / "sequences" / "sim" / "image_2"
     run = ("run", "--dataset", quick["dataset"], "--weights", quick["weights"], "--set", "mapping.enabled=false")
     for numbers in ("estimated", "running", "absent"):
@@ -247,7 +247,7 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
     assert call(*run, "--continue", output, "--frames", "8:10", "--output", tmp_path / "on") == 0
     (output / "metrics.json").write_text('{"schema": 1, "status": "running", "provenance": {"weights_sha256": "00"}}')
     assert call(*run, "--frames", "0:8", "--output", output) == 0
-    assert RunFolder.open(output).metrics()["status"] == "ok"
+    assert RunFolder.open(output).metrics().tree()["status"] == "ok"
 
 
 def test_a_run_that_fails_after_its_folder_is_made_prints_one_line(
@@ -277,8 +277,8 @@ def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None
                 refused.append(error)
 
     run_slam(**quick, output=output, progress=second)
-    assert len(refused) == 2 and RunFolder.open(output).metrics()["status"] == "ok"
-    assert run_slam(**quick, output=output).metrics()["status"] == "ok"
+    assert len(refused) == 2 and RunFolder.open(output).metrics().tree()["status"] == "ok"
+    assert run_slam(**quick, output=output).metrics().tree()["status"] == "ok"
 
 
 def test_a_whole_run_does_not_go_on_by_itself(quick: dict[str, Any], tmp_path: Path) -> None:

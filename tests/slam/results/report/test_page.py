@@ -154,7 +154,7 @@ def test_trajectories_without_common_stamps_leave_the_rest_of_the_report(make_ru
     folder = make_run()
     late = folder.trajectory("odometry")
     assert late is not None
-    folder.write_trajectory("trajectory_lidar", Trajectory(late.stamps + 1e6, late.T_world_camera))
+    folder.write_trajectory("lidar", Trajectory(late.stamps + 1e6, late.T_world_camera))
     write_report(folder, examples(), None)
     html, _ = parsed(folder)
     assert "not drawn, no time stamps match" in html

@@ -14,37 +14,13 @@ from datetime import datetime
 from pathlib import Path
 
 from erfsfm.common.files import unfinished_name, write_atomically
-from slam.mapping.submap import FOLDER as SUBMAPS
 from slam.mapping.submap import remove_submaps
-from slam.results.schema import MetricsFile
+from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
-from slam.runtime.storage.files import KEYFRAMES_PART
-from slam.runtime.storage.json_file import read_json
+from slam.runtime.run_files import ESTIMATE, KEYFRAMES_PART, MEANINGS, METRICS, SUBMAPS, UNFINISHED
+from slam.runtime.storage.record import Missing
 
 logger = logging.getLogger(__name__)
-
-METRICS = "metrics.json"
-UNFINISHED = "unfinished"
-TRAJECTORIES = ("network", "odometry", "optimised", "lidar")
-ESTIMATE = "trajectory_optimised.tum.txt"
-_STEMS = ("reference", *(f"trajectory_{name}" for name in TRAJECTORIES))
-_OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "tum")) | {
-    "config.yaml",
-    METRICS,
-    "graph.g2o",
-    "loops.json",
-    "places.npz",
-    "trajectory_optimised.geojson",
-    "trajectory_optimised.kml",
-    "drive.zip",
-    "keyframes.npz",
-    "map_mesh.ply",
-    "map_cloud.ply",
-    "map_above.png",
-    "map_driver.png",
-    "report.html",
-    "run.log",
-}
 
 
 def check_output(output: Path) -> None:
@@ -141,13 +117,11 @@ def _made(path: Path) -> bool:
 def _is_run(metrics: Path) -> bool:
     """Whether a ``metrics.json`` is that of a run, however it ended."""
     try:
-        content = read_json(metrics, MetricsFile)
+        content = Metrics.read(metrics)
     except (OSError, RunError):
         return False
-    if not {"schema", "status"} <= set(content):
-        return False
-    provenance = content.get("provenance")
-    return isinstance(provenance, dict) and "weights_sha256" in provenance
+    named = not isinstance(content.provenance.weights_sha256, Missing)
+    return named and {"schema_", "status"} <= content.model_fields_set
 
 
 def _is_rest(path: Path) -> bool:
@@ -161,20 +135,9 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if is_own(path.name) or _is_rest(path)]
 
 
-def refuse_file_of_run(path: Path) -> None:
-    """Refuse to write over, or among, what a run has written under the names of its own files.
-
-    Raises:
-        RunError: ``path`` has such a name in the folder of a run.
-    """
-    folder = path.parent
-    if is_own(path.name) and ((folder / METRICS).is_file() or (folder / ESTIMATE).is_file()):
-        raise RunError(f"{path} is a file of a run: choose another --output")
-
-
 def is_own(name: str) -> bool:
     """Whether a run writes a file of this name."""
-    return name in _OWN or KEYFRAMES_PART.fullmatch(name) is not None
+    return name in MEANINGS or KEYFRAMES_PART.fullmatch(name) is not None
 
 
 def _clear(folder: Path) -> None:

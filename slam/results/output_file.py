@@ -1,4 +1,4 @@
-"""What an output may replace: an empty file, or one of the same kind, and none of a run."""
+"""The file that a command writes: what it may replace, an empty file or one of the same kind, and none of a run."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from slam.formats.trajectory import read_trajectory
-from slam.results.output import refuse_file_of_run
+from slam.results.output_folder import is_own
 from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.run_files import ESTIMATE, METRICS
 
 _TRAJECTORIES = (".txt", ".tum", ".kitti")
 
@@ -45,7 +46,8 @@ def _must_be_known(path: Path, suffixes: Collection[str]) -> bool:
     """Whether there is a file whose content must be looked at."""
     if path.is_dir():
         raise RunError(f"{path} is a folder: give the name of a file to write")
-    refuse_file_of_run(path)
+    if is_own(path.name) and any((path.parent / name).is_file() for name in (METRICS, ESTIMATE)):
+        raise RunError(f"{path} is a file of a run: choose another --output")
     if not path.is_file() or not path.stat().st_size:
         return False
     if path.suffix.lower() not in suffixes:

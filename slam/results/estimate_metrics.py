@@ -1,0 +1,196 @@
+"""The metrics of an estimate and of the whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+
+from erfsfm.evaluation.pose_metrics import (
+    SnippetErrors,
+    snippet_errors,
+    snippet_from_network,
+    snippets_from_trajectory,
+)
+from slam.evaluation.coverage import coverage
+from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
+from slam.formats.trajectory import Trajectory, associate
+from slam.frames import Sequence, runs
+from slam.frontend.failure import MeasurementFailure
+from slam.frontend.lidar_odometry import LidarPath
+from slam.geometry.se3 import umeyama
+from slam.pipeline.doubts import DOUBLED, doubled_frames
+from slam.pipeline.estimate import Estimate
+from slam.results.folder import RunFolder
+from slam.results.gps import gps_metrics
+from slam.results.metrics import (
+    Coverage,
+    Event,
+    GraphMetrics,
+    LearnedDepthError,
+    LoopMetrics,
+    Metrics,
+    Provenance,
+    ScaleMetrics,
+    SequenceMetrics,
+    Stretch,
+    Timing,
+    TrackingMetrics,
+    Trajectories,
+)
+from slam.runtime.run_files import TRAJECTORIES
+from slam.runtime.storage.record import Missing
+from slam.runtime.timing import Stopwatch, peak_rss_mb
+from slam.sequences.continued import unused_scans
+
+_NO_TRUTH = Missing("the sequence has no true poses")
+_NO_MAP_YET = Missing("the run ended before its map was whole")
+
+
+def estimate_metrics(
+    result: Estimate, sequence: Sequence, provenance: Provenance, gps_in_graph: bool = True
+) -> Metrics:
+    """All metrics before the map is fused."""
+    return Metrics(
+        schema_=1,
+        status="estimated",
+        reason="the run has not ended, or was killed while it made the map",
+        provenance=provenance,
+        sequence=_sequence(result, sequence),
+        timing=timing_of(result.stopwatch, len(sequence) - result.first),
+        scale=_scale(result),
+        trajectories=Trajectories(
+            network=trajectory_metrics(result.network, result.reference, _network_snippets(result)),
+            odometry=trajectory_metrics(result.odometry, result.reference),
+            optimised=trajectory_metrics(result.optimised, result.reference),
+            lidar=_lidar_metrics(result, sequence),
+        ),
+        gps=gps_metrics(result, gps_in_graph),
+        graph=_graph(result),
+        loops=LoopMetrics.model_validate(result.loops.summary()),
+        tracking=_tracking(result),
+        depth_error=_depth_error(result),
+        depth=_NO_MAP_YET,
+        map=_NO_MAP_YET,
+    )
+
+
+def metrics_of_trajectories(folder: RunFolder) -> Trajectories:
+    """Errors of the trajectories in the folder of a killed run; a reason for each missing one."""
+    reference = folder.trajectory("reference")
+    found: dict[str, TrajectoryMetrics | Missing] = {}
+    for name in TRAJECTORIES:
+        estimate = folder.trajectory(name)
+        if estimate is None:
+            found[name] = Missing("the run did not write this trajectory")
+        elif reference is None:
+            found[name] = trajectory_metrics(estimate, None)
+        else:
+            found[name] = trajectory_metrics(*associate(estimate, reference))
+    return Trajectories(**found)
+
+
+def lidar_trajectory(result: Estimate) -> Trajectory | None:
+    """LiDAR odometry with the stamps of its frames."""
+    if not isinstance(result.lidar, LidarPath):
+        return None
+    return Trajectory(result.optimised.stamps[result.lidar.frames], result.lidar.T_world_camera)
+
+
+def timing_of(watch: Stopwatch, frames: int) -> Timing:
+    """The time of a run until now."""
+    seconds, peak = watch.seconds, peak_rss_mb()
+    return Timing(
+        seconds_total=seconds,
+        frames_per_second=frames / seconds,
+        cpu_seconds=watch.cpu_seconds,
+        peak_rss_mb=Missing("not available on Windows") if peak is None else peak,
+        stages=dict(watch.stages),
+    )
+
+
+def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
+    frames = len(sequence)
+    span = float(sequence.stamps[-1] - sequence.stamps[0]) if frames > 1 else 0.0
+    drive, reference = result.drive, result.reference
+    scans = result.lidar.unreadable if isinstance(result.lidar, LidarPath) else {}
+    return SequenceMetrics(
+        name=sequence.name,
+        frames=frames,
+        length_m=_NO_TRUTH if reference is None else reference.length_m,
+        fps=(frames - 1) / span if span > 0 else Missing("all stamps are equal"),
+        bridged_frames=len(drive.interpolated),
+        bridged=_stretches(drive.interpolated),
+        doubled=_stretches(dict.fromkeys(doubled_frames(drive), DOUBLED)),
+        unreadable_scans=_stretches(scans),
+        continued_at=result.first,
+        segments=[Stretch(**asdict(segment)) for segment in drive.segments],
+    )
+
+
+def _stretches(reasons: Mapping[int, str]) -> list[Stretch]:
+    """Consecutive frames with the reason of the first."""
+    return [Stretch(first=first, last=last, reason=reasons[first]) for first, last in runs(reasons)]
+
+
+def _lidar_metrics(result: Estimate, sequence: Sequence) -> TrajectoryMetrics | Missing:
+    """Errors of LiDAR odometry at its frames."""
+    path, lidar = result.lidar, lidar_trajectory(result)
+    if isinstance(path, MeasurementFailure):
+        return Missing(path.reason)
+    if path is None or lidar is None:
+        return Missing(unused_scans(sequence) or "the sequence has no LiDAR scans")
+    reference = None if result.reference is None else result.reference.select(path.frames).rebased()
+    return trajectory_metrics(lidar, reference)
+
+
+def _network_snippets(result: Estimate) -> SnippetErrors | None:
+    """The paper's protocol on the network's snippet poses; None without truth or with other snippets."""
+    snippets = result.drive.snippets
+    if result.reference is None or len(snippets[0].sources) != 4:
+        return None
+    predicted = np.stack([snippet_from_network(s.T_source_target) for s in snippets])
+    return snippet_errors(predicted, snippets_from_trajectory(result.reference.T_world_camera))
+
+
+def _scale(result: Estimate) -> ScaleMetrics:
+    scale, estimate = result.scale, result.scale.estimate
+    if isinstance(estimate, MeasurementFailure):
+        return ScaleMetrics(mode=scale.mode, unit=scale.unit, value=Missing(estimate.reason))
+    return ScaleMetrics(mode=scale.mode, unit=scale.unit, **asdict(estimate))
+
+
+def _graph(result: Estimate) -> GraphMetrics:
+    """Size of the graph, and coverage of its noise by the truth at the graph's scale."""
+    nodes, factors = len(result.optimised), result.graph.relative_poses
+    if result.reference is None:
+        return GraphMetrics(nodes=nodes, factors=len(factors), coverage=_NO_TRUTH)
+    aligned = umeyama(result.optimised.positions, result.reference.positions, with_scale=True)
+    if not aligned.scale > 0:
+        still = Missing("the estimate does not move: the truth cannot be scaled to it")
+        return GraphMetrics(nodes=nodes, factors=len(factors), coverage=still)
+    covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
+    by_source = {source: Coverage.model_validate(shares) for source, shares in covered.by_source.items()}
+    overall = Coverage.model_validate(covered.overall)
+    return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
+
+
+def _tracking(result: Estimate) -> TrackingMetrics | Missing:
+    """Keyframes, their maps, and what became of them."""
+    drive = result.drive
+    if not drive.maps:
+        return Missing("this drive has no map of keyframes: it is measured from step to step")
+    return TrackingMetrics(
+        keyframes=sum(len(segment.map.keyframes) for segment in drive.maps),
+        maps=len(set(drive.map_poses.segments.values())),
+        events=[Event(**asdict(event)) for event in drive.events],
+    )
+
+
+def _depth_error(result: Estimate) -> list[LearnedDepthError] | Missing:
+    """Bias and sigma of learned depth over distance at the end of the drive, in the unit of the trajectory."""
+    curve, unit = result.state.odometry.depth_error.curve(), float(np.median(result.scale.per_frame))
+    if not curve:
+        return Missing("no step triangulated corners with learned depth")
+    return [LearnedDepthError(depth=unit * at, bias=b, sigma=s, corners=count) for at, b, s, count in curve]

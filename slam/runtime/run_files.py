@@ -1,0 +1,65 @@
+"""The files of a run folder: their names and what each of them is."""
+
+from __future__ import annotations
+
+import re
+
+CONFIG = "config.yaml"
+METRICS = "metrics.json"
+GRAPH = "graph.g2o"
+LOOPS = "loops.json"
+PLACES = "places.npz"
+DRIVE = "drive.zip"
+KEYFRAMES = "keyframes.npz"
+MAP_MESH = "map_mesh.ply"
+MAP_CLOUD = "map_cloud.ply"
+MAP_ABOVE = "map_above.png"
+MAP_DRIVER = "map_driver.png"
+GEOJSON = "trajectory_optimised.geojson"
+KML = "trajectory_optimised.kml"
+REPORT = "report.html"
+LOG = "run.log"
+
+KEYFRAMES_PART = re.compile(r"keyframes-\d{6,}\.npz")  # some keyframes of a pass that has not ended
+SUBMAPS = "submaps"  # folder of the parts of a map that is not whole
+UNFINISHED = "unfinished"  # folder of a new run while an earlier one is kept
+
+REFERENCE = "reference"
+TRAJECTORIES = {
+    "network": "raw network poses, chained",
+    "odometry": "front end fused, no loops",
+    "optimised": "after the pose graph",
+    "lidar": "KISS-ICP on the LiDAR scans",
+}
+FORMATS = ("kitti", "tum")
+
+
+def trajectory_file(name: str, format: str) -> str:
+    """File of ``reference`` or of one of `TRAJECTORIES` in one of `FORMATS`."""
+    return f"{name if name == REFERENCE else f'trajectory_{name}'}.{format}.txt"
+
+
+ESTIMATE = trajectory_file("optimised", "tum")  # a folder that holds it holds a run
+
+MEANINGS = {
+    CONFIG: "resolved configuration",
+    METRICS: "every number of this page",
+    GEOJSON: "optimised trajectory on the earth",
+    KML: "the same for Google Earth",
+    GRAPH: "pose graph",
+    LOOPS: "accepted and rejected loops",
+    PLACES: "features of places, for localize",
+    DRIVE: "measurements of every frame, for run --continue",
+    KEYFRAMES: "keyframes of the map, for run --continue",
+    MAP_MESH: "map as a mesh, y down",
+    MAP_CLOUD: "map as a coloured cloud, y down",
+    MAP_ABOVE: "the map from above",
+    MAP_DRIVER: "the map from the driver's seat",
+    REPORT: "this page",
+    LOG: "log of the run",
+} | {
+    trajectory_file(name, format): meaning
+    for name, meaning in (TRAJECTORIES | {REFERENCE: "ground truth"}).items()
+    for format in FORMATS
+}
+"""Every file that a run may leave, by name."""

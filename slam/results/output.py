@@ -35,7 +35,6 @@ _OWN = frozenset(f"{stem}.{kind}.txt" for stem in _STEMS for kind in ("kitti", "
     "loops.json",
     "places.npz",
     "trajectory_optimised.geojson",
-    "trajectory_optimised.kml",
     "drive.zip",
     "keyframes.npz",
     "map_mesh.ply",

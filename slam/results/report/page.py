@@ -51,7 +51,6 @@ _MEANINGS = {
     "config.yaml": "resolved configuration",
     "metrics.json": "every number of this page",
     "trajectory_optimised.geojson": "optimised trajectory on the earth",
-    "trajectory_optimised.kml": "the same for Google Earth",
     "trajectory_network": "raw network poses, chained",
     "trajectory_odometry": "front end fused, no loops",
     "trajectory_optimised": "after the pose graph",

@@ -275,7 +275,6 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
         ("trajectory", "poses.txt", "1.0"),
         ("trajectory", "poses.tum", "# timestamp"),
         ("graph", "graph.g2o", "VERTEX_SE3:QUAT 0"),
-        ("mesh", "map.obj", "# erfsfm-slam"),
         ("mesh", "map.gltf", '{"asset"'),
     ],
 )

@@ -102,8 +102,8 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     [
         ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
         ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap, nerfstudio"),
-        ("mesh", "out.stl", "y-down", r"written as \.ply, \.obj, \.glb, \.gltf; got 'out\.stl'"),
-        ("cloud", "out.obj", "y-down", r"written as \.ply, \.las, \.laz"),
+        ("mesh", "out.stl", "y-down", r"written as \.ply, \.glb, \.gltf; got 'out\.stl'"),
+        ("cloud", "out.glb", "y-down", r"written as \.ply, \.las, \.laz"),
         ("occupancy", "out.png", "z", r"ends in \.yaml"),
         ("raster", "file", "z", "is a file: a raster is several files"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),

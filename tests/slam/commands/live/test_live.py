@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -25,7 +25,8 @@ import pytest
 from slam import run_slam
 from slam.commands.live.messages import emitters
 from slam.commands.live.reader import Reader
-from slam.commands.live.run import LiveRequest, run_live
+from slam.commands.live.request import LiveRequest
+from slam.commands.live.run import run_live
 from slam.commands.live.sequence import calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
@@ -47,6 +48,10 @@ def street(kitti_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera, no_lens = (kitti_root / "camera.yaml").read_text(), "model: opencv\ndistortion: [0, 0, 0, 0]"
     (folder / "camera.yaml").write_text(camera.replace("model: pinhole", no_lens))
     return folder
+
+
+def request_of(camera: Path | str, weights: Path, settings: Sequence[str], output: Path, **options: Any) -> LiveRequest:
+    return LiveRequest(str(camera), output=output, weights=str(weights), overrides=list(settings), **options)
 
 
 def fill(source: Path, target: Path, messages: list[dict[str, Any]]) -> Thread:
@@ -71,7 +76,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     target.mkdir()
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
-    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=1.5)
     folder = run_live(request, messages.append)
     offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
     for name in ("trajectory_optimised.kitti.txt", "trajectory_odometry.tum.txt", "graph.g2o", "loops.json"):
@@ -97,7 +102,7 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     fill(street / "images", target, messages)
     at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
     settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
-    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=0.5)
     folder = run_live(request, messages.append)
     recorded = folder.metrics()["scale"]
     assert (recorded["unit"], recorded["value"]) == ("the networks' own unit", None)
@@ -130,7 +135,7 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
         target.rename(tmp_path / "unplugged")
 
     Thread(target=fill_and_vanish, daemon=True).start()
-    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=30)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=30)
     folder = run_live(request, messages.append)
     *poses, last = messages
     used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
@@ -158,7 +163,7 @@ def test_what_the_settings_need_is_asked_before_the_first_frame(
     """A camera by its field of view alone has no height; frames that come have no scans and no numbers."""
     settings = (*SETTINGS, *settings)
     images, messages = str(street / "images"), []
-    request = LiveRequest(images, Path("fov=70"), str(tiny_weights), None, settings, tmp_path / "live", wait_s=0.5)
+    request = request_of(images, tiny_weights, settings, tmp_path / "live", calibration=Path("fov=70"), wait=0.5)
     with pytest.raises(SlamError, match=words):
         run_live(request, messages.append)
     assert messages == [] and not (tmp_path / "live").exists()
@@ -182,7 +187,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
         if len(messages) == 9:
             raise SlamError("nobody listens")
 
-    request = LiveRequest(str(target), None, str(tiny_weights), None, SETTINGS, tmp_path / "live", wait_s=1.5)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=1.5)
     with pytest.raises(SlamError, match="nobody listens" if frames == 9 else "usable frames"):
         run_live(request, listen)
     metrics = json.loads((tmp_path / "live" / "metrics.json").read_text())
@@ -304,7 +309,7 @@ def test_the_viewer_is_shown_the_drive(
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
     settings, output = SETTINGS[1:], tmp_path / "run"  # keyframes are kept for the map
-    request = LiveRequest(str(target), None, str(tiny_weights), None, settings, output, wait_s=1.5, view=True)
+    request = request_of(target, tiny_weights, settings, output, wait=1.5, view=True)
     run_live(request, messages.append)
     content = shown.read_bytes()
     assert content[:3] == b"RRF"

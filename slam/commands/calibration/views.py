@@ -12,7 +12,7 @@ from slam.commands.calibration.board import Board, Detector
 from slam.frames import Grey, Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import CalibrationError
-from slam.sequences.recording import ImageSource
+from slam.sequences.images import ImageSource
 
 MOST_VIEWS = 40
 FEWEST_VIEWS = 8

@@ -37,9 +37,8 @@ from slam.runtime.errors import RunError
 from slam.runtime.imports import import_rerun
 from slam.runtime.storage.files import from_anywhere
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import Excerpt
+from slam.sequences.excerpt import Excerpt, undistortion_of
 from slam.sequences.gps import read_gps
-from slam.sequences.undistortion import undistortion_of
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,9 @@ from erfsfm.common.readers.video import VideoFrames
 from slam.commands.calibration.board import Board
 from slam.commands.calibration.picture import write_picture
 from slam.commands.calibration.solve import Calibration, Model, calibrate
-from slam.commands.calibration.views import Progress, chosen, find_views
+from slam.commands.calibration.views import chosen, find_views
 from slam.runtime.errors import CalibrationError, sequence_errors
+from slam.runtime.progress import Progress
 from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.images import ImageFiles, ImageSource

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +11,7 @@ from slam.commands.calibration.board import Board, Detector
 from slam.frames import Grey, Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import CalibrationError
+from slam.runtime.progress import Progress
 from slam.sequences.images import ImageSource
 
 MOST_VIEWS = 40
@@ -19,8 +19,6 @@ FEWEST_VIEWS = 8
 _MOST_SEARCHED = 300  # images of a video
 _MOST_PROBED = 20
 _BLURRED = 0.3  # of the median sharpness
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 from slam.commands.downloads.zip_members import ZipMembers
 from slam.runtime.errors import DownloadError
+from slam.runtime.progress import Progress
 
 SERVER = "https://s3.eu-central-1.amazonaws.com/avg-kitti"
 _WITH_POSES = 11  # sequences 00 to 10
@@ -17,8 +17,6 @@ _SEQUENCES = 22
 _COLOUR, _GREY = ("data_odometry_color.zip", "image_2"), ("data_odometry_gray.zip", "image_0")
 _CALIBRATION, _POSES, _SCANS = "data_odometry_calib.zip", "data_odometry_poses.zip", "data_odometry_velodyne.zip"
 _NAME = re.compile(r"\d\d")
-
-Progress = Callable[[str, int, int], None]
 
 
 def download_kitti(

@@ -8,17 +8,15 @@ import re
 import shutil
 import tarfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 from slam.commands.downloads.connection import ATTEMPTS, BrokenError, Connection, connection_errors
 from slam.runtime.errors import DownloadError
+from slam.runtime.progress import Progress
 
 SERVER = "https://cvg.cit.tum.de/rgbd/dataset"
 _NAME = re.compile(r"(?:rgbd_dataset_)?(?P<name>freiburg(?P<camera>[123])_\w+)")
 _CHUNK = 1 << 20
-
-Progress = Callable[[str, int, int], None]
 
 
 def download_tum(sequence: str, folder: Path, server: str, progress: Progress) -> Path:

@@ -27,9 +27,9 @@ from slam.loops.places import PLACES, Places
 from slam.results.comparison import CAMERA_HEIGHTS, METRES, lookup, unit_of_lengths
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError
+from slam.runtime.progress import Progress
 from slam.runtime.storage.files import write_atomically
 
-Progress = Callable[[str, int, int], None]
 Writer = Callable[[Path, Ply], None]
 
 _WRITERS: dict[str, dict[str, Writer]] = {

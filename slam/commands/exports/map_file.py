@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,10 +12,9 @@ from slam.config.sections import load_stored
 from slam.mapping.submap import FOLDER, Submap, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
+from slam.runtime.progress import Progress
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[str, int, int], None]
 
 
 def has_map(folder: RunFolder, what: str) -> bool:

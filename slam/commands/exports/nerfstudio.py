@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from slam.loops.places import PLACES, Places
 from slam.results.comparison import lookup
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.progress import Progress
 from slam.runtime.storage.files import remove, write_atomically
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
@@ -40,7 +40,7 @@ def write_scene(
     trajectory: Trajectory,
     cloud: Ply | None,
     dataset: Path | None,
-    progress: Callable[[str, int, int], None] | None,
+    progress: Progress | None,
 ) -> None:
     """Write ``images/``, ``points.ply`` and, last, ``transforms.json``.
 

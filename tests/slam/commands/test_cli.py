@@ -281,7 +281,7 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
 def test_export(call: Call, make_run: MakeRun, what: str, output: str, start: str) -> None:
     run = make_run()
     code, out, _ = call("export", run.path, "--what", what, "--output", output)
-    assert code == 0 and output in out and Path(output).read_text().startswith(start)
+    assert code == 0 and output in out and Path(output).read_bytes().startswith(start.encode())
 
 
 def test_export_of_a_part(call: Call, make_run: MakeRun) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from slam.commands.exports.export import export
 from slam.commands.exports.options import R_UP_WORLDS
-from slam.formats.ply import read_ply_points
+from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
 from slam.loops.places import PLACES, Places
@@ -40,8 +40,7 @@ def test_ply_is_copied_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path:
     copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
     assert copied.read_bytes() == source.read_bytes()
     turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
-    points, _ = read_ply_points(turned)
-    np.testing.assert_allclose(points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
+    np.testing.assert_allclose(read_ply(turned).points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
 
 

@@ -1,10 +1,11 @@
 """Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
-accuracy measures simulated worlds and KITTI sequences, ablation turns off one part at a time, speed measures time and
-memory, maps the errors of the map with one of its parts turned off at a time. Every run is a process and a folder of
-its own under --output. A successful one is not repeated as long as sources, weights and options stay the same, so that
-a killed benchmark can be resumed; a failed one is a row with its reason. --jobs and --scheduler need Dask: pip install
-'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the same paths.
+accuracy measures simulated worlds and KITTI sequences, full-size the same worlds and KITTI at the size of KITTI's
+cameras, ablation turns off one part at a time, speed measures time and memory, maps the errors of the map with one of
+its parts turned off at a time. Every run is a process and a folder of its own under --output. A successful one is not
+repeated as long as sources, weights and options stay the same, so that a killed benchmark can be resumed; a failed one
+is a row with its reason. --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers
+need the same files at the same paths.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -13,8 +14,10 @@ from __future__ import annotations
 
 import argparse
 import csv
+import os
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -25,12 +28,15 @@ from benchmarking.plan import (
     ABLATION,
     ACCURACY,
     EVERYTHING,
+    FULL_SIZE,
     GROWTH,
     MAPS,
     SPEED,
     Condition,
+    Configuration,
     Job,
     excerpts,
+    original_recordings,
     plan,
     raw_drives,
     recordings,
@@ -41,6 +47,37 @@ from benchmarking.work import ROOT, measured, workers
 
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.files import write_atomically
+
+
+@dataclass(frozen=True)
+class Mode:
+    """What a mode measures, and the defaults of its options."""
+
+    what: str
+    configurations: tuple[Configuration, ...]
+    routes: tuple[str, ...]
+    worlds: tuple[int, ...] = (610,)
+    weights: tuple[str, ...] = ("default",)
+    seeds: tuple[int, ...] = (0,)
+
+
+_BOTH = ("loop", "straight")
+MODES = {
+    "accuracy": Mode(
+        "errors of network, odometry and optimised trajectory on every sequence",
+        ACCURACY,
+        _BOTH,
+        (610, 611),
+        ("default", "sim"),
+        (0, 1, 2),
+    ),
+    "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", ACCURACY, _BOTH, (610, 611)),
+    "ablation": Mode("the same with one part turned off at a time", ABLATION, _BOTH, weights=("default", "sim")),
+    "speed": Mode(
+        "time of every stage, memory, growth with the number of frames; one run after another", SPEED, ("loop",)
+    ),
+    "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", MAPS, ("loop",)),
+}
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -66,15 +103,16 @@ def main(words: Sequence[str] | None = None) -> None:
         writer.writerows(table_of_runs)
     drives = [(path, "DRIVE") for path in getattr(options, "drives", ())]
     text = section(options.mode, _command(options), results, "several" if scheduler else str(at_a_time))
-    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), (options.kitti, "KITTI"), (ROOT, "."), *drives
+    roots = (getattr(options, "kitti", None), "KITTI"), (getattr(options, "data", None), "DATA")
+    known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
     page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
     write_atomically(options.report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
-    if options.mode == "accuracy":
+    if options.mode in ("accuracy", "full-size"):
         print(summary_table(results))
-        if drawable(results):
-            draw(results, options.report.parent / PICTURE)
+    if options.mode == "accuracy" and drawable(results):
+        draw(results, options.report.parent / PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
 
 
@@ -82,11 +120,14 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     folder = options.output.resolve() / options.mode
     simulated = (options.worlds_in or options.output / "worlds").resolve()
     truth: tuple[Literal["depth"], ...] = ("depth",) if options.mode == "maps" else ()
-    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth)
+    size = FULL_SIZE if options.mode == "full-size" else None
+    drives = worlds(simulated, options.routes, options.worlds, options.frames, options.conditions, truth, size)
     drives += raw_drives(getattr(options, "drives", ()))
-    if options.kitti is not None:
+    if getattr(options, "kitti", None) is not None:
         drives += recordings(options.kitti.resolve(), options.sequences, options.excerpt)
-    configurations = {"accuracy": ACCURACY, "ablation": ABLATION, "speed": SPEED, "maps": MAPS}[options.mode]
+    if getattr(options, "data", None) is not None:
+        drives += original_recordings(options.data.resolve())
+    configurations = MODES[options.mode].configurations
     parts = getattr(options, "parts", None)
     if parts is not None:
         configurations = tuple(c for c in configurations if c is EVERYTHING or c.name in parts)
@@ -101,7 +142,9 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 def _command(options: argparse.Namespace) -> str:
     """The command with its defaults, without the paths and hosts of one machine."""
     words = ["python", "tools/benchmark.py", options.mode]
-    words += ["--kitti", "KITTI"] if options.kitti else []
+    words += [
+        word for name in ("kitti", "data") if getattr(options, name, None) for word in (f"--{name}", name.upper())
+    ]
     drives = getattr(options, "drives", ())
     names = [f"KITTI_RAW/{drive.resolve().parent.name}/{drive.name}" for drive in drives]
     words += ["--drives", *names] if names else []
@@ -121,55 +164,40 @@ def _command(options: argparse.Namespace) -> str:
     ):
         value = getattr(options, name, None)
         if value not in (None, ()):
-            words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+            words += [f"--{name}", *map(str, value if isinstance(value, list | tuple) else [value])]
     return shlex.join(words)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    modes = parser.add_subparsers(dest="mode", required=True, metavar="accuracy|ablation|speed|maps")
-    for mode, what in (
-        ("accuracy", "errors of network, odometry and optimised trajectory on every sequence"),
-        ("ablation", "the same with one part turned off at a time"),
-        ("speed", "time of every stage, memory, growth with the number of frames; one run after another"),
-        ("maps", "errors, size and cost of the map, with one of its parts turned off at a time"),
-    ):
+    modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join(MODES))
+    for name, mode in MODES.items():
         add = modes.add_parser(
-            mode, help=what, description=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+            name, help=mode.what, description=mode.what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
         ).add_argument
-        fast = mode == "speed"
-        many = mode in ("accuracy", "ablation")
-        add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
-        add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
-        add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
-        add(
-            "--routes",
-            nargs="*",
-            default=["loop", "straight"] if many else ["loop"],
-            help="of simulated worlds",
-        )
-        add("--worlds", nargs="+", type=int, default=[610, 611] if mode == "accuracy" else [610], help="their seeds")
+        if name == "full-size":
+            data = os.environ.get("ERFSFM_DATA")
+            add("--data", type=Path, default=data and Path(data), metavar="FOLDER", help="recordings; $ERFSFM_DATA")
+        else:
+            add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root to measure too")
+            add("--sequences", nargs="+", default=(), metavar="NAME", help="of that root; all of them without it")
+            add("--excerpt", metavar="A:B", help="frames of those sequences, half-open")
+        add("--routes", nargs="*", default=mode.routes, help="of simulated worlds")
+        add("--worlds", nargs="+", type=int, default=mode.worlds, help="their seeds")
         add("--frames", type=int, default=300, help="their length")
         add("--conditions", nargs="+", choices=get_args(Condition), default=["clean"], help="hazards: all at once")
         add("--worlds-in", type=Path, metavar="FOLDER", help="where they are or will be; OUTPUT/worlds without it")
-        add(
-            "--weights",
-            nargs="+",
-            default=["default", "sim"] if many else ["default"],
-            help="names or folders",
-        )
-        add(
-            "--seeds", nargs="+", type=int, default=[0, 1, 2] if mode == "accuracy" else [0], help="of the RANSAC draws"
-        )
+        add("--weights", nargs="+", default=mode.weights, help="names or folders")
+        add("--seeds", nargs="+", type=int, default=mode.seeds, help="of the RANSAC draws")
         add("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to every configuration")
         add("--device", choices=("auto", "cpu", "cuda"), default="cpu", help="where the networks compute")
         add("--output", type=Path, default=Path("runs/benchmark"), help="keeps runs, worlds and CSV files")
         add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
-        if mode in ("maps", "ablation"):
+        if name in ("maps", "ablation"):
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
-            names = [each.name for each in (MAPS if mode == "maps" else ABLATION) if each is not EVERYTHING]
-            add("--parts", nargs="*", choices=names, metavar="PART", help=f"to turn off: {', '.join(names)}; else all")
-        if fast:
+            parts = [each.name for each in mode.configurations if each is not EVERYTHING]
+            add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")
+        if name == "speed":
             add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
         else:
             add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")

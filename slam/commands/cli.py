@@ -6,6 +6,7 @@ import json
 import logging
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,10 +20,11 @@ from slam.commands.downloads.cli import verbs as download_verbs
 from slam.commands.exports.cli import verbs as export_verbs
 from slam.commands.live.cli import verbs as live_verbs
 from slam.commands.localisation.cli import verbs as localisation_verbs
+from slam.commands.options import Json, Seed, UnusedDevice, UnusedSeed, options_of
+from slam.commands.run.request import RunRequest
 from slam.runtime.errors import SlamError
 from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
-from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 if TYPE_CHECKING:
     from slam.results.metrics import Metrics
@@ -33,14 +35,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Monocular SLAM on learned depth and ego-motion, on a CPU.",
 )
-
-DeviceName = Literal["auto", "cpu", "cuda"]
-Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
-DefaultSeed = Annotated[
-    int | None, typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or that of the old run")
-]
-Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 
 
 def _print_version(wanted: bool) -> None:
@@ -59,57 +53,16 @@ def _options_of_all_verbs(
 
 
 @app.command()
-def run(
-    dataset: Annotated[
-        str | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
-    ] = None,
-    sequence: Annotated[
-        str | None,
-        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
-    ] = None,
-    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")] = "default",
-    config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
-    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
-    output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
-    cache: Annotated[Path | None, typer.Option(help="folder that keeps network outputs for later runs")] = None,
-    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
-    continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
-    ] = None,
-    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None,
-    seed: DefaultSeed = None,
-    device: Device = "auto",
-    as_json: Json = False,
-) -> None:
+@options_of(RunRequest)
+def run(request: RunRequest, as_json: Json = False) -> None:
     """Trajectory, map and report of a sequence. Without options: the embedded simulated street.
 
     Example: erfsfm-slam run --dataset KITTI --sequence 09
     """
-    from slam.commands.run.run import run_slam
+    from slam.commands.run.run import perform
 
     with progress_bar() as progress:
-        folder = run_slam(
-            dataset=dataset,
-            sequence=sequence,
-            camera=camera,
-            weights=weights,
-            config=config,
-            overrides=overrides or [],
-            frames=frames,
-            output=output,
-            seed=seed,
-            device=device,
-            progress=progress,
-            command=shlex.join(["erfsfm-slam", *sys.argv[1:]]),
-            cache=cache,
-            rerun=rerun,
-            continues=continues,
-            gps=gps,
-        )
+        folder = perform(replace(request, progress=progress, command=shlex.join(["erfsfm-slam", *sys.argv[1:]])))
     metrics = folder.metrics()
     if as_json:
         typer.echo(metrics.to_json())
@@ -150,8 +103,6 @@ app.add_typer(batch_verbs)
 app.add_typer(live_verbs)
 app.add_typer(calibration_verbs)
 app.add_typer(download_verbs)
-
-
 app.add_typer(localisation_verbs)
 
 

@@ -1,4 +1,4 @@
-"""Point clouds and triangle meshes as PLY files, read and written whole.
+"""Point clouds and triangle meshes as binary PLY files.
 
 On a full disk Open3D's writer prints a line for every vertex and reports success, so files are written here, with the
 same layout and bytes.
@@ -6,7 +6,7 @@ same layout and bytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,8 +26,7 @@ _TYPES = {
 _NAMES = {"f8": "double", "f4": "float", "u1": "uchar", "i1": "char"}
 _NAMES |= {"u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"}
 _AXES, _NORMALS, _COLOURS = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
-_GREY = 128
-TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
+_TRIANGLE = np.dtype([("count", "u1"), ("vertices", "<u4", (3,))])
 
 
 @dataclass(frozen=True)
@@ -79,15 +78,14 @@ def read_ply(path: Path) -> Ply:
     """Read a whole file: every vertex, every triangle, and nothing after them.
 
     Raises:
-        RunError: it is no PLY in text or little-endian form, is cut short, or holds impossible values.
+        RunError: it is no PLY in little-endian form, is cut short, or holds impossible values.
     """
     try:
         with path.open("rb") as file:
-            is_text, elements = _header(file)
-            _require_size(path.stat().st_size - file.tell(), elements, is_text)
-            read = _read_text if is_text else _read_binary
-            parts = {element.name: read(file, element) for element in elements}
-            if file.read(1).strip():
+            elements = _header(file)
+            _require_size(path.stat().st_size - file.tell(), elements)
+            parts = {element.name: _read(file, element) for element in elements}
+            if file.read(1):
                 raise ValueError("it is longer than its header states")
         ply = Ply(parts["vertex"], parts["face"].astype(np.int64) if "face" in parts else None)
         _check(ply)
@@ -108,10 +106,9 @@ def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
     """
     try:
         with path.open("rb") as file:
-            is_text, elements = _header(file)
-            vertex, face = elements
-            if is_text or face.list_types is None:
-                raise ValueError("it is no binary mesh")
+            vertex, face = _header(file)
+            if face.list_types is None:
+                raise ValueError("it is no mesh")
             count, index = face.list_types
             start = file.tell()
         of_vertex = np.dtype(vertex.fields)
@@ -121,17 +118,6 @@ def map_ply(path: Path) -> tuple[NDArray[np.void], NDArray[np.void]]:
     except (OSError, ValueError, KeyError, IndexError, StopIteration) as error:
         reason = str(error) or "it ends within its header"
         raise RunError(f"{path} is no mesh that can be read ({reason}): run the sequence again") from error
-
-
-def read_ply_points(path: Path) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Vertices ``(P, 3)`` and their RGB colours ``(P, 3)``, grey where the file has none; raises as `read_ply`."""
-    ply = read_ply(path)
-    points, colours = ply.columns(_AXES), ply.columns(_COLOURS)
-    if points is None:
-        raise RunError(f"{path} is no PLY that can be read (its vertices have no x, y, z): run the sequence again")
-    if colours is None:
-        return points, np.full(points.shape, _GREY, np.uint8)
-    return points, colours.astype(np.uint8)
 
 
 def coloured_ply(
@@ -164,34 +150,52 @@ def rotated(ply: Ply, R_up_world: FloatArray) -> Ply:
     return replace(ply, vertices=vertices)
 
 
-def ply_header(vertex_type: np.dtype[np.void], vertices: int, triangles: int | None) -> bytes:
-    """The header of a binary PLY, whose triangles, if any, are `TRIANGLE` records."""
-    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam", f"element vertex {vertices}"]
-    for name in vertex_type.names or ():
-        lines.append(f"property {_NAMES[vertex_type[name].str[1:]]} {name}")
-    if triangles is not None:
-        lines += [f"element face {triangles}", "property list uchar uint vertex_indices"]
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
-
-
 def write_ply(path: Path, ply: Ply) -> None:
     """Write a binary PLY, atomically.
 
     Raises:
         RunError: the file cannot be written.
     """
-    header = ply_header(ply.vertices.dtype, len(ply.vertices), None if ply.triangles is None else len(ply.triangles))
-    parts: list[NDArray[np.void]] = [ply.vertices]
-    if ply.triangles is not None:
-        faces = np.empty(len(ply.triangles), TRIANGLE)
-        faces["count"], faces["vertices"] = 3, ply.triangles
-        parts.append(faces)
+    triangles, vertices = ply.triangles, ply.vertices
+    faces = (None, None) if triangles is None else (len(triangles), lambda: iter([triangles]))
+    write_ply_pieces(path, vertices.dtype, len(vertices), lambda: iter([vertices]), *faces)
+
+
+def write_ply_pieces(
+    path: Path,
+    vertex_type: np.dtype[np.void],
+    vertices: int,
+    vertex_pieces: Callable[[], Iterator[NDArray[np.void]]],
+    triangles: int | None = None,
+    triangle_pieces: Callable[[], Iterator[NDArray[np.int64]]] | None = None,
+) -> None:
+    """Write a binary PLY, atomically, without its whole content in memory.
+
+    Args:
+        path: the file.
+        vertex_type: fields of a vertex.
+        vertices: their number in all pieces.
+        vertex_pieces: structured arrays ``(v,)``, one after another.
+        triangles: number of triangles; None for a cloud.
+        triangle_pieces: arrays ``(t, 3)`` of indices into all vertices.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", "comment Created by erfsfm-slam", f"element vertex {vertices}"]
+    lines += [f"property {_NAMES[vertex_type[name].str[1:]]} {name}" for name in vertex_type.names or ()]
+    if triangles is not None:
+        lines += [f"element face {triangles}", "property list uchar uint vertex_indices"]
 
     def fill(partial: Path) -> None:
         with partial.open("wb") as file:
-            file.write(header)
-            for part in parts:
-                file.write(np.ascontiguousarray(part).view(np.uint8).data)
+            file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+            for piece in vertex_pieces():
+                file.write(np.ascontiguousarray(piece).view(np.uint8).data)
+            for corners in triangle_pieces() if triangle_pieces is not None else ():
+                faces = np.empty(len(corners), _TRIANGLE)
+                faces["count"], faces["vertices"] = 3, corners
+                file.write(faces.view(np.uint8).data)
 
     write_atomically(path, fill, RunError)
 
@@ -207,13 +211,13 @@ def _check(ply: Ply) -> None:
         raise ValueError("a triangle has a vertex that does not exist")
 
 
-def _header(file: BinaryIO) -> tuple[bool, list[_Element]]:
-    """Whether the body is text, and the elements in their order."""
+def _header(file: BinaryIO) -> list[_Element]:
+    """The elements in their order."""
     lines = _words(file)
     if next(lines) != ["ply"]:
         raise ValueError("it does not begin with 'ply'")
     _, form, _ = next(lines)
-    if form not in ("ascii", "binary_little_endian"):
+    if form != "binary_little_endian":
         raise ValueError(f"its format is {form}")
     elements: list[_Element] = []
     for words in lines:
@@ -229,16 +233,16 @@ def _header(file: BinaryIO) -> tuple[bool, list[_Element]]:
         raise ValueError("its header has no end")
     if not elements or elements[0].name != "vertex":
         raise ValueError("its vertices do not come first")
-    return form == "ascii", elements
+    return elements
 
 
-def _require_size(size: int, elements: list[_Element], is_text: bool) -> None:
+def _require_size(size: int, elements: list[_Element]) -> None:
     """Refuse a body that is shorter than announced, before any memory is taken for it."""
     for element in elements:
         fields = [kind for _, kind in element.fields]
         if element.list_types is not None:
             fields += [element.list_types[0], *[element.list_types[1]] * 3]
-        each = 2 * len(fields) if is_text else sum(np.dtype(kind).itemsize for kind in fields)
+        each = sum(np.dtype(kind).itemsize for kind in fields)
         if element.count < 0 or element.count * each > size:
             raise ValueError(f"it announces {element.count} elements '{element.name}', more than it holds")
         size -= element.count * each
@@ -251,16 +255,7 @@ def _words(file: BinaryIO) -> Iterator[list[str]]:
             yield words
 
 
-def _read_text(file: BinaryIO, element: _Element) -> NDArray[Any]:
-    rows = [file.readline().split() for _ in range(element.count)]
-    if element.list_types is None:
-        return np.array([tuple(row) for row in rows], dtype=element.fields)
-    if any(len(row) != 4 or int(row[0]) != 3 for row in rows):
-        raise ValueError(f"each {element.name} must have 3 vertices")
-    return np.array([row[1:] for row in rows], dtype=np.int64).reshape(-1, 3)
-
-
-def _read_binary(file: BinaryIO, element: _Element) -> NDArray[Any]:
+def _read(file: BinaryIO, element: _Element) -> NDArray[Any]:
     if element.list_types is None:
         return _records(file, element, np.dtype(element.fields))
     count_type, index_type = element.list_types

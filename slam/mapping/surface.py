@@ -16,7 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from slam.config.sections import MappingConfig
-from slam.formats.ply_stream import write_ply_pieces
+from slam.formats.ply import write_ply_pieces
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam.formats.geographic import write_geojson, write_kml
+from slam.formats.geographic import write_geojson
 from slam.formats.trajectory import Trajectory
 from slam.frontend import gps
 from slam.frontend.failure import MeasurementFailure
@@ -13,7 +13,7 @@ from slam.pipeline.estimate import Estimate
 from slam.pipeline.positioning import Location
 from slam.results.folder import RunFolder
 from slam.results.metrics import GpsErrors, GpsMetrics, Origin
-from slam.runtime.run_files import GEOJSON, KML
+from slam.runtime.run_files import GEOJSON
 from slam.runtime.storage.record import Missing
 
 
@@ -39,13 +39,12 @@ def gps_metrics(result: Estimate, in_graph: bool) -> GpsMetrics | Missing:
 
 
 def write_places(folder: RunFolder, result: Estimate, name: str) -> None:
-    """Write the optimised trajectory as paths on the earth, where a GPS track located it."""
+    """Write the optimised trajectory as a path on the earth, where a GPS track located it."""
     if not isinstance(result.location, Location):
         return
     T_enu_camera = result.location.T_enu_world @ result.optimised.T_world_camera
     places = result.location.fixes.frame.places(T_enu_camera[:, :3, 3])
     write_geojson(folder.path / GEOJSON, name, places, result.optimised.stamps)
-    write_kml(folder.path / KML, name, places)
 
 
 def _errors(fixes: gps.GpsFixes, T_enu_world: FloatArray, trajectory: Trajectory) -> GpsErrors:

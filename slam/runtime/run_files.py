@@ -16,7 +16,6 @@ MAP_CLOUD = "map_cloud.ply"
 MAP_ABOVE = "map_above.png"
 MAP_DRIVER = "map_driver.png"
 GEOJSON = "trajectory_optimised.geojson"
-KML = "trajectory_optimised.kml"
 REPORT = "report.html"
 LOG = "run.log"
 
@@ -45,7 +44,6 @@ MEANINGS = {
     CONFIG: "resolved configuration",
     METRICS: "every number of this page",
     GEOJSON: "optimised trajectory on the earth",
-    KML: "the same for Google Earth",
     GRAPH: "pose graph",
     LOOPS: "accepted and rejected loops",
     PLACES: "features of places, for localize",

@@ -21,9 +21,8 @@ from slam.runtime.imports import import_feather
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import describe_unknown, poses_near, poses_of
+from slam.sequences.poses import poses_near, poses_of
 from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_stamps
-from slam.sequences.undistortion import calibrated
 
 _CAMERA = "ring_front_center"
 _IMAGES, _SCANS = f"sensors/cameras/{_CAMERA}", "sensors/lidar"
@@ -61,17 +60,14 @@ def open_argoverse(log: Path, asked: Path | None) -> RecordedSequence:
         T_any_camera = poses_near(_poses(driven) @ T_ego_camera, known, stamps, log / _POSES)
     except (KeyError, TypeError, ValueError) as error:
         raise SequenceError(f"the tables in {log} are not those of Argoverse 2: {error!r}; copy them again") from error
-    describe_unknown(T_any_camera, log / _POSES)
     camera = own_camera(own, asked, stored, log, log.parent)
-    images, intrinsics = calibrated(stored, camera, str(log))
     return RecordedSequence(
         name=log.name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"argoverse2/{log.name}"),),
         T_any_camera=T_any_camera,
-        camera_height_m=camera.height_or(None),
         T_camera_lidar=se3.invert(T_ego_camera),
         scans=_scans(log / _SCANS, stamps),
     )

@@ -114,6 +114,12 @@ def beside(*folders: Path) -> CameraFile | None:
     return None if path is None else read_camera_file(path)
 
 
+def height_beside(usual_m: float | None, *folders: Path) -> float | None:
+    """The camera's height by the first ``camera.yaml`` found in ``folders``; ``usual_m`` where none says it."""
+    found = beside(*folders)
+    return usual_m if found is None else found.height_or(usual_m)
+
+
 def is_field_of_view(given: Path) -> bool:
     """Whether the user named a field of view, not a file."""
     return str(given).startswith("fov=")

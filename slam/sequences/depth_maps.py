@@ -36,6 +36,12 @@ class DepthMaps:
         return np.where(values == self.unknown, 0, values) / self.per_metre
 
 
+def depth_maps_of(paths: list[Path], per_metre: float, unknown: int = 0) -> DepthMaps | None:
+    """The depth maps of the frames whose files are there; None where there are none."""
+    found = {row: path for row, path in enumerate(paths) if path.is_file()}
+    return DepthMaps(found, per_metre, unknown) if found else None
+
+
 def depth_maps_in(folder: Path, images: NumberedFiles) -> DepthMaps | None:
     """The depth maps of a folder, by the numbers of the images; None where there are none."""
     found = (path for path in folder.glob("*.png") if path.stem.isdecimal()) if folder.is_dir() else ()

@@ -21,9 +21,8 @@ from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import describe_unknown, poses_near, poses_of
-from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, require_stamps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.poses import poses_near, poses_of
+from slam.sequences.recording import RecordedSequence, Source, require_stamps
 
 logger = logging.getLogger(__name__)
 
@@ -59,18 +58,15 @@ def open_euroc(body: Path, asked: Path | None) -> RecordedSequence:
     stored = ImageFiles(files)
     sensor = folder / "sensor.yaml"
     camera = own_camera(lambda: _read_sensor(sensor).camera(), asked, stored, body, body.parent)
-    images, intrinsics = calibrated(stored, camera, str(folder))
     stamps = require_stamps(stamps[: files.first + len(files)], table, files)
-    require_short_gaps(files, stamps)
     name = body.parent.name
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"euroc/{name}"),),
         T_any_camera=_true_poses(body / _TRUTH, stamps, sensor),
-        camera_height_m=camera.height_or(None),
     )
 
 
@@ -152,9 +148,7 @@ def _true_poses(folder: Path, stamps: FloatArray, camera: Path) -> FloatArray | 
     sensor = folder / "sensor.yaml"
     T_body_sensor = _read_sensor(sensor).T_body_sensor() if sensor.exists() else np.eye(4)
     T_any_body = T_any_sensor @ se3.invert(T_body_sensor)
-    T_any_camera = poses_near(T_any_body @ _read_sensor(camera).T_body_sensor(), known, stamps, table)
-    describe_unknown(T_any_camera, table)
-    return T_any_camera
+    return poses_near(T_any_body @ _read_sensor(camera).T_body_sensor(), known, stamps, table)
 
 
 def _rows(table: Path) -> list[list[str]]:

@@ -7,7 +7,8 @@ from typing import Protocol
 from slam.frames import Frame, Sequence
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.recording import Source, labels, require_frame
+from slam.sequences.recording import RecordedSequence, Source, labels, require_frame
+from slam.sequences.undistortion import UndistortedImages, Undistortion
 
 
 class SourcedSequence(Sequence, Protocol):
@@ -65,6 +66,13 @@ class Excerpt:
     def provenance(self) -> tuple[str, ...]:
         """Names of the recordings, as in the leak record of a checkpoint."""
         return labels(self.sources, len(self))
+
+
+def undistortion_of(recording: Sequence) -> Undistortion | None:
+    """What a recording does with its images as it reads them; None where they have no distortion."""
+    base = recording.base if isinstance(recording, Excerpt) else recording
+    images = base.images if isinstance(base, RecordedSequence) else None
+    return images.undistortion if isinstance(images, UndistortedImages) else None
 
 
 def frame_range(text: str, frames: int) -> tuple[int, int]:

@@ -13,8 +13,7 @@ from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.recording import RecordedSequence, Source, read_stamps, require_short_gaps, uniform_stamps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.recording import RecordedSequence, Source, read_stamps, uniform_stamps
 
 TIMES = "times.txt"
 
@@ -33,17 +32,14 @@ def open_folder(folder: Path, asked: Path | None) -> RecordedSequence:
     stored = ImageFiles(files)
     places = (where, folder, folder.absolute().parent)
     camera = find_camera_file(asked, *places, wanted_by=f"images in {where}", images=stored)
-    images, intrinsics = calibrated(stored, camera, str(where))
     stamps = _stamps((where / TIMES, folder / TIMES), files, camera.fps)
-    require_short_gaps(files, stamps)
     name = recording_name(folder)
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"folder/{name}"),),
-        camera_height_m=camera.height_or(None),
     )
 
 

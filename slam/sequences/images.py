@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from erfsfm.common.readers.images import first_usual, read_image
 from erfsfm.common.readers.numbering import NumberedFiles
 from slam.frames import Image
 from slam.runtime.errors import MissingFrameError, SequenceError
 
 MAX_GAP_FRAMES = 100
+
+
+class ImageSource(Protocol):
+    """Images of one size, read one at a time."""
+
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        """Number of images."""
+        ...
+
+    def read(self, index: int) -> Image:
+        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
+        ...
 
 
 class ImageFiles:

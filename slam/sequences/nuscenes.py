@@ -21,8 +21,7 @@ from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import poses_of
-from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_short_gaps, require_stamps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.recording import RecordedSequence, ScanReader, Source, require_stamps
 
 _CAMERA, _LIDAR = "CAM_FRONT", "LIDAR_TOP"
 _TABLES = "v1.0-*"
@@ -59,16 +58,13 @@ def open_nuscenes(root: Path, tables: Path, scene: str, asked: Path | None) -> R
         raise SequenceError(f"the tables in {tables} are not those of nuScenes: {error!r}; copy them again") from error
     stored = ImageFiles(files)
     camera = own_camera(own, asked, stored, root)
-    images, intrinsics = calibrated(stored, camera, f"{scene} in {root}")
-    require_short_gaps(files, stamps)
     return RecordedSequence(
         name=scene,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"nuscenes/{scene}", first=files.first),),
         T_any_camera=T_world_ego @ T_ego_camera,
-        camera_height_m=camera.height_or(None),
         T_camera_lidar=T_camera_lidar,
         scans=scans,
     )

@@ -1,4 +1,4 @@
-"""True poses at the stamps of images."""
+"""True poses at the stamps of images, and as one file a frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from erfsfm.common.files import read_text
 from slam.frames import runs
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
@@ -19,6 +20,7 @@ logger = logging.getLogger(__name__)
 _MAX_GAP_S = 0.1
 _FARTHEST = 1e12
 _LENGTH_TOLERANCE = 0.1  # of quaternions, which are written with few digits
+_ROTATION_TOLERANCE = 0.01  # 7-Scenes writes seven digits, ScanNet six
 
 
 def rebased(T_any_camera: FloatArray) -> FloatArray:
@@ -54,13 +56,15 @@ def interpolated_poses(T_any_camera: FloatArray, known: FloatArray, stamps: Floa
 
 
 def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, path: Path) -> FloatArray:
-    """Poses as of `interpolated_poses`; NaN where the nearest known pose is more than 0.1 s away.
+    """Poses as of `interpolated_poses`; NaN, with a warning, where the nearest known pose is more than 0.1 s away.
 
     Raises:
         SequenceError: the stamps of the poses, which were read from ``path``, do not increase.
     """
+    T_near = np.full((len(stamps), 4, 4), np.nan)
     if len(known) < 2:
-        return np.full((len(stamps), 4, 4), np.nan)
+        describe_unknown(T_near, path)
+        return T_near
     if not (np.diff(known) > 0).all():
         raise SequenceError(
             f"{path} row {int(np.argmin(np.diff(known) > 0)) + 2}: stamps must increase; correct the row"
@@ -69,6 +73,7 @@ def poses_near(T_any_camera: FloatArray, known: FloatArray, stamps: FloatArray, 
     gap = np.minimum(np.abs(stamps - known[before]), np.abs(known[before + 1] - stamps))
     T_near = interpolated_poses(T_any_camera, known, stamps)
     T_near[gap > _MAX_GAP_S] = np.nan
+    describe_unknown(T_near, path)
     return T_near
 
 
@@ -91,3 +96,26 @@ def describe_unknown(T_any_camera: FloatArray, path: Path) -> None:
 def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:
     """Which of the poses ``(N, 4, 4)`` are known."""
     return np.asarray(np.isfinite(T_any_camera).all(axis=(1, 2)))
+
+
+def read_pose_files(paths: list[Path]) -> FloatArray:
+    """``T_any_camera`` ``(N, 4, 4)`` of files, NaN where one is missing or its numbers are not finite (tracking lost).
+
+    Raises:
+        SequenceError: a file holds other than 16 numbers, or no pose.
+    """
+    T_any_camera = np.full((len(paths), 4, 4), np.nan)
+    for k, path in enumerate(paths):
+        if not path.exists():
+            continue
+        try:
+            pose = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
+        except (OSError, ValueError) as error:
+            raise SequenceError(f"{path} must hold the 4 x 4 numbers of a pose: {error}") from error
+        if not np.isfinite(pose).all():
+            continue
+        if not se3.is_se3(pose, _ROTATION_TOLERANCE):
+            raise SequenceError(f"{path} holds no pose: its 3 x 3 part is not a rotation")
+        pose[:3, :3] = se3.nearest_rotation(pose[:3, :3])
+        T_any_camera[k] = pose
+    return T_any_camera

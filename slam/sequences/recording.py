@@ -9,22 +9,25 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from collections.abc import Sequence as Items
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from erfsfm.common.files import read_text
+from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import NumberedFiles
-from slam.frames import Frame, Image, Intrinsics
+from erfsfm.common.readers.scan import read_velodyne
+from slam.frames import Frame, Intrinsics
 from slam.geometry.se3 import FloatArray, is_se3
 from slam.runtime.errors import SequenceError, sequence_errors
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.gps import FASTEST_M_S
-from slam.sequences.images import too_long
+from slam.sequences.images import ImageFiles, ImageSource, too_long
 from slam.sequences.poses import known_poses, rebased
+from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
@@ -34,21 +37,6 @@ _USUAL_PERIODS_S = (1e-3, 5.0)
 _RIGID_TOLERANCE = 0.01
 _LONG_PAUSE_S, _LONG_PAUSE_PERIODS = 30.0, 50.0
 ScanReader = Callable[[], FloatArray]  # the points (P, 3) of a LiDAR scan, metres, in the LiDAR
-
-
-class ImageSource(Protocol):
-    """Images of one size, read one at a time."""
-
-    width: int
-    height: int
-
-    def __len__(self) -> int:
-        """Number of images."""
-        ...
-
-    def read(self, index: int) -> Image:
-        """One image ``(height, width, 3)`` uint8 RGB; ``SequenceError`` or ``DataError`` where it cannot be read."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -87,28 +75,41 @@ def labels(sources: Items[Source], frames: int) -> tuple[str, ...]:
 class RecordedSequence:
     """Frames from an ``ImageSource``; the attributes are those of ``slam.frames.Sequence``.
 
-    ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown; ``reference`` follows from them where
-    all are known. ``depth_maps`` are the true depth beside the images, where there is any.
+    ``camera`` took the images as they are stored: where its lens is distorted they are undistorted as they are read,
+    and ``depth_maps``, the true depth beside the stored images, are left out. ``usual_height_m`` is the height of a
+    camera that does not say its own. ``T_any_camera`` ``(N, 4, 4)`` are true poses in any world, NaN where unknown;
+    ``reference`` follows from them where all are known.
     """
 
     name: str
     images: ImageSource
-    intrinsics: Intrinsics
+    camera: InitVar[CameraFile | Intrinsics]
     stamps: FloatArray
     sources: tuple[Source, ...]
     T_any_camera: FloatArray | None = None
-    camera_height_m: float | None = None
+    usual_height_m: InitVar[float | None] = None
     T_camera_lidar: FloatArray | None = None
     scans: dict[int, ScanReader] = field(default_factory=dict)
     depth_maps: DepthMaps | None = None
+    intrinsics: Intrinsics = field(init=False)
+    camera_height_m: float | None = field(init=False)
     reference: FloatArray | None = field(default=None, init=False)
 
-    def __post_init__(self) -> None:
-        """Check the rate of the frames and rebase the poses.
+    def __post_init__(self, camera: CameraFile | Intrinsics, usual_height_m: float | None) -> None:
+        """Check images, camera and stamps against each other, and rebase the poses.
 
         Raises:
-            SequenceError: the stamps cannot be seconds, or the LiDAR's calibration is not rigid.
+            SequenceError: the images have another size than the camera, or its lens cannot be undistorted; a gap in
+                their numbers is too long; the stamps cannot be seconds; the LiDAR's calibration is not rigid.
         """
+        if isinstance(self.images, ImageFiles):
+            require_short_gaps(self.images.files, self.stamps)
+        if isinstance(camera, CameraFile):
+            self.images, self.intrinsics = calibrated(self.images, camera, self.name)
+            self.camera_height_m = camera.height_or(usual_height_m)
+            self.depth_maps = None if camera.is_distorted else self.depth_maps
+        else:
+            self.intrinsics, self.camera_height_m = camera, usual_height_m
         _require_plausible_rate(self.name, self.stamps)
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
             raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
@@ -260,6 +261,12 @@ def require_stamps(stamps: FloatArray, path: Path, files: NumberedFiles) -> Floa
         return stamps[skipped:]
     spread: FloatArray = np.interp(np.arange(len(files)), rows, stamps)
     return spread
+
+
+def scans_in(folder: Path, files: NumberedFiles) -> dict[int, ScanReader]:
+    """The LiDAR scans of a folder of KITTI by frame, by the numbers of the images."""
+    paths = (path for path in folder.glob("*.bin") if path.stem.isdecimal())
+    return {int(path.stem) - files.first: partial(read_velodyne, path) for path in paths}
 
 
 def require_short_gaps(files: NumberedFiles, stamps: FloatArray) -> None:

@@ -13,13 +13,11 @@ from erfsfm.common.readers.images import has_images, list_images
 from erfsfm.common.readers.numbering import by_name
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import Sized, own_camera
-from slam.sequences.depth_maps import DepthMaps
+from slam.sequences.depth_maps import depth_maps_of
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.pose_files import read_pose_files
-from slam.sequences.poses import describe_unknown
-from slam.sequences.recording import RecordedSequence, Source, require_short_gaps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.poses import describe_unknown, read_pose_files
+from slam.sequences.recording import RecordedSequence, Source
 
 _INTRINSICS = "intrinsic/intrinsic_color.txt"
 _FPS = 30.0
@@ -40,24 +38,20 @@ def open_scannet(folder: Path, asked: Path | None) -> RecordedSequence:
     files = by_name(paths)
     stored = ImageFiles(files)
     camera = own_camera(partial(_camera, folder / _INTRINSICS, stored), asked, stored, folder)
-    images, intrinsics = calibrated(stored, camera, str(folder))
     there = [int(path.stem) for path in files.paths]
     numbers = np.interp(np.arange(len(files)), files.rows, there).round().astype(int).tolist()
     stamps = np.array(numbers) / _FPS
-    require_short_gaps(files, stamps)
     T_any_camera = read_pose_files([folder / "pose" / f"{k}.txt" for k in numbers])
     describe_unknown(T_any_camera, folder / "pose")
-    depth = {row: folder / "depth" / f"{k}.png" for row, k in enumerate(numbers)}
-    depth = {row: path for row, path in depth.items() if path.is_file()}
+    depth = [folder / "depth" / f"{k}.png" for k in numbers]
     return RecordedSequence(
         name=folder.name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"scannet/{folder.name}", first=numbers[0]),),
         T_any_camera=T_any_camera,
-        camera_height_m=camera.height_or(None),
-        depth_maps=DepthMaps(depth, _PER_METRE) if depth and images is stored else None,
+        depth_maps=depth_maps_of(depth, _PER_METRE),
     )
 
 

@@ -12,13 +12,11 @@ from erfsfm.common.readers.camera_file import CameraFile
 from erfsfm.common.readers.numbering import by_table
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
-from slam.sequences.depth_maps import DepthMaps
+from slam.sequences.depth_maps import depth_maps_of
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.pose_files import read_pose_files
-from slam.sequences.poses import describe_unknown, known_poses
-from slam.sequences.recording import RecordedSequence, Source, require_short_gaps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.poses import describe_unknown, known_poses, read_pose_files
+from slam.sequences.recording import RecordedSequence, Source
 
 _IMAGE = re.compile(r"frame-(\d{6})\.color\.png")
 _FPS = 30.0
@@ -40,24 +38,20 @@ def open_seven_scenes(folder: Path, asked: Path | None) -> RecordedSequence:
     files = by_table([folder / f"frame-{k:06d}.color.png" for k in frames], folder)
     stored = ImageFiles(files)
     camera = own_camera(lambda: _PUBLISHED, asked, stored, folder, folder.parent)
-    images, intrinsics = calibrated(stored, camera, str(folder))
     stamps = np.array(frames) / _FPS
-    require_short_gaps(files, stamps)
     T_any_camera = read_pose_files([folder / f"frame-{k:06d}.pose.txt" for k in frames])
     if known_poses(T_any_camera).any():
         describe_unknown(T_any_camera, folder)
-    depth = {row: folder / f"frame-{k:06d}.depth.png" for row, k in enumerate(frames)}
-    depth = {row: path for row, path in depth.items() if path.is_file()}
+    depth = [folder / f"frame-{k:06d}.depth.png" for k in frames]
     name = f"{folder.parent.name}_{folder.name}"
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"7scenes/{name}", first=numbers[0]),),
         T_any_camera=T_any_camera,
-        camera_height_m=camera.height_or(None),
-        depth_maps=DepthMaps(depth, _PER_METRE, _UNKNOWN) if depth and images is stored else None,
+        depth_maps=depth_maps_of(depth, _PER_METRE, _UNKNOWN),
     )
 
 

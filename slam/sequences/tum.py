@@ -19,9 +19,8 @@ from slam.sequences.camera_file import beside, find_camera_file
 from slam.sequences.depth_maps import DepthMaps
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import describe_unknown, poses_near
+from slam.sequences.poses import poses_near
 from slam.sequences.recording import RecordedSequence, Source, require_stamps
-from slam.sequences.undistortion import calibrated
 
 INDEX_FILE = "rgb.txt"
 _DEPTH_INDEX = "depth.txt"
@@ -56,17 +55,15 @@ def open_tum(folder: Path, asked: Path | None) -> RecordedSequence:
     files = NumberedFiles(tuple(paths), tuple(range(len(paths))))
     stored = ImageFiles(files)
     camera = _camera(folder, stored, asked)
-    images, intrinsics = calibrated(stored, camera, str(folder))
     name = folder.absolute().name
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=require_stamps(stamps, folder / INDEX_FILE, files),
         sources=(Source(f"tum/{name}"),),
         T_any_camera=_true_poses(folder / "groundtruth.txt", stamps),
-        camera_height_m=camera.height_or(None),
-        depth_maps=_depth_maps(folder, stamps) if images is stored else None,
+        depth_maps=_depth_maps(folder, stamps),
     )
 
 
@@ -122,9 +119,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
     if not path.exists():
         return None
     truth = read_trajectory(path, format="tum")
-    T_any_camera = poses_near(truth.T_world_camera, truth.stamps, stamps, path)
-    describe_unknown(T_any_camera, path)
-    return T_any_camera
+    return poses_near(truth.T_world_camera, truth.stamps, stamps, path)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

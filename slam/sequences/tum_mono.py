@@ -16,9 +16,8 @@ from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import describe_unknown, poses_near, poses_of
-from slam.sequences.recording import RecordedSequence, Source, require_short_gaps, require_stamps
-from slam.sequences.undistortion import calibrated
+from slam.sequences.poses import poses_near, poses_of
+from slam.sequences.recording import RecordedSequence, Source, require_stamps
 
 _CAMERA, _TIMES, _TRUTH = "camera.txt", "times.txt", "groundtruthSync.txt"
 _LENS = "FOV"
@@ -38,18 +37,15 @@ def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
     files = by_name(list_images(folder / "images"))
     stored = ImageFiles(files)
     stamps = _stamps(folder / _TIMES, files)
-    require_short_gaps(files, stamps)
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     camera = own_camera(partial(_camera, folder / _CAMERA, fps), asked, stored, folder)
-    images, intrinsics = calibrated(stored, camera, str(folder))
     return RecordedSequence(
         name=folder.name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"tum_mono/{folder.name}"),),
         T_any_camera=_true_poses(folder / _TRUTH, stamps),
-        camera_height_m=camera.height_or(None),
     )
 
 
@@ -89,9 +85,7 @@ def _true_poses(path: Path, stamps: FloatArray) -> FloatArray | None:
         T_known = poses_of(rows[:, 1:4], rows[:, 4:])
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise SequenceError(f"{path} needs rows of stamp, position and quaternion: {error}") from error
-    T_any_camera = poses_near(T_known, rows[:, 0], stamps, path)
-    describe_unknown(T_any_camera, path)
-    return T_any_camera
+    return poses_near(T_known, rows[:, 0], stamps, path)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.readers.camera_file import CameraFile
-from slam.frames import DepthMap, Image, Intrinsics, Sequence, sampled_depth
+from slam.frames import DepthMap, Image, Intrinsics, sampled_depth
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.excerpt import Excerpt
-from slam.sequences.recording import ImageSource, RecordedSequence
+from slam.sequences.images import ImageSource
 
 logger = logging.getLogger(__name__)
 
@@ -142,14 +141,6 @@ class UndistortedImages:
     def read(self, index: int) -> Image:
         """One undistorted image ``(height, width, 3)`` uint8 RGB."""
         return self.undistortion.apply(self._images.read(index))
-
-
-def undistortion_of(recording: Sequence) -> Undistortion | None:
-    """What a recording does with its images as it reads them; None where they have no distortion."""
-    if isinstance(recording, Excerpt):
-        return undistortion_of(recording.base)
-    images = recording.images if isinstance(recording, RecordedSequence) else None
-    return images.undistortion if isinstance(images, UndistortedImages) else None
 
 
 def calibrated(images: ImageSource, camera: CameraFile, where: str) -> tuple[ImageSource, Intrinsics]:

@@ -14,7 +14,6 @@ from slam.geometry.se3 import FloatArray
 from slam.sequences.camera_file import find_camera_file
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.recording import RecordedSequence, Source, uniform_stamps
-from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
@@ -32,14 +31,12 @@ def open_video(path: Path, asked: Path | None) -> RecordedSequence:
     folder = path.absolute().parent
     frames = VideoFrames(path)
     camera = find_camera_file(asked, folder, wanted_by=f"video {path}", images=frames, fps=frames.fps)
-    images, intrinsics = calibrated(frames, camera, str(path))
     return RecordedSequence(
         name=clip_name(path),
-        images=images,
-        intrinsics=intrinsics,
+        images=frames,
+        camera=camera,
         stamps=_stamps(path, frames, camera.fps),
         sources=(Source(f"folder/{video_name(path)}"),),
-        camera_height_m=camera.height_or(None),
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory
 from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
 from slam.results.folder import RunFolder
@@ -24,10 +25,7 @@ G2O = (
     "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 0 0 1 0 0 0 1\n"
     "EDGE_SE3:QUAT 0 1 0 0 1 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n"
 )
-PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 1\n1 0 1\n0 -2 1\n3 0 1 2\n"
-)
+CORNERS = np.array([(0, 0, 1), (1, 0, 1), (0, -2, 1)], [(axis, "<f4") for axis in "xyz"])
 
 
 def drive(frames: int, step_m: float, yaw_bias: float) -> FloatArray:
@@ -147,8 +145,8 @@ def make_run(tmp_path: Path) -> MakeRun:
         if reference:
             folder.write_trajectory("reference", Trajectory(stamps, drive(300, 1.0, 0.0)))
         folder.write_text("graph.g2o", G2O)
-        folder.write_text("map_mesh.ply", PLY)
-        folder.write_text("map_cloud.ply", PLY)
+        write_ply(folder.path / "map_mesh.ply", Ply(CORNERS, np.array([[0, 1, 2]])))
+        write_ply(folder.path / "map_cloud.ply", Ply(CORNERS))
         folder.write_text("config.yaml", "scale:\n  mode: auto\n")
         folder.write_text("loops.json", '{"accepted": [{"from": 295, "to": 2}], "rejected": []}\n')
         folder.write_metrics(

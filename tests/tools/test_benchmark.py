@@ -133,6 +133,25 @@ def test_hazards_are_all_at_once_and_name_their_clean_drive(plan: ModuleType, tm
     assert hard.simulate == (*clean.simulate, "--hazards", "moving-cars,exposure,blur,stop,rain")
 
 
+def test_full_size_has_worlds_and_originals_of_kitti(
+    benchmark: ModuleType, plan: ModuleType, page: ModuleType, work: ModuleType, tmp_path: Path
+) -> None:
+    for root, name in zip(plan.ORIGINALS, ("00", "03"), strict=True):
+        images = tmp_path / "data" / root / "sequences" / name / "image_2"
+        images.mkdir(parents=True)
+        cv2.imwrite(str(images / "000000.png"), np.zeros((375, 1242, 3), np.uint8))
+    words = ["full-size", "--data", str(tmp_path / "data"), "--output", str(tmp_path / "out")]
+    options = benchmark._parser().parse_args(words)
+    jobs = benchmark._jobs(options)
+    names = [job.drive.name for job in jobs]
+    assert names == ["loop 610", "loop 611", "straight 610", "straight 611", "KITTI 00", "KITTI 03"]
+    assert jobs[0].drive.root.name == "loop-610-300-1242x375-v1"
+    assert jobs[0].drive.simulate[-4:] == ("--width", "1242", "--height", "375")
+    assert benchmark._command(options).startswith("python tools/benchmark.py full-size --data DATA --weights default")
+    text = page.section("full-size", "", [work.JobResult(job, metrics(), "abc") for job in jobs], "1")
+    assert text.startswith("## Full-size") and "| KITTI 03 | default | 100 |" in text and "![" not in text
+
+
 def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
 ) -> None:

@@ -74,11 +74,15 @@ An experiment beside these runs, kiss-icp on the point clouds of learned depth, 
 
 
 def accuracy_tables(results: Sequence[JobResult]) -> str:
+    """The errors and a picture of every drive."""
+    return error_tables(results, f"\n\n![every drive from above]({PICTURE})" if drawable(results) else "")
+
+
+def error_tables(results: Sequence[JobResult], picture: str = "") -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
     definitions = (FRAMES, LENGTH, *ERRORS, PERCENT, OF_NETWORK, R_REL, SCALE)
     definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
-    picture = f"\n\n![every drive from above]({PICTURE})" if drawable(results) else ""
     return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
 trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
@@ -148,6 +152,7 @@ Sizes and cost:
 
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
+    "full-size": error_tables,
     "ablation": ablation_tables,
     "speed": speed_tables,
     "maps": maps_tables,

@@ -92,6 +92,8 @@ _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "no loops": ("loops.enabled=false",),
 }
 MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _MAP_PARTS.items()))
+FULL_SIZE = 1242, 375  # pixels of KITTI's colour cameras
+ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
 GROWTH = Configuration("no fusion", (*QUIET, "mapping.enabled=false"))
 
 
@@ -154,16 +156,20 @@ def worlds(
     frames: int,
     conditions: Sequence[Condition] = ("clean",),
     truth: Sequence[Literal["depth"]] = (),
+    size: tuple[int, int] | None = None,
 ) -> list[BenchmarkSequence]:
     """Simulated drives, in folders named by all parameters of the simulation; ``hazards`` are all of them at once.
 
-    ``truth`` is what is written beside the images.
+    ``truth`` is what is written beside the images, ``size`` their width and height in place of the simulator's own.
     """
     from slam.simulation.hazards import Hazard
     from slam.simulation.street import VERSION
 
-    every_hazard, beside = ",".join(get_args(Hazard)), "".join(f"-{kind}" for kind in truth)
-    flags = [f"--{kind}" for kind in truth]
+    every_hazard = ",".join(get_args(Hazard))
+    flags, beside = [f"--{kind}" for kind in truth], "".join(f"-{kind}" for kind in truth)
+    if size is not None:
+        flags += ["--width", str(size[0]), "--height", str(size[1])]
+        beside += f"-{size[0]}x{size[1]}"
 
     def world(route: str, seed: int, condition: Condition) -> BenchmarkSequence:
         name, words = f"{route} {seed}", ("--route", route, "--seed", str(seed), "--frames", str(frames), *flags)
@@ -178,6 +184,11 @@ def worlds(
         )
 
     return [world(route, seed, condition) for condition in conditions for route in routes for seed in seeds]
+
+
+def original_recordings(data: Path) -> list[BenchmarkSequence]:
+    """Stretches of KITTI odometry at the size of its cameras, in a folder of recordings as the tests use it."""
+    return [drive for root in ORIGINALS for drive in recordings(data / root, (), None)]
 
 
 def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[BenchmarkSequence]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from slam.commands.options import Config, Device, Overrides, Seed
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.progress import progress_bar
 from slam.runtime.storage.files import from_anywhere
@@ -31,11 +32,11 @@ def batch(
     ] = None,
     memory: Annotated[float, typer.Option(min=0, help="GiB that a drive may use; 0: all (Linux)")] = 0.0,
     weights: Annotated[str | None, typer.Option(help="as for run")] = None,
-    config: Annotated[str | None, typer.Option(help="as for run")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
+    config: Config = None,
+    overrides: Overrides = None,
     frames: Annotated[str | None, typer.Option(help="A:B of every drive")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")] = 0,
-    device: Annotated[str, typer.Option(help="where the networks run: auto, cpu or cuda")] = "auto",
+    seed: Seed = 0,
+    device: Device = "auto",
 ) -> None:
     """Many drives at once, each in a process of its own. Started again, it runs what is not whole.
 

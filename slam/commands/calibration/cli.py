@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from slam.commands.options import UnusedDevice, UnusedSeed
 from slam.runtime.progress import progress_bar
-from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 verbs = typer.Typer()
 

@@ -10,7 +10,7 @@ import numpy as np
 from erfsfm.common.figure_file import save_figure
 from erfsfm.common.readers.camera_file import CameraFile
 from slam.commands.calibration.solve import Calibration
-from slam.sequences.recording import ImageSource
+from slam.sequences.images import ImageSource
 from slam.sequences.undistortion import Undistortion
 
 if TYPE_CHECKING:

@@ -23,8 +23,7 @@ from slam.runtime.errors import CalibrationError, sequence_errors
 from slam.runtime.progress import Progress
 from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
-from slam.sequences.images import ImageFiles
-from slam.sequences.recording import ImageSource
+from slam.sequences.images import ImageFiles, ImageSource
 from slam.sequences.undistortion import Undistortion
 
 _MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated

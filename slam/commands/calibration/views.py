@@ -12,7 +12,7 @@ from slam.frames import Grey, Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import CalibrationError
 from slam.runtime.progress import Progress
-from slam.sequences.recording import ImageSource
+from slam.sequences.images import ImageSource
 
 MOST_VIEWS = 40
 FEWEST_VIEWS = 8

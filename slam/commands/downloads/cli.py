@@ -10,7 +10,6 @@ import typer
 
 from slam.runtime.errors import DownloadError
 from slam.runtime.progress import progress_bar
-from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 verbs = typer.Typer()
 
@@ -26,8 +25,6 @@ def download(
         bool, typer.Option("--accept-licence", help="you accept the licence that is shown")
     ] = False,
     mirror: Annotated[str | None, typer.Option(help="address of the archives, in place of the official one")] = None,
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
 ) -> None:
     """One sequence of a public data set from its official server.
 

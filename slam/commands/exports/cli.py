@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from slam.commands.options import UnusedDevice, UnusedSeed
 from slam.runtime.progress import progress_bar
-from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 verbs = typer.Typer()
 
@@ -36,7 +36,7 @@ def export(
 ) -> None:
     """Parts of a run as files for other programs.
 
-    The mesh as PLY, OBJ or glTF, the cloud as PLY, LAS or LAZ (by the end of the name), the trajectory as KITTI or TUM,
+    The mesh as PLY or glTF, the cloud as PLY, LAS or LAZ (by the end of the name), the trajectory as KITTI or TUM,
     the graph as g2o, the run as a COLMAP model or as a nerfstudio scene (transforms.json and images), the map from
     above as a raster of heights and colours, or as an occupancy grid for ROS.
 

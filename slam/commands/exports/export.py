@@ -19,7 +19,6 @@ from slam.formats.colmap import write_colmap
 from slam.formats.g2o import check_g2o
 from slam.formats.gltf import write_gltf
 from slam.formats.las import write_las
-from slam.formats.obj import write_obj
 from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
@@ -36,7 +35,7 @@ from slam.runtime.storage.record import known
 Writer = Callable[[Path, Ply], None]
 
 _WRITERS: dict[str, dict[str, Writer]] = {
-    "mesh": {".ply": write_ply, ".obj": write_obj, ".glb": write_gltf, ".gltf": write_gltf},
+    "mesh": {".ply": write_ply, ".glb": write_gltf, ".gltf": write_gltf},
     "cloud": {".ply": write_ply, ".las": write_las, ".laz": write_las},
 }
 
@@ -55,7 +54,7 @@ def export(
 
     Args:
         folder: the run.
-        what: ``mesh`` (PLY, OBJ or glTF by the end of ``output``), ``cloud`` (PLY, LAS or LAZ), ``trajectory`` (the
+        what: ``mesh`` (PLY or glTF by the end of ``output``), ``cloud`` (PLY, LAS or LAZ), ``trajectory`` (the
             optimised one: TUM where ``output`` ends in ``.tum`` or ``.tum.txt``, else KITTI), ``graph`` (g2o),
             ``colmap`` (a model in text form), ``nerfstudio`` (images and ``transforms.json``), ``raster`` (heights
             and colours from above) or ``occupancy`` (a grid for ROS).

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.progress import Progress
 from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove, write_atomically
 from slam.runtime.storage.record import Missing, known
@@ -41,7 +41,7 @@ def write_scene(
     trajectory: Trajectory,
     cloud: Ply | None,
     dataset: Path | None,
-    progress: Callable[[str, int, int], None] | None,
+    progress: Progress | None,
 ) -> None:
     """Write ``images/``, ``points.ply`` and, last, ``transforms.json``.
 

@@ -23,7 +23,7 @@ _NAMES = {
 }
 _OURS = {"colmap": is_own_model, "nerfstudio": is_own_scene, "raster": is_own_raster}
 _BEGINNINGS = {
-    "mesh": {".ply": b"ply", ".obj": b"# erfsfm-slam", ".glb": b"glTF", ".gltf": b"{"},
+    "mesh": {".ply": b"ply", ".glb": b"glTF", ".gltf": b"{"},
     "cloud": {".ply": b"ply", ".las": b"LASF", ".laz": b"LASF"},
     "graph": {".g2o": b"VERTEX_SE3", ".txt": b"VERTEX_SE3"},
     "occupancy": {".yaml": b"", ".pgm": b"P5"},

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 
@@ -17,11 +16,13 @@ from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor
 from slam.commands.live.messages import Emit, corrected_message, pose_message
 from slam.commands.live.reader import EXPECTED
+from slam.commands.live.request import LiveRequest
 from slam.commands.live.sequence import StreamedSequence, calibration_of
 from slam.commands.live.source import open_source
 from slam.commands.live.view import Viewer
 from slam.commands.run.job import Job, Stream, complete
-from slam.commands.run.run import RunRequest, provenance_of
+from slam.commands.run.request import RunRequest
+from slam.commands.run.run import provenance_of
 from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.pipeline.batch import SlamPipeline
@@ -39,37 +40,6 @@ from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_rerun
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LiveRequest:
-    """All inputs of a live run.
-
-    Attributes:
-        source: number of a camera, address of a stream, a pipe, a video, or a folder being filled.
-        calibration: ``camera.yaml`` or ``fov=DEGREES``; None looks beside a folder or a video.
-        weights: a shipped name or a training output folder.
-        config: a YAML file or a shipped name.
-        overrides: ``section.key=value`` each.
-        output: the run folder; None makes ``results/<stamp>_<name>``.
-        seed: of everything random.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        command: recorded in the metrics.
-        wait_s: seconds without an image after which the stream has ended.
-        view: open the rerun viewer.
-    """
-
-    source: str
-    calibration: Path | None = None
-    weights: str = "default"
-    config: str | Path | None = None
-    overrides: tuple[str, ...] = ()
-    output: Path | None = None
-    seed: int = 0
-    device: str = "auto"
-    command: str = "slam.commands.live.run.run_live"
-    wait_s: float = 10.0
-    view: bool = False
 
 
 def run_live(request: LiveRequest, emit: Emit) -> RunFolder:
@@ -99,23 +69,23 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         check_output(request.output)
     if request.view:
         import_rerun("--view")
-    settings = load_config(request.config, request.overrides)
+    settings = load_config(request.config, request.overrides or ())
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
-    source = open_source(request.source, request.wait_s)
-    camera = calibration_of(request.source, request.calibration, source)
+    source = open_source(request.camera, request.wait)
+    camera = calibration_of(request.camera, request.calibration, source)
     source.fps = camera.fps
     intrinsics = StreamedSequence.intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
-    name = Path(request.source).stem or "live"
+    name = Path(request.camera).stem or "live"
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)
-    sequence = StreamedSequence(name, source, camera, request.wait_s)
+    sequence = StreamedSequence(name, source, camera, request.wait)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
     tracker = Tracker(predictor.sources, sequence.camera_height_m, settings, networks.noise)
     session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
-        dataset=request.source,
+        dataset=Path(request.camera),
         camera=request.calibration,
         weights=request.weights,
         output=request.output,

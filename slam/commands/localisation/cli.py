@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
+from slam.commands.options import Json, UnusedDevice, UnusedSeed
 from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
-from slam.runtime.unused_options import UnusedDevice, UnusedSeed
 
 verbs = typer.Typer()
 
@@ -28,7 +28,7 @@ def localize(
         Path | None, typer.Option(help="KITTI or TUM poses, a row an image, in the world of the run's reference")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="TUM file for the poses found; image numbers as stamps")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON instead of a table")] = False,
+    as_json: Json = False,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, TypedDict, Unpack
-
-from pydantic import Field, ValidationError
-from pydantic.dataclasses import dataclass
+from typing import Any
 
 from erfsfm import __version__
-from erfsfm.common.config_tree import first_problem
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
@@ -27,6 +22,7 @@ from slam.commands.run.continuation import (
     warn_of_other_noise,
 )
 from slam.commands.run.job import Job, complete
+from slam.commands.run.request import RunRequest
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.batch import SlamPipeline
@@ -34,92 +30,22 @@ from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_folder import FrameNumbers
 from slam.prediction.depth_source import DepthSource, mixed_sha256
 from slam.results.folder import RunFolder
-from slam.results.metrics import Provenance, Recording
+from slam.results.metrics import Provenance
 from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_rerun
-from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
-from slam.runtime.storage.record import MISSING, Missing, known
+from slam.runtime.storage.record import MISSING, Missing
 from slam.sequences.catalogue import open_sequence
-from slam.sequences.excerpt import Excerpt
+from slam.sequences.excerpt import Excerpt, undistortion_of
 from slam.sequences.gps import read_gps
-from slam.sequences.undistortion import undistortion_of
 
 logger = logging.getLogger(__name__)
 
 
-class RunOptions(TypedDict, total=False):
-    """Keyword arguments of `run_slam`; defaults and meanings as in `RunRequest`."""
-
-    camera: str | Path | None
-    weights: str | Path
-    config: str | Path | None
-    overrides: Sequence[str]
-    frames: str | None
-    output: str | Path | None
-    seed: int | None
-    device: str
-    progress: Progress | None
-    command: str
-    cache: str | Path | None
-    rerun: str | Path | None
-    continues: str | Path | None
-    gps: str | Path | None
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """All inputs of a run.
-
-    Attributes:
-        dataset: a recording of a kind that ``docs/recordings.md`` lists; None with no
-            ``sequence`` is the embedded simulated street.
-        sequence: name inside the data set.
-        camera: ``camera.yaml`` in place of the one beside the images or their calibration, or ``fov=DEGREES``.
-        weights: a shipped name or a training output folder.
-        config: a YAML file or a shipped name; None for the defaults.
-        overrides: ``section.key=value`` each.
-        frames: ``A:B``, half-open.
-        output: the run folder itself; None makes ``results/<stamp>_<sequence>``.
-        seed: of everything random; None is 0, or that of the run to continue.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        progress: called with (stage, done, total).
-        command: recorded in the metrics.
-        cache: folder of network outputs; None computes all of them.
-        rerun: ``.rrd`` file to write for the rerun viewer, an optional extra.
-        continues: a run folder whose last frame comes right before the first of these, by the same camera; its
-            configuration is used, and the new folder has the whole drive. A run that did not end goes on in its own
-            folder, with its recording, weights and seed.
-        gps: a track of the drive, CSV or NMEA, see ``docs/gps.md``; None is that of the run to continue.
-    """
-
-    dataset: str | Path | None = None
-    sequence: str | None = None
-    camera: Path | None = None
-    weights: str | Path = "default"
-    config: str | Path | None = None
-    overrides: Sequence[str] = ()
-    frames: str | None = None
-    output: Path | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**31)] | None = None
-    device: str = "auto"
-    progress: Progress | None = None
-    command: str = "slam.run_slam"
-    cache: Path | None = None
-    rerun: Path | None = None
-    continues: Path | None = None
-    gps: Path | None = None
-
-
-def run_slam(
-    dataset: str | Path | None = None, sequence: str | None = None, **options: Unpack[RunOptions]
-) -> RunFolder:
+def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
     """Run the whole system on one sequence.
-
-    All checks come before a folder is made. An earlier run in ``output`` stays until the
-    trajectories of this one are whole.
 
     Args:
         dataset: as in `RunRequest`.
@@ -131,15 +57,20 @@ def run_slam(
 
     Raises:
         TypeError: an unknown argument.
+        SlamError, ErfsfmError: as `perform`.
+    """
+    return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
+
+
+def perform(request: RunRequest) -> RunFolder:
+    """Run the whole system on one sequence.
+
+    All checks come before a folder is made. An earlier run in ``output`` stays until the
+    trajectories of this one are whole.
+
+    Raises:
         SlamError, ErfsfmError: one line. However a run ends, its folder keeps its results and the reason.
     """
-    unknown = options.keys() - RunOptions.__annotations__.keys()
-    if unknown:
-        raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
-    try:
-        request = RunRequest(dataset=dataset, sequence=sequence, **options)  # type: ignore[arg-type]  # text becomes a path
-    except ValidationError as error:
-        raise RunError(f"run_slam: {first_problem(error)}") from error
     with run_log() as log, raising_on_termination() as ignore_signals, FolderLock() as lock:
         return complete(*_begin(request, lock), log, ignore_signals)
 
@@ -149,11 +80,11 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
     before: Provenance | Missing = MISSING
     if request.continues is not None:
         _, metrics = RunFolder.open_with_metrics(request.continues)
-        provenance = provenance_to_resume(request.continues, metrics, request.output, _recording(request))
+        provenance = provenance_to_resume(request.continues, metrics, request.output, request.recording)
         if provenance is not None:
             lock.take(whole_place(request.continues))
             return _resume(request, request.continues, provenance)
-        if not _recording(request).tree():
+        if not request.recording.tree():
             raise RunError(
                 f"name the frames that follow those of {request.continues} (--dataset, --frames): only what did not "
                 "end goes on without, in its own folder"
@@ -170,14 +101,7 @@ def _begin(request: RunRequest, lock: FolderLock) -> tuple[Job, RunFolder]:
 
 def _resume(request: RunRequest, place: Path, before: Provenance) -> tuple[Job, RunFolder]:
     """A run that did not end, on what it was run on, from its last kept state."""
-    recording = before.recording
-    places = {"dataset": recording.dataset, "camera": recording.camera, "gps": recording.gps}
-    files = {name: None if isinstance(place, Missing) else Path(place) for name, place in places.items()}
-    words = {"sequence": known(recording.sequence), "frames": known(recording.frames)}
-    weights = (known(before.weights) or "default") if request.weights == "default" else request.weights
-    seed = known(before.seed) if request.seed is None else request.seed
-    same = replace(request, **files, **words, weights=weights, seed=seed, output=place, continues=None)  # type: ignore[arg-type]
-    job = _prepare(same, place)
+    job = _prepare(request.resumed(before, place), place)
     warn_of_other_noise(place, before, job.provenance)
     logger.info("the run in %s goes on at frame %d", place, job.pipeline.first)
     return job, RunFolder.resume(place)
@@ -190,8 +114,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.rerun is not None:
         import_rerun("--rerun")
     settings = _settings(request, resumes)
-    dataset = None if request.dataset is None else Path(request.dataset)
-    recording = open_sequence(dataset, request.sequence, request.camera, request.frames)
+    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording
@@ -220,11 +143,12 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
 
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:
+    given = request.config, request.overrides or ()
     if resumes is not None:
-        return settings_to_resume(resumes, request.config, request.overrides)
+        return settings_to_resume(resumes, *given)
     if request.continues is not None:
-        return settings_to_continue(request.continues, request.config, request.overrides)
-    return load_config(request.config, request.overrides)
+        return settings_to_continue(request.continues, *given)
+    return load_config(*given)
 
 
 def _settings_from_anywhere(settings: SlamConfig) -> SlamConfig:
@@ -254,7 +178,7 @@ def provenance_of(
         command=request.command,
         seed=request.seed or 0,
         device=str(networks.device),
-        weights=from_anywhere(request.weights) if is_folder else str(request.weights),
+        weights=from_anywhere(request.weights) if is_folder else request.weights,
         weights_sha256=networks.sha256,
         noise_sha256=networks.noise_sha256 or Missing("no noise.yaml was measured with these weights"),
         weights_licence=networks.record.licence,
@@ -262,14 +186,5 @@ def provenance_of(
         leak=bool(networks.leaks(recording.provenance())),
         depth_source="network" if source is None else source.name,
         depth_sha256=networks.sha256 if source is None else source.sha256,
-        recording=_recording(request),
+        recording=request.recording,
     )
-
-
-def _recording(request: RunRequest) -> Recording:
-    """The options that name the recording."""
-    files = {"dataset": request.dataset, "camera": request.camera, "gps": request.gps}
-    named = {name: Path(path) for name, path in files.items() if path is not None}
-    places = {name: from_anywhere(path) for name, path in named.items()}
-    words = {"sequence": request.sequence, "frames": request.frames}
-    return Recording(**places | {name: word for name, word in words.items() if word is not None})

@@ -2,8 +2,8 @@
 
 A monocular step has a direction and no length. Three measurements give the length: points triangulated by two steps
 that share a frame give the ratio of both lengths; the road's homography gives it in camera heights; learned depth gives
-it in a unit that drifts. A vehicle's acceleration bounds the change of speed. In logarithms all of them are linear in the
-lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a step:
+it in a unit that drifts. A vehicle's acceleration bounds the change of speed. In logarithms all of them are linear in
+the lengths ``x`` and the unit's deviation ``b``, with ``t`` the duration of a step:
 
     x_k - x_{k-1} = ratio_k        x_k = road_k        x_k - b_k = learned_k        b_k - b_{k-1} = 0
     x_k - x_{k-1} = log(t_k / t_{k-1})
@@ -75,8 +75,8 @@ class StepLengths:
 
     Steps linked by ratios have correlated errors. Independent errors of ``relative_correlated_sigma`` ``(S,)``
     would add up along the drive as those do. ``unit_correction`` ``(S,)`` times the prior unit of learned depth is its
-    unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or changes from
-    the step before as no vehicle's does.
+    unit near that step. ``contradicted`` ``(S,)`` marks steps whose length is not what learned depth says, or changes
+    from the step before as no vehicle's does.
     """
 
     length: FloatArray

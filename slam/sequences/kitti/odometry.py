@@ -15,26 +15,23 @@ from erfsfm.common.readers.images import list_images
 from erfsfm.common.readers.kitti_calibration import CAMERA_HEIGHT_M, ODOMETRY_CALIBRATION, CalibrationFile
 from erfsfm.common.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_odometry_root, odometry_camera
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
-from erfsfm.common.readers.scan import read_velodyne
 from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
+from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.camera_file import explicit_camera, height_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
-from slam.sequences.kitti.calibration import moved_to_camera
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
-    ImageSource,
     RecordedSequence,
     Source,
     fallback_stamps,
     read_stamps,
-    require_short_gaps,
+    scans_in,
 )
-from slam.sequences.undistortion import calibrated
 
 
 def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:
@@ -52,27 +49,25 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
     files = by_number(list_images(folder / f"image_{number}"))
     stored = ImageFiles(files)
     stamps = _stamps(folder / "times.txt", files)
-    require_short_gaps(files, stamps)
     calibration = CalibrationFile(folder / ODOMETRY_CALIBRATION)
     T_camera_cam0 = calibration.T_camera_cam0(f"P{number}")
-    images: ImageSource = stored
-    camera = None if asked is None else explicit_camera(asked, stored)
-    if camera is None:
-        intrinsics = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
+    camera: CameraFile | Intrinsics
+    if asked is None:
+        camera = Intrinsics.of(calibration.pinhole(f"P{number}", stored.width, stored.height))
+        height_m = height_beside(CAMERA_HEIGHT_M, root.base)
     else:
-        images, intrinsics = calibrated(stored, camera, str(folder))
-    scans = (path for path in (folder / "velodyne").glob("*.bin") if path.stem.isdecimal())
+        camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(_source(root, name, files.first),),
         T_any_camera=_true_poses(root.base / "poses" / f"{name}.txt", files, stamps, T_camera_cam0),
-        camera_height_m=_camera_height(root, camera),
+        usual_height_m=height_m,
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
-        scans={int(path.stem) - files.first: partial(read_velodyne, path) for path in scans},
-        depth_maps=depth_maps_in(folder / f"depth_{number}", files) if images is stored else None,
+        scans=scans_in(folder / "velodyne", files),
+        depth_maps=depth_maps_in(folder / f"depth_{number}", files),
     )
 
 
@@ -101,15 +96,10 @@ def _true_poses(path: Path, files: NumberedFiles, stamps: FloatArray, T_camera_c
             f"the poses to match, or remove the file to run without a reference"
         )
     rows, skipped = assigned
-    T_world_camera = moved_to_camera(T_world_cam0[skipped:], T_camera_cam0)
+    T_world_camera = T_world_cam0[skipped:] @ se3.invert(T_camera_cam0)
     if len(rows) < len(files):
         T_world_camera = interpolated_poses(T_world_camera, stamps[rows], stamps)
     return T_world_camera
-
-
-def _camera_height(root: OdometryRoot, camera: CameraFile | None) -> float | None:
-    camera = camera or beside(root.base)
-    return CAMERA_HEIGHT_M if camera is None else camera.height_or(CAMERA_HEIGHT_M)
 
 
 def _T_camera_lidar(calibration: CalibrationFile, T_camera_cam0: FloatArray) -> FloatArray | None:

@@ -21,27 +21,23 @@ from erfsfm.common.readers.kitti_calibration import (
 from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES, RAW_CAMERAS, drive_name, find_drives
 from erfsfm.common.readers.kitti_oxts import read_packet
 from erfsfm.common.readers.numbering import NumberedFiles, by_number
-from erfsfm.common.readers.scan import read_velodyne
 from slam.frames import Intrinsics
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.camera_file import explicit_camera, height_beside
 from slam.sequences.depth_maps import depth_maps_in
 from slam.sequences.images import ImageFiles
 from slam.sequences.kitti import oxts
-from slam.sequences.kitti.calibration import moved_to_camera
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.poses import interpolated_poses
 from slam.sequences.recording import (
-    ImageSource,
     RecordedSequence,
     Source,
     fallback_stamps,
-    require_short_gaps,
     require_stamps,
+    scans_in,
 )
-from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
@@ -64,30 +60,27 @@ def open_kitti_raw(drive: Path, asked: Path | None) -> RecordedSequence:
         raise SequenceError(f"no images in {drive}: looked for png or jpg in {looked}; copy the drive again")
     files = by_number(list_images(drive / f"image_{number}" / "data"))
     stored = ImageFiles(files)
-    images: ImageSource = stored
     cameras = CalibrationFile(drive.parent / CAM_TO_CAM)
-    intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, images.width, images.height))
-    camera = None if asked is None else explicit_camera(asked, stored)
-    if camera is not None:
-        images, intrinsics = calibrated(images, camera, str(drive))
+    camera: CameraFile | Intrinsics = Intrinsics.of(cameras.rectified_pinhole(number, stored.width, stored.height))
+    height_m = height_beside(CAMERA_HEIGHT_M, drive, drive.parent, drive.parent.parent)
+    if asked is not None:
+        camera, height_m = explicit_camera(asked, stored), CAMERA_HEIGHT_M
     times_path = drive / f"image_{number}" / "timestamps.txt"
     image_times = _times(times_path, files)
     stamps = fallback_stamps(times_path, len(files)) if image_times is None else image_times - image_times[0]
-    require_short_gaps(files, stamps)
     T_camera_lidar = _T_camera_lidar(drive, cameras, number)
     name = drive_name(drive.name)
-    scans = (path for path in (drive / "velodyne_points/data").glob("*.bin") if path.stem.isdecimal())
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=tuple(source.shifted(files.first) for source in drive_sources(name)),
         T_any_camera=_true_poses(drive, files, stamps, image_times, T_camera_lidar),
-        camera_height_m=_camera_height(drive, camera),
+        usual_height_m=height_m,
         T_camera_lidar=T_camera_lidar,
-        scans={int(path.stem) - files.first: partial(read_velodyne, path) for path in scans},
-        depth_maps=depth_maps_in(drive / _DEPTH_MAPS / f"image_{number}", files) if images is stored else None,
+        scans=scans_in(drive / "velodyne_points/data", files),
+        depth_maps=depth_maps_in(drive / _DEPTH_MAPS / f"image_{number}", files),
     )
 
 
@@ -153,16 +146,10 @@ def _true_poses(
         ages_s = image_times[known] - packet_times[known + files.first - packets.first]
     content = np.array([read_packet(paths[files.first + row]) for row in rows])
     T_camera_imu = T_camera_lidar @ CalibrationFile(path).transform("R", "T")
-    T_world_camera = moved_to_camera(oxts.T_world_imu(content, ages_s), T_camera_imu)
+    T_world_camera = oxts.T_world_imu(content, ages_s) @ se3.invert(T_camera_imu)
     if len(known) < len(files):
         T_world_camera = interpolated_poses(T_world_camera, stamps[known], stamps)
     return T_world_camera
-
-
-def _camera_height(drive: Path, camera: CameraFile | None) -> float | None:
-    """By a camera file, given or in the drive, its date or the root; 1.65 m by default."""
-    camera = camera or beside(drive, drive.parent, drive.parent.parent)
-    return CAMERA_HEIGHT_M if camera is None else camera.height_or(CAMERA_HEIGHT_M)
 
 
 def _find(path: Path, asked: Asked) -> dict[str, Opener]:

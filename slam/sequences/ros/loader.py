@@ -21,7 +21,7 @@ from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import own_camera
 from slam.sequences.loader import Asked, Loader, Opener
-from slam.sequences.poses import describe_unknown, poses_near
+from slam.sequences.poses import poses_near
 from slam.sequences.recording import RecordedSequence, ScanReader, Source
 from slam.sequences.ros.bag import Bag, is_bag
 from slam.sequences.ros.messages import (
@@ -35,7 +35,6 @@ from slam.sequences.ros.messages import (
     points_of,
 )
 from slam.sequences.ros.transforms import StaticTransforms, transform_of
-from slam.sequences.undistortion import calibrated
 
 logger = logging.getLogger(__name__)
 
@@ -144,17 +143,15 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
     stamps = stored.messages.stamps
     fps = 1.0 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
     camera = own_camera(partial(_calibration, bag, topic, fps), asked, stored, path.absolute().parent)
-    images, intrinsics = calibrated(stored, camera, f"{topic} in {path}")
     mounted, frame = StaticTransforms(bag), bag.first(topic).header.frame_id
     T_camera_lidar, scans = _scans(bag, mounted, frame, stamps)
     return RecordedSequence(
         name=name,
-        images=images,
-        intrinsics=intrinsics,
+        images=stored,
+        camera=camera,
         stamps=stamps,
         sources=(Source(f"bag/{name}"),),
         T_any_camera=_true_poses(bag, mounted, frame, stamps),
-        camera_height_m=camera.height_or(None),
         T_camera_lidar=T_camera_lidar,
         scans=scans,
     )
@@ -197,9 +194,7 @@ def _true_poses(bag: Bag, mounted: StaticTransforms, camera: str, stamps: FloatA
         found = StampedMessages(bag, topic)
         messages = (found.read(k) for k in range(len(found)))
         T_any_body = np.stack([transform_of(m.pose.pose if hasattr(m, "pose") else m.transform) for m in messages])
-        T_any_camera = poses_near(T_any_body @ T_body_camera, found.stamps, stamps, bag.path)
-        describe_unknown(T_any_camera, bag.path)
-        return T_any_camera
+        return poses_near(T_any_body @ T_body_camera, found.stamps, stamps, bag.path)
     return None
 
 

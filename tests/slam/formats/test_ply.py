@@ -1,4 +1,4 @@
-"""Clouds are read as Open3D writes them, and as others do."""
+"""Clouds and meshes are read as they are written here and by Open3D."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.formats.ply import coloured_ply, read_ply, read_ply_points, write_ply
+from slam.formats.ply import coloured_ply, read_ply, write_ply
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 
@@ -15,33 +15,15 @@ POINTS = np.array([[0.0, 0.5, 1.0], [1.25, -2.0, 3.0]])
 COLOURS = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_what_open3d_writes(tmp_path: Path, text: bool) -> None:
+def test_what_open3d_writes(tmp_path: Path) -> None:
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(POINTS))
     cloud.normals = o3d.utility.Vector3dVector(np.tile([0.0, 1.0, 0.0], (2, 1)))
     cloud.colors = o3d.utility.Vector3dVector(COLOURS / 255)
-    o3d.io.write_point_cloud(str(tmp_path / "c.ply"), cloud, write_ascii=text)
-    points, colours = read_ply_points(tmp_path / "c.ply")
-    np.testing.assert_allclose(points, POINTS)
-    np.testing.assert_array_equal(colours, COLOURS)
-
-
-def test_text_with_faces_and_no_colours(tmp_path: Path) -> None:
-    lines = ["ply", "format ascii 1.0", "comment by hand", "element vertex 2"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [
-        "element face 1",
-        "property list uchar int vertex_indices",
-        "end_header",
-        "0 0.5 1",
-        "1.25 -2 3",
-        "3 0 1 1",
-    ]
-    (tmp_path / "c.ply").write_text("\n".join(lines) + "\n")
-    points, colours = read_ply_points(tmp_path / "c.ply")
-    np.testing.assert_allclose(points, POINTS)
-    assert (colours == 128).all()
+    o3d.io.write_point_cloud(str(tmp_path / "c.ply"), cloud)
+    ply = read_ply(tmp_path / "c.ply")
+    np.testing.assert_allclose(ply.points, POINTS)
+    np.testing.assert_array_equal(ply.colours, COLOURS)
 
 
 @pytest.mark.parametrize(
@@ -51,12 +33,13 @@ def test_text_with_faces_and_no_colours(tmp_path: Path) -> None:
         (b"ply\n", "it ends within its header"),
         (b"PK\x03\x04", ".+"),
         (b"ply\nformat binary_big_endian 1.0\nend_header\n", "its format is binary_big_endian"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "its format is ascii"),
     ],
 )
 def test_what_is_no_ply_is_one_error(tmp_path: Path, content: bytes, why: str) -> None:
     (tmp_path / "c.ply").write_bytes(content)
     with pytest.raises(RunError, match=rf"c\.ply is no PLY that can be read \({why}\)"):
-        read_ply_points(tmp_path / "c.ply")
+        read_ply(tmp_path / "c.ply")
 
 
 def test_a_truncated_cloud_is_one_error(tmp_path: Path) -> None:
@@ -64,7 +47,7 @@ def test_a_truncated_cloud_is_one_error(tmp_path: Path) -> None:
     header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
     (tmp_path / "c.ply").write_bytes(header.encode() + POINTS.tobytes())
     with pytest.raises(RunError, match="no PLY that can be read"):
-        read_ply_points(tmp_path / "c.ply")
+        read_ply(tmp_path / "c.ply")
 
 
 TRIANGLES = np.array([[0, 1, 0]])
@@ -78,7 +61,7 @@ def test_what_is_written_reads_back_here_and_in_open3d(tmp_path: Path, triangles
     ply = read_ply(path)
     np.testing.assert_array_equal(ply.columns(("x", "y", "z")), POINTS)
     np.testing.assert_array_equal(ply.columns(("nx", "ny", "nz")), NORMALS)
-    np.testing.assert_array_equal(read_ply_points(path)[1], COLOURS)
+    np.testing.assert_array_equal(ply.colours, COLOURS)
     o3d = import_open3d()
     if triangles is None:
         assert ply.triangles is None

@@ -6,7 +6,7 @@ import pytest
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.kitti_calibration import CalibrationFile
 from slam.geometry import se3
-from slam.sequences.kitti.calibration import moved_to_camera
+from slam.geometry.se3 import invert
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def test_lever_arm_by_hand(calibration) -> None:
     assert T_camera_cam0[:3, 3] == pytest.approx(
         [(45.38225 - 607.1928 * z) / 718.856, (-0.1130887 - 185.2157 * z) / 718.856, z]
     )
-    T_cam0_camera = moved_to_camera(np.eye(4)[None], T_camera_cam0)[0]
+    T_cam0_camera = invert(T_camera_cam0)
     assert T_cam0_camera[0, 3] == pytest.approx(-0.0599, abs=1e-4)
     # reference is P itself: it projects a point of camera 0 to where K projects the translated point
     point_cam0 = np.array([1.0, -0.5, 8.0])
@@ -40,7 +40,7 @@ def test_lever_arm_by_hand(calibration) -> None:
 def test_rotation_of_the_rig_translates_the_side_camera() -> None:
     T_camera_cam0 = se3.make(np.eye(3), np.array([0.5, 0.0, 0.0]))  # the camera is 0.5 m left of camera 0
     turn_right = se3.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]), np.zeros(3))
-    T_world_camera = moved_to_camera(np.stack([np.eye(4), turn_right]), T_camera_cam0)
+    T_world_camera = np.stack([np.eye(4), turn_right]) @ invert(T_camera_cam0)
     assert T_world_camera[:, :3, 3] == pytest.approx(np.array([[-0.5, 0, 0], [0, 0, 0.5]]), abs=1e-12)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from slam.commands.exports.export import export
 from slam.commands.exports.options import R_UP_WORLDS
-from slam.formats.ply import read_ply_points
+from slam.formats.ply import read_ply
 from slam.formats.trajectory import read_trajectory
 from slam.frames import Intrinsics
 from slam.loops.places import Places
@@ -42,8 +42,7 @@ def test_ply_is_copied_or_rotated_into_a_new_folder(make_run: MakeRun, tmp_path:
     copied = export(folder, what, tmp_path / "new" / "a.ply", "y-down")
     assert copied.read_bytes() == source.read_bytes()
     turned = export(folder, what, tmp_path / "new" / "b.ply", "z")
-    points, _ = read_ply_points(turned)
-    np.testing.assert_allclose(points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
+    np.testing.assert_allclose(read_ply(turned).points[2], [0, 1, 2])  # the vertex 2 m above the road, (0, -2, 1)
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.ply", "b.ply"]
 
 
@@ -104,8 +103,8 @@ def test_colmap_without_a_map_has_no_points(make_run: MakeRun, tmp_path: Path) -
     [
         ("colmap", "file", "y-down", "is a file: .* the name of a folder"),
         ("video", "out.mp4", "y-down", "unknown: choose one of mesh, cloud, trajectory, graph, colmap, nerfstudio"),
-        ("mesh", "out.stl", "y-down", r"written as \.ply, \.obj, \.glb, \.gltf; got 'out\.stl'"),
-        ("cloud", "out.obj", "y-down", r"written as \.ply, \.las, \.laz"),
+        ("mesh", "out.stl", "y-down", r"written as \.ply, \.glb, \.gltf; got 'out\.stl'"),
+        ("cloud", "out.glb", "y-down", r"written as \.ply, \.las, \.laz"),
         ("occupancy", "out.png", "z", r"ends in \.yaml"),
         ("raster", "file", "z", "is a file: a raster is several files"),
         ("nerfstudio", "file", "z", "is a file: a scene is several files"),

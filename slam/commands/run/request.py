@@ -1,0 +1,104 @@
+"""The inputs of a run: the options of the verb ``run`` and the arguments of `slam.run_slam`, written once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
+
+from erfsfm.common.config_tree import first_problem
+from slam.commands.options import LARGEST_SEED, Config, Device, Output, Overrides, Weights
+from slam.runtime.errors import RunError
+from slam.runtime.progress import Progress
+from slam.runtime.storage.files import from_anywhere
+from slam.runtime.storage.record import known
+
+if TYPE_CHECKING:
+    from slam.results.metrics import Provenance, Recording
+
+_RECORDING = ("dataset", "camera", "gps", "sequence", "frames")
+_AS_TEXT = BeforeValidator(lambda value: str(value) if isinstance(value, Path) else value)
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """All inputs of a run. Those with a help are options of the command line.
+
+    Without ``dataset`` and ``sequence`` the embedded simulated street is run. From Python, a path may be text.
+
+    Attributes:
+        progress: called with (stage, done, total).
+        command: recorded in the metrics.
+    """
+
+    dataset: Annotated[
+        Path | None, typer.Option(help="a data set, image folder or video: docs/recordings.md lists all kinds")
+    ] = None
+    sequence: Annotated[
+        str | None,
+        typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
+    ] = None
+    camera: Annotated[
+        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+    ] = None
+    weights: Annotated[Weights, _AS_TEXT] = "default"
+    config: Annotated[Config, _AS_TEXT] = None
+    overrides: Overrides = None
+    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None
+    output: Output = None
+    cache: Annotated[
+        Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
+    ] = None
+    rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None
+    continues: Annotated[
+        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
+    ] = None
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None
+    seed: Annotated[
+        int | None,
+        Field(ge=0, le=LARGEST_SEED),
+        typer.Option(min=0, max=LARGEST_SEED, help="of every random draw; default: 0, or that of the old run"),
+    ] = None
+    device: Device = "auto"
+    progress: Progress | None = None
+    command: str = "slam.run_slam"
+
+    @classmethod
+    def of(cls, **arguments: Any) -> RunRequest:
+        """The request of arguments given in Python, or read from a file.
+
+        Raises:
+            TypeError: an unknown argument.
+            RunError: a value of another kind.
+        """
+        unknown = arguments.keys() - {field.name for field in fields(cls)}
+        if unknown:
+            raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+        try:
+            return TypeAdapter(cls).validate_python(arguments)
+        except ValidationError as error:
+            raise RunError(f"run_slam: {first_problem(error)}") from error
+
+    @property
+    def recording(self) -> Recording:
+        """The options that name the recording, files by their whole paths."""
+        from slam.results.metrics import Recording
+
+        given = {name: getattr(self, name) for name in _RECORDING}
+        texts = {
+            name: from_anywhere(value) if isinstance(value, Path) else value
+            for name, value in given.items()
+            if value is not None
+        }
+        return Recording(**texts)
+
+    def resumed(self, before: Provenance, place: Path) -> RunRequest:
+        """The request of a run that did not end, to go on in its folder with what it was run on."""
+        named = dict.fromkeys(_RECORDING) | before.recording.tree()
+        weights = (known(before.weights) or "default") if self.weights == "default" else self.weights
+        seed = known(before.seed) if self.seed is None else self.seed
+        again = replace(self, weights=weights, seed=seed, output=place, continues=None)
+        return RunRequest.of(**vars(again) | named)

@@ -1,4 +1,4 @@
-"""The content of ``metrics.json`` (``docs/outputs.md``)."""
+"""The content of ``metrics.json`` (``docs/metrics.md``)."""
 
 from __future__ import annotations
 

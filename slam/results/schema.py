@@ -1,4 +1,4 @@
-"""The JSON files of a run folder, as far as they are read back; ``docs/outputs.md`` describes every key."""
+"""The JSON files of a run folder, as far as they are read back; ``docs/metrics.md`` describes every key."""
 
 from __future__ import annotations
 

@@ -60,14 +60,12 @@ from slam.results.comparison import MISSING, lookup
 PICTURE = "images/trajectories.png"  # beside the page
 PAGE = """# Benchmarks
 
-Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
-measured with. A seed is `--seed` of the run, which seeds its RANSAC draws and nothing else: images, worlds and weights
-are the same for every seed, and a standard deviation over seeds is that of the draws alone, neither of training nor of
-data. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale* is the
-factor that the optimised trajectory still needs.
+`tools/benchmark.py` writes this page; `--help` says how. Every section gives its command, its commit and its seeds.
 
-An experiment beside these runs, kiss-icp on the point clouds of learned depth, is described in
-[design/tried-without-success](design/tried-without-success.md).
+- A seed is `--seed` of the run. It seeds the draws of RANSAC and nothing else: images, worlds and weights are the same for
+  every seed. A standard deviation over seeds is therefore the spread of these draws, not of training or data.
+- Position errors (ATE RMSE) are in metres: mean, and ± standard deviation if there are several seeds.
+- *scale* is the factor by which the optimised trajectory must be multiplied to fit the truth best.
 """
 
 
@@ -77,8 +75,8 @@ def accuracy_tables(results: Sequence[JobResult]) -> str:
     definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     picture = f"\n\n![every drive from above]({PICTURE})" if drawable(results) else ""
-    return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
-trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
+    return f"""Every kind of drive: the median and, in brackets, the worst run. ATE is of the optimised trajectory, 7-dof. A loop is
+false if it is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
 {summary_table(results)}
 
@@ -95,8 +93,8 @@ def ablation_tables(results: Sequence[JobResult]) -> str:
     drives = grouped(results, drive, weights)
     by_drive = {", ".join(label): average_among(ATE_7, group) for label, group in drives.items()}
     rows = {"configuration": configuration}
-    return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
-above 1, the part helps. The rest are means.
+    return f"""Errors over the errors of the same sequence, weights and seed with everything on: geometric mean and, in brackets, the
+worst. A ratio above 1 means that the part helps. The other columns are means.
 
 {table(rows, columns, results)}
 
@@ -113,7 +111,7 @@ def speed_tables(results: Sequence[JobResult]) -> str:
     costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
     shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
     by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
-    return f"""Everything on. Frames a second count all from the first image to the evaluation; the whole command also
+    return f"""Everything is on. Frames a second count the time from the first image to the evaluation. The whole command also has
 start and report.
 
 {table(rows, {q.title: over_seeds(q) for q in costs}, whole)}
@@ -135,7 +133,7 @@ def maps_tables(results: Sequence[JobResult]) -> str:
     sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
     return f"""Errors of the map after one rigid motion, by the best truth of each drive
 ([metrics](metrics.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
-2 m before it.
+2 m in front of it.
 
 {table(rows, {q.title: over_seeds(q) for q in MAP_ERRORS}, results)}
 

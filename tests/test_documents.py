@@ -17,7 +17,10 @@ from erfsfm.config import ExperimentConfig
 from slam.config.sections import SlamConfig
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 NAMING = [path for kind in ("slam", "erfsfm", "tools", "tests", "configs") for path in (ROOT / kind).rglob("*.*")]
 PROGRAMS = {"erfsfm": erfsfm.cli.app, "erfsfm-slam": slam.commands.cli.app}
 LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(?:#([^)\s]*))?\)")

@@ -202,7 +202,7 @@ class MappingConfig(Section):
 
 
 class OutputConfig(Section):
-    """What a run writes."""
+    """The output of a run."""
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")

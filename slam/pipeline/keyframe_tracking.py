@@ -37,7 +37,7 @@ def decided(config: SlamConfig, camera_height_m: float | None) -> SlamConfig:
 
 
 class KeyframeTracking:
-    """Tracks keyframes: beside the steps until those say whether they are a vehicle's, then in place of one of both."""
+    """Tracks keyframes beside the steps. The first steps decide which goes on: steps of a vehicle, else keyframes."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class KeyframeTracking:
         self._places = None  # the new keyframe changes the map
 
     def decide(self, drive: Drive) -> None:
-        """End the tracking where the first steps are those of a vehicle."""
+        """End the tracking if the first steps belong to a vehicle."""
         if self._odometry is None or self._is_carried:
             return
         vehicle = False if self._config.use == "always" else is_vehicle(drive)
@@ -147,7 +147,7 @@ class KeyframeTracking:
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
-        """What became of the maps so far."""
+        """The events of the maps so far."""
         return () if self._odometry is None else self._odometry.events
 
     def poses(self, maps: Sequence[Segment]) -> WindowPoses:

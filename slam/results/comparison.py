@@ -94,7 +94,7 @@ def unit_of_lengths(metrics: Mapping[str, Any]) -> str:
 
 
 def is_metric(metrics: Mapping[str, Any]) -> bool:
-    """Whether lengths of a run are metres; so are those of one that does not tell."""
+    """Whether lengths of a run are metres; they are if the run does not tell."""
     return unit_of_lengths(metrics) == METRES
 
 

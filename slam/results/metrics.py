@@ -126,7 +126,7 @@ def _depth_error(result: Estimate) -> dict[str, Any]:
 def whole_metrics(
     metrics: dict[str, Any], result: Estimate, sequence: Sequence, map_summary: dict[str, Any], depth: dict[str, Any]
 ) -> dict[str, Any]:
-    """The metrics of a complete run: those of the estimate, with depth, the map and the final timing."""
+    """The metrics of a complete run: the estimate, depth, the map and the final timing."""
     timing = describe_timing(result.stopwatch, len(sequence) - result.first)
     rest = {"timing": timing, "depth": depth, "map": map_summary}
     whole: dict[str, Any] = metrics | {"status": "ok"} | finite(rest)

@@ -1,4 +1,4 @@
-"""What an output may replace: an empty file, or one of the same kind, and none of a run."""
+"""The files that an output may replace: an empty file, or one of the same kind, and none of a run."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class Recording(_Part):
 
 
 class ProvenanceRecord(_Part):
-    """What ran."""
+    """The program, weights and command of a run."""
 
     seed: Count | None = None
     weights: str | None = None
@@ -51,7 +51,7 @@ class Gap(_Part):
 
 
 class SequenceRecord(_Part):
-    """What was run on."""
+    """The sequence of a run."""
 
     name: str | None = None
     frames: Count | None = None
@@ -121,7 +121,7 @@ class LoopCounts(_Part):
 
 
 class EventRecord(_Part):
-    """What became of the tracking of keyframes at a frame."""
+    """An event in the tracking of keyframes at a frame."""
 
     frame: Count
     event: str

@@ -145,7 +145,7 @@ class UndistortedImages:
 
 
 def undistortion_of(recording: Sequence) -> Undistortion | None:
-    """What a recording does with its images as it reads them; None where they have no distortion."""
+    """The undistortion of a recording's images as they are read; None if they have no distortion."""
     if isinstance(recording, Excerpt):
         return undistortion_of(recording.base)
     images = recording.images if isinstance(recording, RecordedSequence) else None

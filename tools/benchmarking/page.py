@@ -62,8 +62,8 @@ PAGE = """# Benchmarks
 
 `tools/benchmark.py` writes this page; `--help` says how. Every section gives its command, its commit and its seeds.
 
-- A seed is `--seed` of the run. It seeds the draws of RANSAC and nothing else: images, worlds and weights are the same for
-  every seed. A standard deviation over seeds is therefore the spread of these draws, not of training or data.
+- A seed is `--seed` of the run. It seeds the draws of RANSAC and nothing else: images, worlds and weights are the same
+  for every seed. A standard deviation over seeds is therefore the spread of these draws, not of training or data.
 - Position errors (ATE RMSE) are in metres: mean, and ± standard deviation if there are several seeds.
 - *scale* is the factor by which the optimised trajectory must be multiplied to fit the truth best.
 """
@@ -75,8 +75,8 @@ def accuracy_tables(results: Sequence[JobResult]) -> str:
     definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     picture = f"\n\n![every drive from above]({PICTURE})" if drawable(results) else ""
-    return f"""Every kind of drive: the median and, in brackets, the worst run. ATE is of the optimised trajectory, 7-dof. A loop is
-false if it is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
+    return f"""Every kind of drive: the median and, in brackets, the worst run. ATE is of the optimised trajectory, 7-dof.
+A loop is false if it is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
 {summary_table(results)}
 
@@ -93,8 +93,8 @@ def ablation_tables(results: Sequence[JobResult]) -> str:
     drives = grouped(results, drive, weights)
     by_drive = {", ".join(label): average_among(ATE_7, group) for label, group in drives.items()}
     rows = {"configuration": configuration}
-    return f"""Errors over the errors of the same sequence, weights and seed with everything on: geometric mean and, in brackets, the
-worst. A ratio above 1 means that the part helps. The other columns are means.
+    return f"""Errors over the errors of the same sequence, weights and seed with everything on: geometric mean and, in
+brackets, the worst. A ratio above 1 means that the part helps. The other columns are means.
 
 {table(rows, columns, results)}
 
@@ -111,8 +111,8 @@ def speed_tables(results: Sequence[JobResult]) -> str:
     costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
     shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
     by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
-    return f"""Everything is on. Frames a second count the time from the first image to the evaluation. The whole command also has
-start and report.
+    return f"""Everything is on. Frames a second count the time from the first image to the evaluation. The whole command
+also has start and report.
 
 {table(rows, {q.title: over_seeds(q) for q in costs}, whole)}
 

@@ -27,7 +27,7 @@ _FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops", "windo
 def provenance_to_resume(
     continues: Path, known: Mapping[str, Any], output: Path | None, recording: Mapping[str, str]
 ) -> dict[str, Any] | None:
-    """What a run that did not end was run on, where it is to go on in its own folder; else None.
+    """The recording of a run that did not end and goes on in its own folder; else None.
 
     Args:
         continues: its folder.

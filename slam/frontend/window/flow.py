@@ -35,7 +35,7 @@ def flow(first: Grey, second: Grey, pixels: Pixels, guesses: Pixels, levels: int
 
 
 def new_corners(grey: Grey, taken: Pixels, count: int, spacing_px: float) -> Pixels:
-    """Up to ``count`` Shi-Tomasi corners ``(M, 2)`` at least ``spacing_px`` from each other and from those taken."""
+    """Up to ``count`` Shi-Tomasi corners ``(M, 2)`` at least ``spacing_px`` from each other and from taken ones."""
     if count <= 0:
         return np.zeros((0, 2), np.float32)
     mask = np.full(grey.shape, 255, np.uint8)

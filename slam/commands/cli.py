@@ -35,7 +35,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 Device = Annotated[DeviceName, typer.Option(help="where the networks run")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw")]
 DefaultSeed = Annotated[
-    int | None, typer.Option(min=0, max=2**31 - 1, help="of every random draw; default: 0, or that of the old run")
+    int | None, typer.Option(min=0, max=2**31 - 1, help="seed of every random draw; default: 0, or the old run's")
 ]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 
@@ -67,19 +67,19 @@ def run(
     camera: Annotated[
         Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
     ] = None,
-    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2 or a training output")] = "default",
+    weights: Annotated[str, typer.Option(help="default, sim, erf-dfc, erf-dfcv2, or a training's output")] = "default",
     config: Annotated[str | None, typer.Option(help="a YAML file or a shipped name")] = None,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
-    frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None,
+    frames: Annotated[str | None, typer.Option(help="A:B: frames A to B-1")] = None,
     output: Annotated[Path | None, typer.Option(help="the run folder; else results/<stamp>_<sequence>")] = None,
     cache: Annotated[
         Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")
     ] = None,
     rerun: Annotated[Path | None, typer.Option(help="also write an .rrd file for the rerun viewer (extra)")] = None,
     continues: Annotated[
-        Path | None, typer.Option("--continue", help="a run folder; these frames follow, or (alone) it goes on")
+        Path | None, typer.Option("--continue", help="run folder; adds --frames to its drive; alone: ends a killed run")
     ] = None,
-    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None,
+    gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: the old run's")] = None,
     seed: DefaultSeed = None,
     device: Device = "auto",
     as_json: Json = False,
@@ -119,7 +119,7 @@ def run(
 @app.command()
 def evaluate(
     paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders")],
-    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the two files")] = "auto",
+    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="format of the two files")] = "auto",
     fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
     as_json: Json = False,
     seed: UnusedSeed = 0,
@@ -127,7 +127,7 @@ def evaluate(
 ) -> None:
     """Errors of trajectories or of whole runs.
 
-    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side.
+    Two trajectory files give all metrics under all alignments. Run folders give their tables side by side.
 
     Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
     """

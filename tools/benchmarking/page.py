@@ -75,8 +75,8 @@ def accuracy_tables(results: Sequence[JobResult]) -> str:
     definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     picture = f"\n\n![every drive from above]({PICTURE})" if drawable(results) else ""
-    return f"""Every kind of drive: the median and, in brackets, the worst run. ATE is of the optimised trajectory, 7-dof.
-A loop is false if it is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
+    return f"""Every kind of drive: the median and, in brackets, the worst run. ATE is of the optimised trajectory,
+7-dof. A loop is false if it is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
 
 {summary_table(results)}
 
@@ -111,8 +111,8 @@ def speed_tables(results: Sequence[JobResult]) -> str:
     costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
     shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
     by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
-    return f"""Everything is on. Frames a second count the time from the first image to the evaluation. The whole command
-also has start and report.
+    return f"""Everything is on. Frames a second count the time from the first image to the evaluation. The whole
+command also has start and report.
 
 {table(rows, {q.title: over_seeds(q) for q in costs}, whole)}
 

@@ -167,8 +167,8 @@ def receptive_field(
     weights: Annotated[str, typer.Option(help="learned weights for their own presets; none: all untrained")] = "none",
     fidelity: Fidelity = "default",
     offsets_px: Annotated[float, typer.Option(min=0, help="outward offset of deformable taps, pixels")] = 1.0,
-    height: Annotated[int, typer.Option(min=48, help="of the image, pixels")] = 128,
-    width: Annotated[int, typer.Option(min=48, help="of the image, pixels")] = 416,
+    height: Annotated[int, typer.Option(min=48, help="size of the image, pixels")] = 128,
+    width: Annotated[int, typer.Option(min=48, help="size of the image, pixels")] = 416,
     device: Device = "auto",
     seed: Seed = 0,
     as_json: Json = False,
@@ -217,8 +217,8 @@ def convert(
     dilated: Annotated[
         bool, typer.Option("--dilated", help="the pose network is the dilated one; not recorded in the file")
     ] = False,
-    width: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 416,
-    height: Annotated[int, typer.Option(min=32, help="of the images it was trained on, pixels")] = 128,
+    width: Annotated[int, typer.Option(min=32, help="size of the training images, pixels")] = 416,
+    height: Annotated[int, typer.Option(min=32, help="size of the training images, pixels")] = 128,
     trained_on: Annotated[
         list[str] | None, typer.Option(help="recording seen in training, e.g. kitti_odometry/00; repeat")
     ] = None,
@@ -244,7 +244,7 @@ def export(
     output: Annotated[Path, typer.Option(help="depth network's file; the pose network goes beside it")] = Path(
         "erfsfm.onnx"
     ),
-    format_: Annotated[Literal["onnx"], typer.Option("--format", help="of the files")] = "onnx",
+    format_: Annotated[Literal["onnx"], typer.Option("--format", help="format of the files")] = "onnx",
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def pack(
-    config: Annotated[str, typer.Option(help="of the training: a YAML file, or the name of a shipped configuration")],
+    config: Annotated[str, typer.Option(help="configuration of the training: a YAML file or a shipped name")],
     dataset: Annotated[
         list[Path] | None, typer.Option(help="KITTI odometry or raw root, image folder or video; repeat")
     ] = None,
@@ -22,7 +22,7 @@ def pack(
     shard_megabytes: Annotated[
         float | None, typer.Option(min=0.1, help="write tar files of at most this size, as many as all the data need")
     ] = None,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="of the JPEG images")] = 85,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="quality of the JPEG images")] = 85,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="section.key=value; repeat")] = None,
 ) -> None:
     """Pack the data of a training for another machine: frames at the networks' size, and what the teacher measured.

@@ -172,7 +172,7 @@ class DepthPosePredictor:
         return predictor
 
     def leaks(self, names: Sequence[str]) -> list[str]:
-        """Those of the given recordings (``kitti_odometry/00[0:300]``) that were trained on."""
+        """The given recordings (``kitti_odometry/00[0:300]``) that were trained on."""
         return overlapping(names, self.record.trained_on)
 
     def depth(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:

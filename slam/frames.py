@@ -69,7 +69,7 @@ class Intrinsics(Pinhole):
 class Frame:
     """One image of a sequence: ``image`` ``(H, W, 3)`` uint8 RGB, ``stamp`` in seconds.
 
-    What is computed from the image alone (grey levels, pyramids, features) is computed once and cached by the frame.
+    Values that depend on the image alone (grey levels, pyramids, features) are computed once and kept by the frame.
     """
 
     index: int
@@ -200,8 +200,9 @@ class RelativePose:
     """A measured ``T_from_to`` between two frames and its noise.
 
     ``sigmas`` ``(6,)``: standard deviations in GTSAM's tangent order, rotation (radians) first, then
-    translation in the units of the measurement. ``source`` names the method. ``correlated_sigmas`` ``(6,)``, where
-    errors of neighbours are correlated: independent errors of these sigmas would add up along a chain as those do.
+    translation in the units of the measurement. ``source`` names the method. Errors of
+    neighbours may be correlated and add up along a chain faster than independent ones: ``correlated_sigmas`` ``(6,)``
+    are the larger sigmas of independent errors that add up as fast.
     Errors follow Student's t with ``student_t_dof`` degrees of freedom; they are normal where that is infinite.
     """
 
@@ -249,7 +250,7 @@ class RelativeSimilarity:
 
 @dataclass(frozen=True)
 class TrackingEvent:
-    """What became of the tracking of keyframes at a frame.
+    """An event in the tracking of keyframes at a frame.
 
     A map began, the camera was lost from this frame on, it was found again at the place of an ``other`` frame, or the
     map that begins here was joined with that of an ``other`` frame. ``support`` is the number of points, or of loops.

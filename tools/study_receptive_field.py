@@ -3,7 +3,7 @@
 The teacher is that of many views, whose poses supervise pose networks alone. Finished trainings are not repeated and
 interrupted ones are resumed, so the same command may be given again.
 
-Example: python tools/study_receptive_field.py --dataset pack --cache pack/teacher --report docs/study.md
+Example: python tools/study_receptive_field.py --dataset pack --cache pack/teacher --report study.md
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FIELDS = {
 PAGE = """# Does a wider receptive field help?
 
 The paper's question, for the pose networks here. Every one is trained under one budget, supervised by the poses of the
-[many-view teacher](design/learning.md#a-teacher-of-many-views), and measured on snippets of frames that none of them
+[many-view teacher](learning.md#a-teacher-of-many-views), and measured on snippets of frames that none of them
 saw. Networks are paired by seed: a pair has the same draws of snippets.
 
 `{pack}`
@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--networks", nargs="+", default=NETWORKS, choices=NETWORKS, help="only these")
     parser.add_argument("--output", type=Path, default=Path("runs/study"), help="receives every training")
-    parser.add_argument("--report", type=Path, help="page to write, such as docs/receptive-field-study.md")
+    parser.add_argument("--report", type=Path, help="page to write; the last one is in docs/design/networks.md")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
@@ -200,7 +200,7 @@ def write_page(
         "--quality 95 --set teacher.cache=labels --output pack",
         command="python tools/study_receptive_field.py --dataset pack --cache pack/teacher "
         f"--seeds {len({row.seed for row in rows})} --networks {' '.join(by_network(rows))} "
-        f"--report docs/{report.name}",
+        f"--report {report.name}",
         steps=config.training.steps,
         rate=config.training.learning_rate,
         batch=config.training.batch,

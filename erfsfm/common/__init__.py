@@ -1,1 +1,1 @@
-"""What both packages use, without PyTorch: files, locks, YAML, errors, signals, threads, the command line, readers."""
+"""Code of both packages without PyTorch: files, locks, YAML, errors, signals, threads, the command line, readers."""

@@ -1,4 +1,4 @@
-"""What both command lines share: their words are checked once, and every error is one line and an exit code."""
+"""Code of both command lines: it checks their words, and turns every error into one line and an exit code."""
 
 from __future__ import annotations
 

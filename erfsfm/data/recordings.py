@@ -70,7 +70,7 @@ class Recording:
         )
 
     def within(self, first: int, stop: int) -> Recording | None:
-        """Those of its frames whose numbers are ``first`` to ``stop - 1``; None where it has none of them."""
+        """The frames with the numbers ``first`` to ``stop - 1``; None if there are none."""
         begin, end = max(first - self.start, 0), min(stop - self.start, len(self))
         return self.part(begin, end) if begin < end else None
 

@@ -1,4 +1,4 @@
-"""The leak record: frames a network was trained on, and their overlap with those of an evaluation.
+"""The leak record: frames a network was trained on, and their overlap with the frames of an evaluation.
 
 Names are those of `erfsfm.common.readers.frame_range`.
 """
@@ -11,7 +11,7 @@ from erfsfm.common.readers.frame_range import FrameRange, seed_span
 
 
 def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
-    """Those of ``names`` that share frames with what was ``seen``; empty where nothing leaks."""
+    """The ``names`` that share frames with the recordings ``seen``; empty if nothing leaks."""
     ranges = [FrameRange.parse(name) for name in seen]
 
     def leaks(name: str) -> bool:

@@ -1,6 +1,6 @@
 """The five-frame snippet protocol for ego-motion (Zhou et al. 2017, section 4.2), in NumPy alone.
 
-Conventions: ``docs/conventions.md``. Poses of a snippet are written in the frame of its first camera.
+Conventions: ``docs/design/conventions.md``. Poses of a snippet are written in the frame of its first camera.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def measure(
 
 
 def combine(values: Array, sigmas: Array) -> MeasuredDepth:
-    """Weighted mean of those neighbours ``(N, H, W)`` that agree with their weighted median."""
+    """Weighted mean of the neighbours ``(N, H, W)`` that agree with their weighted median."""
     known = np.isfinite(sigmas)
     weights = np.where(known, 1 / np.square(sigmas), 0).astype(np.float32)
     order = np.argsort(np.where(known, values, np.inf), axis=0)
@@ -108,7 +108,7 @@ def optical_flow(first: Grey, second: Grey, fine: bool) -> tuple[Array, NDArray[
 
 
 def guided_flow(first: Grey, second: Grey, fine: bool, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """As `optical_flow`, sought around those pixels ``(H, W, 2)`` of the second image."""
+    """As `optical_flow`, searched around the given pixels ``(H, W, 2)`` of the second image."""
     near = cv2.remap(second, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     left, trusted = optical_flow(first, np.asarray(near, np.uint8), fine)
     height, width = first.shape

@@ -46,7 +46,7 @@ def kept(made_from: str) -> bytes | None:
 
 
 def keep(made_from: str, graph: bytes) -> None:
-    """Write an ONNX file; those used least recently are deleted. A folder that cannot be written costs time alone."""
+    """Write an ONNX file and delete the least recently used ones. A folder that cannot be written costs time only."""
     content = hashlib.sha256(graph).digest() + graph
     try:
         write_atomically(_path(made_from), lambda partial: partial.write_bytes(content), sync=False)

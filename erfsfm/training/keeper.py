@@ -105,7 +105,7 @@ class WeightKeeper(Callback):
             save_model(folder, model)
 
     def metrics_at(self, step: int) -> dict[str, float]:
-        """What was measured of the latest weights, if these are of that step; else nothing."""
+        """The measurements of the latest weights, if these are of the given step; else nothing."""
         record = self._output / "last" / "model.yaml"
         latest = read_record(record) if record.is_file() else None
         return latest.metrics if latest is not None and latest.step == step else {}

@@ -168,7 +168,7 @@ class SelfSupervision(lightning.LightningModule):
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Learn at the configured rates: a resumed run has those of its checkpoint until here."""
+        """Learn at the configured rates. Until here, a resumed run has the rates of its checkpoint."""
         schedule: Any = self.lr_schedulers()
         schedule.base_lrs = self._rates
         factor = learning_rate_factor(self.config.training.schedule, self._progress(schedule.last_epoch))

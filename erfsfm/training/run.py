@@ -109,7 +109,7 @@ def train(
 
 
 def rank_of(training: TrainingConfig) -> int:
-    """Number of this process among those of all nodes, as Lightning will count it.
+    """Number of this process among the processes of all nodes, as Lightning counts it.
 
     With several devices Lightning starts the program again for each further one of its node. On every node it is
     started once, with the environment that Lightning, torchrun or SLURM reads.

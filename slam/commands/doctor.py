@@ -1,4 +1,4 @@
-"""What is installed, what is found, what is missing and what to do about it."""
+"""A check of the installation: parts that are installed, parts that are missing, and what to do about them."""
 
 from __future__ import annotations
 

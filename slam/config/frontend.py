@@ -13,18 +13,18 @@ ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps
 
 
 class FrontendConfig(Section):
-    """Factors from the pose network's snippet poses and their noise, see ``frontend/network_factors.py``."""
+    """Factors of the pose network, see ``frontend/network_factors.py``."""
 
     use: Literal["calibrated", "gaps", "always"] = Field(
         default="calibrated",
-        description="gaps: only where image geometry fails; calibrated: always with a noise.yaml, else gaps",
+        description="gaps: only where image geometry fails; calibrated: always if there is a noise.yaml, else gaps",
     )
 
 
 class GeometryConfig(Section):
     """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
 
-    enabled: bool = Field(default=True, description="measure relative poses by image geometry, beside the pose network")
+    enabled: bool = Field(default=True, description="measure relative poses by image geometry")
     max_corners: int = Field(default=800, ge=50, le=10000, description="largest number of tracked corners")
     corner_spacing_px: float = Field(default=11.0, ge=1, description="least distance between corners, pixels")
     few_corners: int = Field(
@@ -74,12 +74,12 @@ class RoadConfig(Section):
     near_heights: float = Field(
         default=4.5,
         gt=0,
-        description="farthest ground of the short strip, used behind a vehicle ahead, in camera heights",
+        description="far end of the short strip of road, used behind a vehicle ahead, in camera heights",
     )
 
 
 class LengthConfig(Section):
-    """Joint estimation of all step lengths, see ``frontend/scale/step_lengths.py``; sigmas are of logarithms."""
+    """Joint estimation of all step lengths, see ``frontend/scale/step_lengths.py``. Sigmas are of logarithms."""
 
     ratio_sigma: float = Field(default=0.004, gt=0, description="least sigma of the ratio of two consecutive steps")
     learned_sigma: float = Field(default=0.1, gt=0, description="sigma of a length by learned depth")
@@ -93,7 +93,7 @@ class GapsConfig(Section):
 
     enabled: bool = Field(
         default=True,
-        description="interpolate over unusable frames; false: they are measured as usable ones and may end a run",
+        description="interpolate over unusable frames; false: measure them like other frames, which may end the run",
     )
     max_unread_frames: int = Field(
         default=30, ge=1, description="largest number of consecutive unreadable images; more end the run"
@@ -101,23 +101,22 @@ class GapsConfig(Section):
 
 
 class LidarConfig(Section):
-    """LiDAR odometry, see ``frontend/lidar_odometry.py``; without factors only for comparison."""
+    """LiDAR odometry, see ``frontend/lidar_odometry.py``. Without factors it is only compared."""
 
-    factors: bool = Field(
-        default=False, description="add kiss-icp's odometry to the pose graph; scale.mode lidar fits the scale to it"
-    )
+    factors: bool = Field(default=False, description="add kiss-icp's odometry to the pose graph")
 
 
 class GpsConfig(Section):
     """A GPS track beside the images, see ``docs/gps.md``."""
 
-    factors: bool = Field(default=True, description="add its positions to the pose graph; false: only for comparison")
+    factors: bool = Field(default=True, description="add the positions to the pose graph; false: only compare them")
     sigma_m: float = Field(default=2.5, gt=0, description="sigma of a fix east and north where its HDOP is 1, metres")
-    vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of its height, metres")
+    vertical_sigma_m: float = Field(default=5.0, gt=0, description="sigma of the height of a fix, metres")
     correlation_s: float = Field(default=10.0, ge=0, description="time for which fixes share their error, seconds")
     offset_s: float = Field(default=0.0, description="added to the stamps of the fixes, seconds")
     lever_arm_m: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.0), description="the antenna from the camera: x right, y down, z ahead, metres"
+        default=(0.0, 0.0, 0.0),
+        description="position of the antenna in the camera's axes: x right, y down, z ahead, metres",
     )
 
 

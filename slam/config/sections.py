@@ -53,29 +53,35 @@ DEPTH_SOURCES = ("onnx", "npy", "png")
 
 
 class DepthConfig(Section):
-    """Where depth comes from, see ``docs/depth-models.md``, and what keyframes make of it."""
+    """The source of depth and the refinement of the keyframes' depth, see ``docs/depth.md``."""
 
     source: str = Field(
         default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
     )
     kind: Literal["auto", "depth", "disparity"] = Field(
         default="auto",
-        description="what the source gives; auto: depth in folders, in ONNX files that we exported theirs",
+        description="content of the source; auto: depth in folders, disparity in ONNX files of erfsfm export",
     )
     align: Literal["none", "scale", "affine"] = Field(
         default="none",
-        description="none: one unit in all frames; scale: a unit of its own in each; affine: also a shift of disparity",
+        description="none: all frames have one unit; scale: each has its own; affine: also its own shift of disparity",
     )
     mean: tuple[float, float, float] | None = Field(
-        default=None, description="of RGB in [0, 1], subtracted for onnx; null in ONNX files that we exported"
+        default=None,
+        description="onnx: mean of RGB in [0, 1], which is subtracted; null for ONNX files of erfsfm export",
     )
-    std: tuple[float, float, float] | None = Field(default=None, description="divides RGB less the mean; likewise")
-    height: int = Field(default=0, ge=0, description="input height for onnx; 0 where the file fixes it")
-    width: int = Field(default=0, ge=0, description="input width for onnx; 0 where the file fixes it")
-    output_name: str = Field(default="", description="output for onnx, where the network has several")
-    png_scale: float = Field(default=256.0, gt=0, description="value of 1 m (or other unit) for png; 0 is unknown")
+    std: tuple[float, float, float] | None = Field(
+        default=None, description="onnx: standard deviation, by which RGB less the mean is divided; null likewise"
+    )
+    height: int = Field(default=0, ge=0, description="onnx: height of the input; 0 if the file fixes it")
+    width: int = Field(default=0, ge=0, description="onnx: width of the input; 0 if the file fixes it")
+    output_name: str = Field(default="", description="onnx: name of the output, if the network has several")
+    png_scale: float = Field(
+        default=256.0, gt=0, description="png: value of a pixel at a depth of 1 m; a pixel of 0 is unknown"
+    )
     refine: Literal["none", "multiview"] = Field(
-        default="multiview", description="refine the keyframes' depth by their neighbours at the optimised poses"
+        default="multiview",
+        description="multiview: refine the keyframes' depth by neighbouring images at the optimised poses",
     )
 
     @field_validator("source")
@@ -95,7 +101,7 @@ class DepthConfig(Section):
 
 
 class LoopsConfig(Section):
-    """Loop closure, see ``loops/closure.py``; metres, or camera heights under scale mode none."""
+    """Loop closure, see ``loops/closure.py``."""
 
     enabled: bool = Field(default=True, description="detect and close loops")
     frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
@@ -108,11 +114,11 @@ class LoopsConfig(Section):
         gt=0,
         description="largest difference of the translations measured in both directions, over the depth",
     )
-    min_support: int = Field(default=2, ge=0, description="least number of images with loops that support a loop")
+    min_support: int = Field(default=2, ge=0, description="least number of images whose loops support a loop")
 
 
 class PoseGraphConfig(Section):
-    """The pose graph, see ``pose_graph.py``."""
+    """The pose graph, see ``graph/pose_graph.py``."""
 
     kernel: Literal["none", "huber"] = Field(default="huber", description="robust loss")
     huber_k: float = Field(default=1.345, gt=0, description="whitened residual at which Huber becomes linear")
@@ -120,13 +126,13 @@ class PoseGraphConfig(Section):
 
 
 class MappingConfig(Section):
-    """TSDF fusion, see ``mapping/``; without a known scale, lengths follow the depth of the scene."""
+    """The map, see ``docs/design/map.md``. Without metres, all lengths here follow the depth of the scene."""
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
-    keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance moved after which a frame is fused")
+    keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance between keyframes, metres")
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
-    voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel")
+    voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
     truncation_voxels: float = Field(
         default=10.0, ge=1, description="truncation distance of the signed distance, voxels"
     )
@@ -134,40 +140,48 @@ class MappingConfig(Section):
         default=245,
         ge=1,
         le=256,
-        description="level of all colours from which on a pixel above the horizon is sky, if the upper border is too",
+        description="least level of all colours of sky, above the horizon and connected to the upper border",
     )
     sky_blueness: int = Field(
-        default=15, ge=1, le=256, description="or blue less red from which on it is, grey levels; 256 keeps it"
+        default=15, ge=1, le=256, description="or least blue less red of such a pixel, grey levels; 256: off"
     )
-    depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth")
-    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, whatever its sigma")
+    depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
+    depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, metres")
     sure_sigma_m: float = Field(
-        default=1.2, ge=0, description="largest sigma of depth that is fused up to sure_reach times depth_max_m"
+        default=1.2, ge=0, description="largest sigma of depth that is fused beyond depth_max_m, metres"
     )
-    sure_reach: float = Field(default=1.4, ge=1, description="for depth as sure as that")
+    sure_reach: float = Field(default=1.4, ge=1, description="such depth is fused up to this multiple of depth_max_m")
     border: float = Field(
-        default=0.02, ge=0, lt=0.5, description="left, right and upper border left out, over the image's width"
+        default=0.02,
+        ge=0,
+        lt=0.5,
+        description="width of the left, right and upper border that is left out, over the image's width",
     )
     bonnet: float = Field(
-        default=0.0, ge=0, lt=1, description="lower part left out, over the image's height: the car's own bonnet"
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="height of the lower part with the car's own hood that is left out, over the image's height",
     )
     max_depth_step: float = Field(
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
     consistency: float = Field(
-        default=0.12, gt=0, description="largest relative depth difference to the previous keyframe"
+        default=0.12, gt=0, description="largest relative difference to the depth of the previous keyframe"
     )
-    max_relative_sigma: float = Field(
-        default=0.2, gt=0, description="largest sigma of refined depth that is fused, relative to it"
+    max_relative_sigma: float = Field(default=0.2, gt=0, description="largest sigma of fused depth, over the depth")
+    min_weight: float = Field(
+        default=2.0, ge=0, description="least number of observations of a voxel that becomes surface"
     )
-    min_weight: float = Field(default=2.0, ge=0, description="least number of observations of an extracted voxel")
     min_component_triangles: int = Field(
         default=300, ge=0, description="least number of triangles of a connected piece of the mesh"
     )
-    close_holes_m: float = Field(default=1.5, ge=0, description="largest diameter of a hole of the road to close")
-    submap_m: float = Field(default=60.0, gt=0, description="length of road in a submap")
+    close_holes_m: float = Field(
+        default=1.5, ge=0, description="largest diameter of a hole of the road that is closed, metres"
+    )
+    submap_m: float = Field(default=60.0, gt=0, description="length of the road in a submap, metres")
     memory_mb: int = Field(
-        default=1000, ge=100, description="memory of the map, MiB: a submap ends before submap_m where it would be more"
+        default=1000, ge=100, description="memory of the map, MiB; a submap that would need more ends before submap_m"
     )
 
     def in_unit(self, per_metre: float) -> MappingConfig:
@@ -188,16 +202,16 @@ class MappingConfig(Section):
 
 
 class OutputConfig(Section):
-    """What a run writes."""
+    """The output of a run."""
 
     root: str = Field(default="results", min_length=1, description="parent folder of run folders")
     report: bool = Field(default=True, description="write report.html")
     viewer_triangles: int = Field(
-        default=60_000, ge=0, description="most triangles of the map that turns in the report; 0 for pictures alone"
+        default=60_000, ge=0, description="largest number of triangles of the map in the report; 0: pictures only"
     )
     keep: Literal["nothing", "drive", "keyframes"] = Field(
         default="drive",
-        description="for run --continue: nothing, the measurements of the drive, or also the keyframes of the map",
+        description="kept for run --continue; drive: the measurements; keyframes: also the keyframes of the map",
     )
 
 

@@ -14,6 +14,6 @@ class WindowConfig(Section):
 
     use: Literal["auto", "always", "never"] = Field(
         default="auto",
-        description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps alone",
+        description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps only",
     )
     max_corners: int = Field(default=500, ge=50, le=10000, description="largest number of corners of a keyframe")

@@ -122,7 +122,7 @@ def pose_similarity(T_world_camera_true: FloatArray, T_world_camera: FloatArray,
 
 @dataclass(frozen=True)
 class MapDistances:
-    """Distances in metres at samples of the map and of the true surface, with those to the nearest camera.
+    """Errors in metres at samples of the map and of the true surface, and their distances to the nearest camera.
 
     ``to_surface``, ``map_range`` and ``in_field`` ``(M,)`` belong to map points, ``to_map`` and ``surface_range``
     ``(S,)`` to points of the true surface. ``in_field`` marks map points where the truth's sensor looked.
@@ -135,7 +135,7 @@ class MapDistances:
     surface_range: FloatArray
 
     def between(self, from_m: float, to_m: float) -> MapDistances:
-        """Those of points so far from the nearest camera, half-open."""
+        """The errors of points at such distances from the nearest camera, half-open."""
         own = (self.map_range >= from_m) & (self.map_range < to_m)
         true = (self.surface_range >= from_m) & (self.surface_range < to_m)
         return self._of(own, true)
@@ -145,7 +145,7 @@ class MapDistances:
         return MapDistances(*map_part, self.to_map[true], self.surface_range[true])
 
     def headline(self) -> MapDistances:
-        """Those of all map points, and of the true surface within 20 m of a camera."""
+        """The errors of all map points, and of the true surface within 20 m of a camera."""
         return self._of(np.ones(len(self.to_surface), dtype=bool), self.surface_range < NEAR_CAMERA_M)
 
     def where_measured(self) -> MapDistances:

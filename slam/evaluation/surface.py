@@ -103,7 +103,7 @@ def length_m(T_world_camera: FloatArray, parts: list[Indices]) -> float:
 
 
 def moved_frames(T_world_camera: FloatArray, frames: Indices, step_m: float) -> Indices:
-    """Those of increasing ``frames`` that are ``step_m`` or 5 degrees from the one before."""
+    """The increasing ``frames`` that are ``step_m`` or 5 degrees from the chosen one before."""
     kept: list[int] = []
     for frame in frames:
         if kept:
@@ -117,7 +117,7 @@ def moved_frames(T_world_camera: FloatArray, frames: Indices, step_m: float) -> 
 
 
 def nearby(T_world_camera: FloatArray, views: Indices, part: Indices) -> Indices:
-    """Those of ``views`` that can see what is near a stretch of road."""
+    """The ``views`` that can see surfaces near a stretch of road."""
     positions = T_world_camera[:, :3, 3]
     away, _ = cKDTree(positions[part]).query(positions[views])
     near: Indices = views[away <= 2 * RANGE_M]

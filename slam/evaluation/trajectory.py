@@ -100,7 +100,7 @@ class Aligned:
 def trajectory_metrics(
     estimate: Trajectory, reference: Trajectory | None, snippet5: SnippetErrors | None = None
 ) -> TrajectoryMetrics:
-    """The object T of ``metrics.json`` (``docs/outputs.md``); a number that cannot be computed is missing.
+    """The object T of ``metrics.json`` (``docs/metrics.md``); a number that cannot be computed is missing.
 
     Args:
         estimate: the trajectory to evaluate.

@@ -1,6 +1,6 @@
 """Trajectories: camera poses with time stamps, their KITTI and TUM files, and association by time stamp.
 
-Conventions: ``docs/conventions.md``. Quaternions are those of TUM files.
+Conventions: ``docs/design/conventions.md``. Quaternions are those of TUM files.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ class Drive:
         return {name: getattr(self, name) for name in _COLLECTED}
 
     def since(self, first: int) -> Drive:
-        """What was measured from frame ``first`` on, which becomes frame 0; without views and keyframes.
+        """The measurements from frame ``first`` on, which becomes frame 0; without views and keyframes.
 
         It takes as long as there are frames since, however long the drive.
         """

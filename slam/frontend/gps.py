@@ -79,7 +79,7 @@ def fixes_of(track: GpsTrack, stamps: FloatArray, config: GpsConfig) -> GpsFixes
 def scale_by_gps(
     fixes: GpsFixes, T_world_camera_unscaled: FloatArray, stamps: FloatArray
 ) -> ScaleEstimate | MeasurementFailure:
-    """Chords by GPS over those of the estimate: the median, so that drift and outliers count little.
+    """The ratio of chords by GPS to chords of the estimate: the median, so that drift and outliers count little.
 
     Errors of fixes lengthen a chord by about their variance over its length. So chords are a tenth of the fixes, or
     several of them where these span less than 20 sigmas, and are chosen by the camera's lengths: choosing by GPS would

@@ -223,7 +223,7 @@ def measured_noise(snippets: Sequence[SnippetPoses], geometric: Sequence[Relativ
 def chain_raw(snippets: Sequence[SnippetPoses], count: int) -> FloatArray:
     """The raw network trajectory: target to next source of each snippet, without a graph.
 
-    Frames before the first target and after the last come from those two snippets' direct poses.
+    Frames before the first target and after the last come from the direct poses of these two snippets.
 
     Args:
         snippets: one per target, in time order without gaps.

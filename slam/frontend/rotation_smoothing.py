@@ -35,7 +35,7 @@ def smooth_rotations(table: StepTable, relative_rotations: Sequence[RelativeRota
 
     Args:
         table: of all steps.
-        relative_rotations: those over a step that is not triangulated are not used.
+        relative_rotations: rotations over a step that is not triangulated are not used.
     """
     motions = table.triangulated
     by_start = shortest_by_start(motions)

@@ -1,4 +1,4 @@
-"""Segments of a drive: where one ends, no measurement relates the frames after to those before."""
+"""Segments of a drive: no measurement relates the frames of a segment to the frames before it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Segment:
 def find_cuts(
     failures: Sequence[tuple[int, int, str]], measured: Collection[Ends], doubtful: Collection[int]
 ) -> list[int]:
-    """Frames that show another place than the one before: their step failed, those before and after did not.
+    """Frames that show another place than the frame before: their step failed, the steps before and after did not.
 
     Args:
         failures: steps that image geometry could not measure, and why.

@@ -1,6 +1,6 @@
 """Rigid transforms as 4x4 float64 matrices.
 
-``T_a_b`` takes coordinates in b to coordinates in a; neighbours cancel (``docs/conventions.md``).
+``T_a_b`` takes coordinates in b to coordinates in a; neighbours cancel (``docs/design/conventions.md``).
 Functions accept stacks: any leading shape before ``(4, 4)``.
 """
 

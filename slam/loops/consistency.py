@@ -21,7 +21,7 @@ _SUPPORT_DRIFT_RATIO = 0.1  # drift of the odometry between supporting loops ove
 def agreeing(
     loops: Sequence[Loop], T_world_camera: FloatArray, thresholds: LoopThresholds
 ) -> tuple[list[Loop], list[RejectedLoop]]:
-    """Split verified loops into consistent ones and those without support or in conflict with others.
+    """Split verified loops into consistent ones, and ones without support or in conflict with others.
 
     Args:
         loops: verified, in the unit of the trajectory.

@@ -37,7 +37,7 @@ class Places:
     T_world_camera: FloatArray
 
     def write(self, path: Path) -> None:
-        """Write as ``.npz``; ``docs/outputs.md`` describes each array."""
+        """Write as ``.npz``; ``docs/localisation.md`` describes each array."""
         camera = self.intrinsics
         np.savez_compressed(
             path,

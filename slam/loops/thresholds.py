@@ -1,4 +1,4 @@
-"""What a loop must fulfil: between frames of a drive, and between keyframes of a carried camera's maps."""
+"""The conditions of a loop: between frames of a drive, and between keyframes of a hand-held camera's maps."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LoopThresholds:
 
     @classmethod
     def of_frames(cls, config: LoopsConfig) -> Self:
-        """Those between frames of a drive."""
+        """The conditions of loops between frames of a drive."""
         return cls(config.min_inliers, config.agreement_deg, config.agreement_ratio, config.min_support)
 
 

@@ -55,7 +55,7 @@ class DepthFilters:
         self._frames = 0
 
     def shares(self) -> dict[str, float]:
-        """The share of all pixels that each filter took from what those before it left."""
+        """The share of the pixels that each filter removed, over the pixels that reached it."""
         return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
 
     def kept(self, view: KeyframeDepth, other: KeyframeDepth | None) -> DepthMap:

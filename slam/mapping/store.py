@@ -61,7 +61,7 @@ class SubmapStore:
         return len(np.unique(np.concatenate(self._keys), axis=0)) if self._keys else 0
 
     def merged(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> Blocks:
-        """Blocks with ``low <= key < high``, each the mean of those of all submaps by their weights."""
+        """Blocks with ``low <= key < high``: the weighted means of the blocks of all submaps."""
         inside = [np.asarray(((keys >= low) & (keys < high)).all(axis=1)) for keys in self._keys]
         keys = np.unique(np.concatenate([own[mask] for own, mask in zip(self._keys, inside)]), axis=0)
         weight = np.zeros((len(keys), BLOCK_VOXELS), np.float32)

@@ -35,7 +35,7 @@ _FILLED = np.dtype([*VERTEX.descr, ("filled", "u1")])
 
 @dataclass(frozen=True)
 class Piece:
-    """What is kept of a tile, in the spill file.
+    """The part of a tile that is kept in the spill file.
 
     ``vertices`` ``(V,)`` are records with ``filled``, ``triangles`` ``(T, 3)``, ``label`` ``(V,)`` numbers connected
     parts, ``shared`` ``(S,)`` are vertices that a neighbouring tile may have, too; ``sizes`` counts the triangles of
@@ -116,7 +116,7 @@ class MapSurface:
             yield piece.vertices.read()[self._written(piece, kept)]
 
     def cloud_pieces(self) -> Iterator[NDArray[np.void]]:
-        """The vertices that were observed, without those that close holes, as records."""
+        """The observed vertices, without the ones that close holes, as records."""
         for vertices in self.vertex_pieces():
             observed = vertices[vertices["filled"] == 0]
             cloud = np.empty(len(observed), VERTEX)

@@ -83,7 +83,7 @@ class SessionCheckpoint:
         )
 
     def write(self, path: Path) -> None:
-        """Write a file as in ``docs/outputs.md``."""
+        """Write a file as in ``docs/run-folder.md``."""
         SERIALISER.write(path, self)
 
     @classmethod

@@ -53,7 +53,7 @@ class KeyframeDepths:
             )
 
     def fitted(self, mapping: MappingConfig) -> MappingConfig:
-        """Settings whose lengths are for this scene as those in metres are for a street, by the median of known depth.
+        """The settings with their lengths scaled from a street to this scene, by the median of known depth.
 
         Where no depth is known they stay as they are.
         """

@@ -48,7 +48,7 @@ def _in_turn(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[
 class Slam:
     """Monocular SLAM frame by frame; it keeps no images and makes no map.
 
-    Poses come from the measurements of the last 100 frames; those before stay, so a frame costs the same however long
+    Poses come from the measurements of the last 100 frames; older ones stay, so a frame costs the same however long
     the drive is. `close_loops` solves the whole drive as `run` does. Threads may share a session: each call waits for
     the one before.
     """

@@ -66,8 +66,8 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    While keyframes alone measure the camera, depth is predicted for them and for the targets of snippets, and snippets
-    only touch: each step is measured by one.
+    While keyframes alone measure the camera, depth is predicted for keyframes and for the middle frames of snippets.
+    Snippets then do not overlap: every step is measured by one snippet.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class Observer:
 
     @property
     def drive(self) -> Drive:
-        """What was measured so far, which grows with the frames."""
+        """The measurements so far, which grow with the frames."""
         return self._drive
 
     def keyframe_step(self, index: int) -> tuple[int, FloatArray] | None:

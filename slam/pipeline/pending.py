@@ -1,4 +1,4 @@
-"""What the threads of a pass have not finished yet."""
+"""Work that the threads of a pass have not finished yet."""
 
 from __future__ import annotations
 

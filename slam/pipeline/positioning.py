@@ -26,7 +26,7 @@ class Location:
 
 
 class Positioning:
-    """The GPS track of one drive; ``stamps`` ``(N,)`` are those of its frames."""
+    """The GPS track of one drive; ``stamps`` ``(N,)`` are the stamps of its frames."""
 
     def __init__(self, track: GpsTrack, stamps: FloatArray, config: GpsConfig, mode: ScaleMode) -> None:
         """Match a track to a drive.

@@ -1,4 +1,4 @@
-"""What others give for each frame: its image, or why there is none, and its depth."""
+"""The input of each frame: its image, or the reason why there is none, and its depth."""
 
 from __future__ import annotations
 

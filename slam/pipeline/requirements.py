@@ -1,4 +1,4 @@
-"""What a configuration needs of a sequence, checked at every door before the first frame."""
+"""The needs of a configuration, which are checked before the first frame of a sequence."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Tracked:
 
 
 class Tracker:
-    """Poses from the measurements of the last ``window`` frames; those before are left as they are.
+    """Poses from the measurements of the last ``window`` frames; older poses stay as they are.
 
     Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
     the last one was. Where keyframes measure the camera, only their unit is solved again; where they have lost it, only

@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 class RunFolder:
-    """The files of one run, under the names of the contract (``docs/outputs.md``)."""
+    """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
     def __init__(self, path: Path, replaces: Path | None = None) -> None:
         """A folder that exists.

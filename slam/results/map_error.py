@@ -98,7 +98,7 @@ class LidarTruth:
         self._limits: dict[int, tuple[float, float]] = {}
 
     def view(self, frame: int) -> Surface:
-        """The points of one scan; those that project into its image are in the image."""
+        """The points of one scan; points that project into its image are in the image."""
         sequence = self._sequence
         assert sequence.reference is not None and sequence.T_camera_lidar is not None
         points = readable_scan(sequence, frame)

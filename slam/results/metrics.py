@@ -1,4 +1,4 @@
-"""``metrics.json`` and ``loops.json``: their keys, how they are written and read (``docs/outputs.md``)."""
+"""``metrics.json`` and ``loops.json``: their keys, how they are written and read (``docs/metrics.md``)."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def unused_scans(sequence: Sequence) -> str:
 
 
 def missing_between(before: tuple[str, ...], following: tuple[str, ...]) -> int:
-    """Number of frames of a recording between the earlier ones and those that follow, by their leak-record names.
+    """Number of frames of a recording between the earlier ones and the new ones, by their leak-record names.
 
     Names of simulated worlds have no frame numbers: their stamps tell. Folders with other names are assumed to follow,
     with a warning.

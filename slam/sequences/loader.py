@@ -1,4 +1,4 @@
-"""What a kind of recording adds to the catalogue: how it is recognised, and how its sequences are opened."""
+"""A kind of recording in the catalogue: how it is recognised, and how its sequences are opened."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Opener = Callable[[], SourcedSequence]
 
 @dataclass(frozen=True)
 class Asked:
-    """What the user asked for beside the data set.
+    """Options of the user beside the data set.
 
     Attributes:
         name: of a sequence, or None for the only one.

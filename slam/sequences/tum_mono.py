@@ -26,7 +26,7 @@ _LENS = "FOV"
 def open_tum_mono(folder: Path, asked: Path | None) -> RecordedSequence:
     """Open a sequence; response and vignette (``pcalib.txt``, ``vignette.png``) are not used.
 
-    True poses are those of the start and the end that the benchmark gives.
+    The benchmark gives true poses of the start and the end only.
 
     Raises:
         SequenceError, DataError: if images, ``camera.txt`` or ``times.txt`` are missing or malformed.

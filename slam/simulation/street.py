@@ -45,7 +45,7 @@ FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What to simulate; ``seed`` determines everything else."""
+    """The street to simulate; ``seed`` determines everything else."""
 
     route: RouteKind = "loop"
     frames: int = 300

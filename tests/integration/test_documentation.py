@@ -71,7 +71,7 @@ SLOW = (
     r"^erfsfm-slam run(?! --dataset my_drive.mp4 --camera)",  # a whole run each; test_every_command_is_understood
     r"^erfsfm export ",  # tests/erfsfm/test_export.py exports smaller networks
     r"^python tools/",  # several whole runs each
-    r"^erfsfm receptive-field --(output|weights default)",  # docs/receptive-fields.md has it with smaller weights
+    r"^erfsfm receptive-field --(output|weights default)",  # docs/design/networks.md has it with smaller weights
     r"^erfsfm train --config table1",  # networks of the paper's size
 )
 

@@ -140,7 +140,7 @@ def maps_tables(results: Sequence[JobResult]) -> str:
     costs = (*MAP_SIZES, FUSION, MESH, MEMORY)
     sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
     return f"""Errors of the map after one rigid motion, by the best truth of each drive
-([outputs](outputs.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
+([metrics](metrics.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
 2 m before it.
 
 {table(rows, {q.title: over_seeds(q) for q in MAP_ERRORS}, results)}

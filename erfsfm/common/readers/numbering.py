@@ -117,9 +117,9 @@ def in_order(paths: list[Path]) -> NumberedFiles:
 
 
 def by_table(listed: list[Path], table: Path) -> NumberedFiles:
-    """The files that a table lists in the order of time; those that are not there are gaps.
+    """The files that a table lists in the order of time; missing files are gaps.
 
-    Rows before the first file and after the last are left out; ``first`` is the number of those before.
+    Rows before the first file and after the last are left out; ``first`` is the number of rows before the first file.
 
     Raises:
         DataError: none of them is there.

@@ -32,7 +32,7 @@ def read_velodyne(path: Path, columns: int = VELODYNE_COLUMNS) -> NDArray[np.flo
 
 
 def measured_points(points: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
-    """Those of the points ``(P, 3)`` of a file that a LiDAR can measure: not its own place, and within 10 km.
+    """The points of a file ``(P, 3)`` that a LiDAR can measure: not its own place, and within 10 km.
 
     Raises:
         DataError: there are none.

@@ -24,7 +24,9 @@ verbs = typer.Typer()
 def batch(
     drives: Annotated[Path, typer.Argument(help="a manifest (YAML or CSV), or a data set")],
     output: Annotated[Path, typer.Option(help="holds a run folder for each drive, drives.csv and index.html")],
-    sequence: Annotated[list[str] | None, typer.Option("--sequence", "-s", help="of the data set; repeat")] = None,
+    sequence: Annotated[
+        list[str] | None, typer.Option("--sequence", "-s", help="sequence of the data set; repeat")
+    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="drives at a time on this machine")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler in place of this machine")] = None,
     threads: Annotated[

@@ -22,7 +22,7 @@ _OURS = ("--dataset", "--sequence", "-s", "--camera", "--output", "--continue", 
 
 @dataclass(frozen=True)
 class Drive:
-    """One run: ``name`` is that of its folder, ``arguments`` are those of ``erfsfm-slam run`` but ``--output``.
+    """One run: ``name`` of its folder, and ``arguments`` of ``erfsfm-slam run`` without ``--output``.
 
     Relative paths are seen from ``folder``.
     """
@@ -33,7 +33,7 @@ class Drive:
 
 
 def drives_of(manifest_or_root: Path, sequences: Sequence[str], options: Sequence[str]) -> list[Drive]:
-    """The drives of a manifest, or those sequences of a data set.
+    """The drives of a manifest, or the named sequences of a data set.
 
     Args:
         manifest_or_root: a ``.yaml`` or ``.csv`` file, or a data set.

@@ -19,16 +19,14 @@ def calibrate(
     board: Annotated[str, typer.Option(help="corners between the squares: 9x6 for 10 by 7 squares")],
     output: Annotated[Path, typer.Option(help="the camera.yaml to write")] = Path("camera.yaml"),
     square_m: Annotated[float, typer.Option(min=1e-4, max=10.0, help="side of a square in metres")] = 0.03,
-    model: Annotated[
-        Literal["opencv", "fisheye"], typer.Option(help="of the lens; fisheye beyond 110 degrees")
-    ] = "opencv",
-    pattern: Annotated[Literal["chessboard", "charuco"], typer.Option(help="of the board")] = "chessboard",
+    model: Annotated[Literal["opencv", "fisheye"], typer.Option(help="lens; fisheye beyond 110 degrees")] = "opencv",
+    pattern: Annotated[Literal["chessboard", "charuco"], typer.Option(help="pattern of the board")] = "chessboard",
     dictionary: Annotated[str, typer.Option(help="OpenCV's dictionary of the ArUco markers")] = "5X5_100",
     marker_share: Annotated[
         float, typer.Option(min=0.1, max=0.99, help="side of a marker over that of a square")
     ] = 0.75,
     fps: Annotated[
-        float | None, typer.Option(min=1e-3, max=1e4, help="to write; default: that of the video, or 10")
+        float | None, typer.Option(min=1e-3, max=1e4, help="frame rate to write; default: the video's, or 10")
     ] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",

@@ -31,7 +31,7 @@ _MARK = "erfsfm-slam calibrate"  # of a camera file that was calibrated
 
 @dataclass(frozen=True)
 class CalibrationFiles:
-    """What a calibration wrote, and the fit."""
+    """The files that a calibration wrote, and the fit."""
 
     fit: Calibration
     camera: CameraFile

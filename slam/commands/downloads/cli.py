@@ -16,10 +16,10 @@ verbs = typer.Typer()
 
 @verbs.command()
 def download(
-    data_set: Annotated[Literal["kitti-odometry", "tum-rgbd"], typer.Argument(help="which")],
+    data_set: Annotated[Literal["kitti-odometry", "tum-rgbd"], typer.Argument(help="the data set")],
     sequence: Annotated[str, typer.Option("--sequence", "-s", help="09, or freiburg1_xyz")],
     to: Annotated[Path, typer.Option(help="folder that gets it")],
-    camera: Annotated[Literal["colour", "grey"], typer.Option(help="of KITTI")] = "colour",
+    camera: Annotated[Literal["colour", "grey"], typer.Option(help="images of KITTI")] = "colour",
     lidar: Annotated[bool, typer.Option("--lidar", help="KITTI's scans as well")] = False,
     accept_licence: Annotated[
         bool, typer.Option("--accept-licence", help="you accept the licence that is shown")

@@ -24,7 +24,7 @@ def download_kitti(
 ) -> int:
     """Fetch one sequence as an odometry root: images of the left camera, calibration, times and poses.
 
-    What is there already is kept, so an interrupted download goes on.
+    Files that are there already are kept, so an interrupted download goes on.
 
     Args:
         sequence: ``00`` to ``21``; poses are public of the first eleven.

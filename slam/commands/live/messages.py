@@ -1,4 +1,4 @@
-"""What a live drive says of every frame: JSON on a stream and over ZeroMQ."""
+"""The messages of a live drive, one for every frame: JSON on a stream and over ZeroMQ."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from slam.sequences.undistortion import Undistortion
 
 
 class StreamedSequence(GrowingSequence):
-    """The frames that a reader gave so far; ``arrivals`` are those of the last ones, by frame."""
+    """The frames that a reader gave so far; ``arrivals`` are the arrival times of the last ones, by frame."""
 
     def __init__(self, name: str, source: Source, camera: CameraFile, most_wait_s: float) -> None:
         """Begin to read.

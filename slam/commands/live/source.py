@@ -121,7 +121,7 @@ class FolderSource:
 
 
 class VideoSource:
-    """What OpenCV opens: a camera by number, a stream by address, a pipe, or a file, which plays at its own speed."""
+    """A source that OpenCV opens: a camera's number, a stream's address, a pipe, or a file, played at its own speed."""
 
     def __init__(self, name: str, wait_s: float) -> None:
         """Open it; wait up to ``wait_s`` for somebody who writes to a pipe.

@@ -91,7 +91,7 @@ def true_poses(truth: Path, images: Path, numbers: range) -> FloatArray:
 
 
 def summary(errors: Sequence[PoseError | None]) -> dict[str, Any]:
-    """The success rate over all images, and quantiles over those found; null with a reason where none was."""
+    """The success rate over all images, and quantiles over the found ones; null with a reason if none was found."""
     known = [error for error in errors if error is not None]
     numbers: dict[str, Any] = {
         "images": len(errors),

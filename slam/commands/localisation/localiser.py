@@ -223,7 +223,7 @@ class _Pose:
 
 
 def image_paths(images: Path) -> list[Path]:
-    """An image, or those of a folder in their order.
+    """One image, or the images of a folder in their order.
 
     Raises:
         SequenceError: there are none.

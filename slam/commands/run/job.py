@@ -67,7 +67,7 @@ class Job:
     stream: Stream | None = None
 
     def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
-        """What is kept of this run after some of its frames."""
+        """The state of this run after some of its frames, which is kept."""
         return SessionCheckpoint.of(self.recording, state, self.predictors_sha256)
 
 

@@ -170,7 +170,7 @@ def _frame_numbers(recording: FrameSequence, first: int) -> FrameNumbers:
 def provenance_of(
     request: RunRequest, networks: DepthPosePredictor, recording: FrameSequence, source: DepthSource | None
 ) -> Provenance:
-    """What goes into a run: networks, depth, and the options that name the recording."""
+    """The input of a run: networks, depth, and the options that name the recording."""
     is_folder = Path(request.weights) == Path(networks.origin)  # else a shipped name, whatever lies here
     return Provenance(
         version=__version__,

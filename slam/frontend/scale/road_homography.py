@@ -5,7 +5,7 @@ A plane ``n . X = h`` of the current camera maps to the previous one by the homo
 ``m = |t| n / h`` that aligns both images of the road is estimated; its norm is the length. Learned depth is
 not used, so this length has neither the bias nor the drift of the networks.
 
-What changes slowly over the image, as light and reflections do, is taken from the difference of the aligned images.
+Brightness that changes slowly over the image (light, reflections) is removed from the difference of the images.
 Taken from each image before, it would not be the same part of the road in both, for the road is larger in the later
 one: lengths came out 1 % short.
 """

@@ -1,4 +1,4 @@
-"""Points that a step triangulated: with those of the step before they give the ratio of both lengths."""
+"""Points that a step triangulated. With the points of the step before they give the ratio of both lengths."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ class _Block:
     local_point: NDArray[np.int64]
 
     def dense(self, coupling: FloatArray) -> FloatArray:
-        """The matrix of all its cameras and points from what couples those of each sighting ``(6, 3, s)``."""
+        """The matrix of all cameras and points, from the ``(6, 3, s)`` block of each sighting."""
         matrix = np.zeros((len(self.cameras), 6, len(self.points), 3))
         matrix[self.local_camera, :, self.local_point, :] = coupling.transpose(2, 0, 1)
         return matrix.reshape(6 * len(self.cameras), 3 * len(self.points))

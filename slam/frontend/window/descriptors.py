@@ -1,7 +1,7 @@
 """Descriptors of corners, by which they are known again in keyframes far apart: SIFT (Lowe 2004) as 256 bits.
 
-Bits in place of numbers: words, matching and files are those of the binary descriptors of loops. A value is coded by
-two thresholds, so that Hamming's distance is that of the sums of coded differences.
+The descriptors are bits, so that words, matching and files of the binary descriptors of loops can be used. Two
+thresholds code a value, so that Hamming's distance is the distance between the sums of coded differences.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def join_gap_ends(
     by_map: Sequence[RelativePose],
     maps: Mapping[int, int],
 ) -> list[RelativePose]:
-    """The interpolated steps, those in gaps of a map replaced by equal steps from its one side to the other.
+    """The interpolated steps. Equal steps across a gap replace the steps in the gap if one map has both sides.
 
     Constant velocity is a poor guess over a long gap, and many such steps would outvote the one pose by the map.
 

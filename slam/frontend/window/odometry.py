@@ -106,7 +106,7 @@ class WindowOdometry:
 
     @property
     def events(self) -> Sequence[TrackingEvent]:
-        """What became of the maps so far."""
+        """The events of the maps so far."""
         return self._state.events
 
     def lost_map(self) -> Segment | None:

@@ -46,7 +46,7 @@ class WindowPoses:
         return {(k, k + 1) for k, number in self.segments.items() if self.segments.get(k + 1) == number}
 
     def relates(self, first: int) -> bool:
-        """Whether the frames before ``first`` and those from it on have poses in one map."""
+        """Whether the frames before ``first`` and the frames from it on have poses in one map."""
         before = max((frame for frame in self.segments if frame < first), default=None)
         after = min((frame for frame in self.segments if frame >= first), default=None)
         return before is not None and after is not None and self.segments[before] == self.segments[after]

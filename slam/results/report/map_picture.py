@@ -73,7 +73,7 @@ class MapScene:
         return int(rows[int(np.argmax(shares))])
 
     def from_seat(self, T_world_camera: FloatArray) -> Image:
-        """What a camera at this pose ``(4, 4)`` sees of the map, ``(720, 1280, 3)`` uint8 RGB."""
+        """The map as a camera at this pose ``(4, 4)`` sees it, ``(720, 1280, 3)`` uint8 RGB."""
         colours, distance = self._perspective(T_world_camera, WIDTH_PX, HEIGHT_PX)
         return np.where(np.isfinite(distance)[..., None], colours, np.array(BACKGROUND, np.uint8))
 

@@ -1,4 +1,4 @@
-"""What a person sees of a finished map: two pictures in the run folder, and the viewer of the report."""
+"""Views of a finished map for people: two pictures in the run folder, and the viewer of the report."""
 
 from __future__ import annotations
 

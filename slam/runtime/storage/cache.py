@@ -100,7 +100,7 @@ class DiskCache:
 
 
 class CacheNamespace:
-    """The entries of one user of a cache, separated from those of others by its identity."""
+    """The entries of one user of a cache, kept apart from other users' entries by its identity."""
 
     def __init__(self, cache: DiskCache, identity: str) -> None:
         """Use a cache.

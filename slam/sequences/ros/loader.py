@@ -158,7 +158,7 @@ def open_topic(path: Path, topic: str, name: str, asked: Path | None) -> Recorde
 
 
 def camera_topics(path: Path) -> list[str]:
-    """Topics of a bag with pictures of a camera: not those of depth.
+    """Topics of a bag with pictures of a camera, without depth.
 
     Raises:
         SequenceError: the bag is damaged.

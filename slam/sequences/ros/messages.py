@@ -100,7 +100,7 @@ def camera_file_of(info: Any, is_rectified: bool, fps: float, where: str) -> Cam
 
 
 def points_of(cloud: Any, where: str) -> FloatArray:
-    """The points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres; those that are not finite are left out.
+    """The finite points ``(P, 3)`` of a ``PointCloud2`` in its frame, metres.
 
     Raises:
         DataError: it has no x, y, z as float32, or too few bytes.

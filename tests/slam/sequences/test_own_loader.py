@@ -1,4 +1,4 @@
-"""The loader of docs/own-data.md works as the page says."""
+"""The loader of docs/design/loaders.md works as the page says."""
 
 import importlib.util
 import re
@@ -12,7 +12,7 @@ from slam.runtime.errors import MissingFrameError
 from slam.sequences import catalogue
 from slam.sequences.catalogue import open_sequence
 
-PAGE = Path(__file__).parents[3] / "docs/own-data.md"
+PAGE = Path(__file__).parents[3] / "docs/design/loaders.md"
 
 
 def test_the_example_is_a_loader(tmp_path: Path, images, camera_yaml: str, monkeypatch: pytest.MonkeyPatch) -> None:

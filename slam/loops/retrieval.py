@@ -62,11 +62,9 @@ def find_candidates(views: Sequence[View], path: FloatArray, least_path: float) 
         path: distance driven up to each view ``(V,)``.
         least_path: distance along the path within which there is no candidate, in the same unit.
     """
-    everything = _all_descriptors(views)
-    if len(views) < 2 or len(everything) == 0:
+    if len(views) < 2 or not any(map(len, views)):
         return []
-    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, _WORDS)), _WORDS)
-    weighted = _weighted(counts, _inverse_frequency(counts))
+    weighted = PlaceIndex(views).weights
     indices = np.array([view.index for view in views])
     rows = np.arange(len(views))
     neighbour = np.asarray((weighted[1:] * weighted[:-1]).sum(axis=1)).ravel()
@@ -91,11 +89,9 @@ def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int)
         allowed: ``(V, V)``, which pairs may be candidates.
         count: of candidates.
     """
-    everything = _all_descriptors(views)
-    if len(views) < 2 or len(everything) == 0:
+    if len(views) < 2 or not any(map(len, views)):
         return []
-    counts = _word_counts(views, nearest_words(everything, train_vocabulary(everything, _WORDS)), _WORDS)
-    weighted = _weighted(counts, _inverse_frequency(counts))
+    weighted = PlaceIndex(views).weights
     found = []
     for later in range(1, len(views)):
         scores = (weighted[[later]] @ weighted[:later].T).toarray().ravel()
@@ -106,15 +102,15 @@ def similar_views(views: Sequence[View], allowed: NDArray[np.bool_], count: int)
 
 
 class PlaceIndex:
-    """Finds the views of a drive that are similar to a new one."""
+    """Finds the views of a drive that are similar to a new one; ``weights`` ``(V, words)`` are tf-idf vectors."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """Train the vocabulary on the drive's views, at least one."""
-        everything = _all_descriptors(views)
+        everything = np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
         self._words = train_vocabulary(everything, _WORDS)
         counts = _word_counts(views, nearest_words(everything, self._words), _WORDS)
         self._inverse_frequency = _inverse_frequency(counts)
-        self._weights = _weighted(counts, self._inverse_frequency)
+        self.weights = _weighted(counts, self._inverse_frequency)
 
     def nearest(self, view: View, count: int) -> list[int]:
         """Rows of at most ``count`` views that share words with this one, the most similar first."""
@@ -122,7 +118,7 @@ class PlaceIndex:
             return []
         word = nearest_words(view.descriptors, self._words)
         query = _weighted(_word_counts([view], word, len(self._inverse_frequency)), self._inverse_frequency)
-        scores = (self._weights @ query.T).toarray().ravel()
+        scores = (self.weights @ query.T).toarray().ravel()
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(row) for row in best if scores[row] > 0]
 
@@ -147,10 +143,6 @@ def nearest_words(descriptors: Descriptors, words: Descriptors) -> NDArray[np.in
     blocks = [descriptors[k : k + _BLOCK_DESCRIPTORS] for k in range(0, len(descriptors), _BLOCK_DESCRIPTORS)]
     nearest = side_by_side(lambda block: hamming(block, words).argmin(axis=1), blocks)
     return np.concatenate([np.zeros(0, np.int64), *nearest])
-
-
-def _all_descriptors(views: Sequence[View]) -> Descriptors:
-    return np.concatenate([np.zeros((0, 32), np.uint8), *(view.descriptors for view in views)])
 
 
 def _word_counts(views: Sequence[View], word: NDArray[np.int64], words: int) -> csr_array:

@@ -15,7 +15,6 @@ from slam.runtime.storage.files import write_atomically
 _STEP = 1e-4  # coordinates are integers of this unit: 214 km to either side
 _RGB_POINTS = 2  # the point format with colours and without time
 _TO_16_BITS = 257  # 255 becomes 65535
-_GREY = 128
 
 
 def write_las(path: Path, cloud: Ply) -> None:
@@ -25,9 +24,7 @@ def write_las(path: Path, cloud: Ply) -> None:
         SlamError: laspy is not installed, or (`RunError`) the file cannot be written.
     """
     laspy = import_laspy()
-    points, colours = cloud.points, cloud.colours
-    if colours is None:
-        colours = np.full(points.shape, _GREY, np.uint8)
+    points, colours = cloud.points, cloud.colours_or_grey
     header = laspy.LasHeader(point_format=_RGB_POINTS, version="1.2")
     header.scales = np.full(3, _STEP)
     header.offsets = np.floor(points.min(axis=0))

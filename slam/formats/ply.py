@@ -58,6 +58,11 @@ class Ply:
         colours = self.columns(_COLOURS)
         return None if colours is None else colours.astype(np.uint8)
 
+    @property
+    def colours_or_grey(self) -> NDArray[np.uint8]:
+        """RGB ``(V, 3)``, a middle grey where the file has none."""
+        return np.full((len(self.vertices), 3), 128, np.uint8) if self.colours is None else self.colours
+
     def extra_fields(self) -> list[str]:
         """Names of the fields besides position, normal and colour."""
         known = {*_AXES, *_NORMALS, *_COLOURS}

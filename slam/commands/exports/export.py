@@ -116,9 +116,7 @@ def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOpti
     trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
     cloud = _cloud(folder, up, options, progress)
     points = np.zeros((0, 3)) if cloud is None else cloud.points
-    colours = None if cloud is None else cloud.colours
-    if colours is None:
-        colours = np.full(points.shape, 128, np.uint8)
+    colours = np.zeros((0, 3), np.uint8) if cloud is None else cloud.colours_or_grey
     write_colmap(output, camera, trajectory.T_world_camera, points, colours, interpolated(folder))
 
 
@@ -126,9 +124,8 @@ def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, prog
     unit = folder.metrics().unit
     if options.origin is not None and unit != METRES:
         raise RunError(f"a place on the earth needs metres, but this run's lengths are in {unit}: leave --origin")
-    with map_file(folder, "mesh", progress) as source:
-        mesh = prepared(read_ply(source), options)
-    raster = height_raster(_rotated(mesh, "z"), options.resolution or DEFAULT_RESOLUTION, options.origin)
+    mesh = _map(folder, "mesh", "z", options, progress)
+    raster = height_raster(mesh, options.resolution or DEFAULT_RESOLUTION, options.origin)
     write_raster(output, raster, unit)
 
 
@@ -138,11 +135,10 @@ def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, p
     unit = folder.metrics().unit
     if unit not in (METRES, CAMERA_HEIGHTS):
         raise RunError(f"heights above the road need metres or camera heights, but this run's lengths are in {unit}")
-    with map_file(folder, "mesh", progress) as source:
-        mesh = prepared(read_ply(source), options)
+    mesh = _map(folder, "mesh", "z", options, progress)
     trajectory = _trajectory(folder, "z")
     resolution = options.resolution or DEFAULT_RESOLUTION
-    grid = occupancy_grid(_rotated(mesh, "z"), trajectory.T_world_camera, resolution, unit == METRES)
+    grid = occupancy_grid(mesh, trajectory.T_world_camera, resolution, unit == METRES)
     written = output.with_suffix(".yaml")
     write_ros_map(written, grid.cells, grid.corner, grid.resolution, unit)
     return written
@@ -150,9 +146,12 @@ def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, p
 
 def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress | None) -> Ply | None:
     """The cloud of the map, None where the run has none."""
-    if not has_map(folder, "cloud"):
-        return None
-    with map_file(folder, "cloud", progress) as source:
+    return _map(folder, "cloud", up, options, progress) if has_map(folder, "cloud") else None
+
+
+def _map(folder: RunFolder, what: str, up: str, options: ExportOptions, progress: Progress | None) -> Ply:
+    """The mesh or cloud of the map as the options want it, in the given axes."""
+    with map_file(folder, what, progress) as source:
         return _rotated(prepared(read_ply(source), options), up)
 
 

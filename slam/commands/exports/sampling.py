@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.commands.exports.surface import colours_or_grey
 from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
@@ -87,7 +86,7 @@ class Samples:
 def samples(mesh: Ply, grid: Grid) -> Iterator[Samples]:
     """The surface in equal parts of each triangle, so small that no cell is skipped."""
     assert mesh.triangles is not None
-    points, colours = mesh.points, colours_or_grey(mesh)
+    points, colours = mesh.points, mesh.colours_or_grey.astype(np.float64)
     for start in range(0, len(mesh.triangles), _CHUNK_SAMPLES):
         chosen = mesh.triangles[start : start + _CHUNK_SAMPLES]
         yield from _samples(points[chosen], colours[chosen], grid)

@@ -11,11 +11,9 @@ from scipy.spatial import cKDTree
 
 from slam.commands.exports.options import Crop, ExportOptions
 from slam.formats.ply import Ply, coloured_ply
-from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_open3d
 
-_GREY = 128
 _MOST_CUBES = 1e9  # along an axis: Open3D counts them in 32 bits
 
 
@@ -77,15 +75,15 @@ def _through_open3d(ply: Ply, change: Any) -> Ply:
     """Convert, change, convert back; fields that Open3D does not know are those of the nearest vertex before."""
     o3d = import_open3d()
     vector = o3d.utility.Vector3dVector
-    colours = np.full(ply.points.shape, _GREY, np.uint8) if ply.colours is None else ply.colours
+    shades = vector(ply.colours_or_grey / 255.0)
     is_mesh = ply.triangles is not None
     if ply.triangles is not None:
         corners = o3d.utility.Vector3iVector(ply.triangles.astype(np.int32))  # others are converted one by one
         source = o3d.geometry.TriangleMesh(vector(ply.points), corners)
-        source.vertex_colors = vector(colours / 255.0)
+        source.vertex_colors = shades
     else:
         source = o3d.geometry.PointCloud(vector(ply.points))
-        source.colors = vector(colours / 255.0)
+        source.colors = shades
         if ply.normals is not None:
             source.normals = vector(ply.normals)
     result = change(source)
@@ -112,9 +110,3 @@ def _with_extra_fields(changed: Ply, source: Ply) -> Ply:
     for name in names:
         vertices[name] = source.vertices[name][nearest]
     return replace(changed, vertices=vertices)
-
-
-def colours_or_grey(ply: Ply) -> FloatArray:
-    """Colours ``(V, 3)``, 0 to 255."""
-    colours = ply.colours
-    return np.full(ply.points.shape, float(_GREY)) if colours is None else colours.astype(np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -74,6 +75,7 @@ def test_sequences_of_a_data_set(kitti_root: Path) -> None:
         drives_of(kitti_root / "none.yaml", ["all"], [])
 
 
+@pytest.mark.slow
 def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
     manifest, output = tmp_path / "drives.yaml", tmp_path / "out"
     manifest.write_text(f"- {{name: good, dataset: '{kitti_root}'}}\n- {{name: bad, dataset: nowhere}}\n")
@@ -93,13 +95,20 @@ def test_failures_are_told_apart_and_whole_runs_are_kept(kitti_root: Path, tiny_
     (good, _) = drives_of(manifest, ["all"], options)
     assert run_drive(good, output, Limits()).status == "kept"
     assert (output / "good" / "metrics.json").stat().st_mtime_ns == written
-    metrics = json.loads((output / "good" / "metrics.json").read_text())
-    (output / "good" / "metrics.json").write_text(json.dumps(metrics | {"status": "estimated"}))
-    outcome = run_drive(good, output, Limits(threads=1, memory_gib=0.05))
+
+
+def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> None:
+    """What an earlier run left, which was ended before its map, is no whole run."""
+    (sim,) = drives_of(kitti_root, ["all"], [*QUICK, "--weights", str(tiny_weights), "--frames", "0:6"])
+    (tmp_path / "sim").mkdir()
+    command = shlex.join(["erfsfm-slam", "run", *sim.arguments, "--output", str(tmp_path / "sim")])
+    ended = {"status": "estimated", "provenance": {"command": command}}
+    (tmp_path / "sim" / "metrics.json").write_text(json.dumps(ended))
+    outcome = run_drive(sim, tmp_path, Limits(threads=1, memory_gib=0.05))
     assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
-    write_summary(output, [outcome])
-    assert "0 of 1 drives" in (output / "index.html").read_text()
-    check_output(output)
+    write_summary(tmp_path, [outcome])
+    assert "0 of 1 drives" in (tmp_path / "index.html").read_text()
+    check_output(tmp_path)
 
 
 def test_paths_of_the_command_line_are_seen_from_where_it_is_given(

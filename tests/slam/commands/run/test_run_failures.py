@@ -143,6 +143,7 @@ def test_a_run_that_breaks_off_leaves_an_earlier_one_and_stays_beside_it(
     assert set(contents(output)) == set(before)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     overrides = ["geometry.enabled=false", "output.report=false", "output.keep=nothing", "loops.enabled=false"]
     overrides += ["mapping.voxel_size_m=0.1", "mapping.submap_m=3", "depth.refine=none"]  # a map larger than its parts

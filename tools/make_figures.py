@@ -20,7 +20,7 @@ from slam.frames import Sequence
 from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMeshFile
 from slam.results.report.map_picture import MapScene
-from slam.results.report.plots import depth_figure, map_figure, trajectories_of, trajectory_figure
+from slam.results.report.plots import depth_figure, map_figure, trajectories_figure, trajectories_of
 from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
 
@@ -70,7 +70,7 @@ def overview(folder: RunFolder, sequence: Sequence, predictor: DepthPosePredicto
     trajectories = trajectories_of(folder)
     scene = MapScene(MapMeshFile(folder.require(MAP_MESH)).reduced(1_000_000))
     top = _raster(depth_figure(images, depths, [f"frame {k}" for k in chosen]), WIDTH_PX)
-    left = _raster(trajectory_figure(trajectories, title="trajectories"), WIDTH_PX // 2)
+    left = _raster(trajectories_figure("trajectory", trajectories, "trajectories"), WIDTH_PX // 2)
     map_picture = map_figure(scene.from_above(trajectories["optimised"].positions), trajectories["optimised"])
     right = _raster(map_picture, WIDTH_PX - WIDTH_PX // 2)
     height = max(left.shape[0], right.shape[0])

@@ -25,7 +25,7 @@ from slam.pipeline.estimate import Estimate
 from slam.results.folder import RunFolder
 from slam.results.gps import gps_metrics
 from slam.results.metrics import (
-    Coverage,
+    CoverageMetrics,
     Event,
     GraphMetrics,
     LearnedDepthError,
@@ -171,8 +171,8 @@ def _graph(result: Estimate) -> GraphMetrics:
         still = Missing("the estimate does not move: the truth cannot be scaled to it")
         return GraphMetrics(nodes=nodes, factors=len(factors), coverage=still)
     covered = coverage(factors, result.reference.T_world_camera, aligned.scale)
-    by_source = {source: Coverage.model_validate(shares) for source, shares in covered.by_source.items()}
-    overall = Coverage.model_validate(covered.overall)
+    by_source = {source: CoverageMetrics.model_validate(shares) for source, shares in covered.by_source.items()}
+    overall = CoverageMetrics.model_validate(covered.overall)
     return GraphMetrics(nodes=nodes, factors=len(factors), coverage=overall, coverage_by_source=by_source)
 
 

@@ -124,7 +124,7 @@ class GpsMetrics(Record):
     optimised: Known[GpsErrors] = MISSING
 
 
-class Coverage(Record):
+class CoverageMetrics(Record):
     """Share of factors inside so many per cent of their stated noise, and their number where they are of one source."""
 
     factors: Known[Count] = MISSING
@@ -138,8 +138,8 @@ class GraphMetrics(Record):
 
     nodes: Known[Count] = MISSING
     factors: Known[Count] = MISSING
-    coverage: Known[Coverage] = MISSING
-    coverage_by_source: Known[dict[str, Coverage]] = MISSING
+    coverage: Known[CoverageMetrics] = MISSING
+    coverage_by_source: Known[dict[str, CoverageMetrics]] = MISSING
 
 
 class LoopEnds(Record):

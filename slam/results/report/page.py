@@ -21,11 +21,9 @@ from slam.results.report.map_report import has_map_curve, map_error_figure, map_
 from slam.results.report.map_view import MapViews
 from slam.results.report.plots import (
     depth_figure,
-    drift_figure,
-    errors_figure,
     length_unit,
+    trajectories_figure,
     trajectories_of,
-    trajectory_figure,
 )
 from slam.results.report.tables import Cell, Table, number
 from slam.runtime.errors import SlamError
@@ -134,16 +132,18 @@ def _trajectory_picture(trajectories: Mapping[str, Trajectory], unit: str) -> Pi
         )
     else:
         caption = "Seen from above, as written; no ground truth is known. The raw network chain is scaled to the rest."
-    return _drawn(lambda: trajectory_figure(trajectories, unit=unit), "Trajectories from above", caption)
+    return _drawn(
+        lambda: trajectories_figure("trajectory", trajectories, unit=unit), "Trajectories from above", caption
+    )
 
 
 def _error_pictures(trajectories: Mapping[str, Trajectory]) -> Iterator[Picture]:
     if REFERENCE not in trajectories or len(trajectories) < 2:
         return
     caption = "Distance to the true position, after the 7-dof alignment."
-    yield _drawn(lambda: errors_figure(trajectories), "Position error over distance travelled", caption)
+    yield _drawn(lambda: trajectories_figure("errors", trajectories), "Position error over distance travelled", caption)
     caption = "Mean relative error of all segments of a length; the scale is that of the 7-dof alignment."
-    yield _drawn(lambda: drift_figure(trajectories), "Drift over segment length", caption)
+    yield _drawn(lambda: trajectories_figure("drift", trajectories), "Drift over segment length", caption)
 
 
 def _depth_error(metrics: Metrics) -> Table | None:

@@ -54,33 +54,26 @@ _LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def trajectory_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
-    """Top view, x to the right and z ahead, all estimates aligned to the reference by 7 degrees of freedom.
+def trajectories_figure(what: str, trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
+    """One of `PANELS` as a figure.
 
     Args:
+        what: ``trajectory``: top view, x to the right and z ahead; ``errors``: position error over the distance
+            travelled; ``drift``: relative errors over the length of segments. All estimates are aligned to the
+            reference by 7 degrees of freedom.
         trajectories: by name: ``reference``, ``network``, ``odometry``, ``optimised``, ``lidar``.
         title: over the figure.
         unit: of the positions where there is no reference.
-    """
-    return _figure(draw_trajectories, trajectories, title, unit, (7.4, 5.6))
-
-
-def errors_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
-    """Position error over the distance travelled, after the 7-dof alignment.
 
     Raises:
-        RunError: there is no reference.
+        RunError: there is no reference for errors and drift.
     """
-    return _figure(draw_errors, trajectories, title, unit, (7.4, 3.4))
-
-
-def drift_figure(trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
-    """Relative translation and rotation error over the length of segments, after the 7-dof alignment.
-
-    Raises:
-        RunError: there is no reference.
-    """
-    return _figure(draw_drift, trajectories, title, unit, (7.4, 3.4))
+    with figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4, 5.6 if what == "trajectory" else 3.4), layout="constrained")
+        if title:
+            figure.suptitle(title, fontsize=12)
+        PANELS[what](figure, trajectories, unit)
+    return figure
 
 
 def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
@@ -143,6 +136,9 @@ def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit:
             axes.set_xticks(sorted(lengths))
     canvas.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return [left, right]
+
+
+PANELS = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
 
 
 def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Sequence[str]) -> Figure:
@@ -210,12 +206,11 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
         RunError: an unknown ``what``, or a run without what the figure needs.
         ConfigError: as `require_figure`.
     """
-    panels = {"trajectory": draw_trajectories, "errors": draw_errors, "drift": draw_drift}
     what = [name.strip() for name in what]
-    unknown = [name for name in what if name not in panels]
+    unknown = [name for name in what if name not in PANELS]
     if unknown or not what or not runs:
         wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
-        raise RunError(f"{wanted}: give at least one run and some of {', '.join(panels)}")
+        raise RunError(f"{wanted}: give at least one run and some of {', '.join(PANELS)}")
     require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [4.6 if name == "trajectory" else 3.2 for name in what]
@@ -223,7 +218,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
         figure = new_figure(figsize=(7.4 * len(runs), sum(heights)), layout="constrained")
         grid = figure.subfigures(len(what), len(runs), squeeze=False, height_ratios=heights)
         for name, row in zip(what, grid):
-            drawn = [panels[name](part, each, length_unit(run)) for part, each, run in zip(row, contents, runs)]
+            drawn = [PANELS[name](part, each, length_unit(run)) for part, each, run in zip(row, contents, runs)]
             if name != "trajectory":
                 _share_heights(drawn)
         for part, run in zip(grid[0], runs):
@@ -256,21 +251,6 @@ def length_unit(run: RunFolder) -> str:
     """The unit of a run's trajectories and map, for the axes of a plot."""
     unit = run.metrics().unit
     return "m" if unit == METRES else unit
-
-
-def _figure(
-    draw: Callable[[FigureBase, Mapping[str, Trajectory], str], list[Axes]],
-    trajectories: Mapping[str, Trajectory],
-    title: str,
-    unit: str,
-    size: tuple[float, float],
-) -> Figure:
-    with figure_style() as new_figure:
-        figure = new_figure(figsize=size, layout="constrained")
-        if title:
-            figure.suptitle(title, fontsize=12)
-        draw(figure, trajectories, unit)
-    return figure
 
 
 @contextmanager

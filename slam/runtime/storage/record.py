@@ -71,8 +71,10 @@ class Record(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _with_reasons(cls, content: Any) -> Any:
-        if not isinstance(content, dict):
+        if isinstance(content, cls):
             return content
+        if not isinstance(content, dict):
+            raise ValueError(f"should be an object with keys, is {str(content)[:40]!r}")
         read = dict(content)
         for name, field in cls.model_fields.items():
             key = field.alias if field.alias in content else name

@@ -250,7 +250,7 @@ def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
 def test_evaluate_files(call: Call, make_run: MakeRun, kind: str) -> None:
     estimate, reference = files_of(make_run(), kind)
     code, out, _ = call("evaluate", estimate, reference, "--json")
-    expected = trajectory_metrics(read_trajectory(estimate, kind), read_trajectory(reference, kind))
+    expected = trajectory_metrics(read_trajectory(estimate, kind), read_trajectory(reference, kind)).tree()
     assert code == 0 and json.loads(out) == expected
     code, table, _ = call("evaluate", estimate, reference, "--format", kind)
     assert code == 0

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 import slam.commands.run.run
-import slam.results.metrics
+import slam.results.estimate_metrics
 from erfsfm.common.signals import Terminated
 from slam import run_slam
 from slam.config.sections import PoseGraphConfig
@@ -22,6 +22,7 @@ from slam.graph.pose_graph import PoseGraph
 from slam.pipeline.batch import SlamPipeline
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
+from slam.runtime.storage.record import Missing
 from slam.simulation.street import SimulatedStreet, SimulationOptions
 
 CheckRun = Callable[[Path], dict[str, Any]]
@@ -223,8 +224,8 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
 
     assert Result.optimised is not None
     Result.optimised.T_world_camera[:] = np.eye(4)
-    graph = slam.results.metrics._graph(Result)  # type: ignore[arg-type]
-    assert graph["coverage"] is None and "does not move" in graph["coverage_reason"]
+    graph = slam.results.estimate_metrics._graph(Result)  # type: ignore[arg-type]
+    assert isinstance(graph.coverage, Missing) and "does not move" in graph.coverage.reason
 
 
 @pytest.mark.slow

@@ -19,11 +19,9 @@ from slam.geometry.se3 import Similarity, from_rotation_vector
 from slam.results.folder import RunFolder
 from slam.results.report.plots import (
     depth_figure,
-    drift_figure,
-    errors_figure,
     plot_runs,
+    trajectories_figure,
     trajectories_of,
-    trajectory_figure,
 )
 from slam.runtime.errors import RunError
 
@@ -48,19 +46,17 @@ def moved(trajectory: Trajectory, scale: float) -> Trajectory:
     return Trajectory(trajectory.stamps, similarity.apply_to_poses(trajectory.T_world_camera))
 
 
-@pytest.mark.parametrize("figure_of", [trajectory_figure, errors_figure, drift_figure])
-def test_figures_of_a_run_are_not_blank_and_change_no_global_state(
-    make_run: MakeRun, figure_of: Callable[..., Any]
-) -> None:
+@pytest.mark.parametrize("what", ["trajectory", "errors", "drift"])
+def test_figures_of_a_run_are_not_blank_and_change_no_global_state(make_run: MakeRun, what: str) -> None:
     before = dict(mpl.rcParams)
-    figure = figure_of(trajectories_of(make_run()), "sim")
+    figure = trajectories_figure(what, trajectories_of(make_run()), "sim")
     assert not is_blank(drawn(figure))
     assert dict(mpl.rcParams) == before
 
 
 def test_without_a_reference_nothing_is_aligned_and_the_unit_is_shown(make_run: MakeRun) -> None:
     trajectories = trajectories_of(make_run(reference=False))
-    (axes,) = trajectory_figure(trajectories, unit="camera heights").axes
+    (axes,) = trajectories_figure("trajectory", trajectories, unit="camera heights").axes
     assert "camera heights" in axes.get_xlabel()
     assert axes.get_legend().get_title().get_text() == ""
     optimised = next(line for line in axes.get_lines() if line.get_label() == "Optimised")
@@ -93,7 +89,7 @@ def test_drift_of_a_known_scale_and_rotation_has_its_hand_value() -> None:
 def test_errors_need_a_reference(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(reference=False)
     with pytest.raises(RunError, match="no reference"):
-        errors_figure(trajectories_of(run))
+        trajectories_figure("errors", trajectories_of(run))
     with pytest.raises(RunError, match=r"has no reference.*plot --what trajectory"):
         plot_runs([run], ["errors"], tmp_path / "a.png")
     plot_runs([run], ["trajectory"], tmp_path / "a.png")

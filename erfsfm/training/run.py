@@ -86,7 +86,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output / "teacher", quiet)
+    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, quiet)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
@@ -143,16 +143,17 @@ def _draws(
     sharded: bool,
     config: ExperimentConfig,
     position: tuple[int, int],
-    measured: Path,
+    output: Path,
     quiet: bool,
 ) -> SnippetDraws | ShardDraws:
-    """What this process trains on; ``position``: steps done and rank; ``measured``: of the teacher."""
+    """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
-    many_views = measured_views(training, config, measured, quiet or rank > 0)
+    folder = config.teacher.cache or output / "teacher"
+    many_views = measured_views(training, config, folder, quiet or rank > 0)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 

@@ -36,11 +36,11 @@ from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordi
 from erfsfm.data.splits import merge
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
-from erfsfm.training.keeper import WeightKeeper
+from erfsfm.training.keeper import Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import OutputFolder
-from erfsfm.training.progress import ProgressLine
+from erfsfm.training.progress import StepBar
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
@@ -102,9 +102,9 @@ def train(
             lock.take(output)
             folder.write_config(config)
         _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
+    keeper.save(trainer, module)
     if not trainer.is_global_zero:
         sys.exit()
-    keeper.save(module, trainer.global_step)
     return output
 
 
@@ -260,7 +260,8 @@ def _trainer(
     # Lightning's CSV log starts by deleting an older one of its name
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
-    progress = [] if quiet else [ProgressLine(training.batch * training.processes)]
+    stops = [Patience(training.patience)] if training.patience else []
+    progress = [] if quiet else [StepBar()]
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
@@ -278,9 +279,9 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *progress],
+        callbacks=[latest, *callbacks, *stops, *progress],
         plugins=[AtomicCheckpoints()],
-        enable_progress_bar=False,
+        enable_progress_bar=not quiet,
         enable_model_summary=False,
         default_root_dir=output,
     )

@@ -45,8 +45,6 @@ class SelfSupervision(lightning.LightningModule):
         super().__init__()
         self.config = config
         self._clock = clock
-        plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
-        self._warm_up = config.model_copy(update={"loss": plain})
         geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
@@ -123,9 +121,7 @@ class SelfSupervision(lightning.LightningModule):
 
     def _config_of_step(self) -> ExperimentConfig:
         """The configuration with the loss of this step."""
-        if self.global_step < self.config.teacher.alone_steps:
-            return self._teacher_alone
-        return self._warm_up if self.global_step < self.config.loss.warm_up_steps else self.config
+        return self._teacher_alone if self.global_step < self.config.teacher.alone_steps else self.config
 
     def train(self, mode: bool = True) -> Self:
         """Training mode, except for a network that is not trained: its batch statistics would drift."""

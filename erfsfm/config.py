@@ -111,22 +111,13 @@ class LossConfig(Section):
     auto_mask: bool = Field(
         default=False, description="mask pixels whose error is smaller without warping (Godard et al. 2019)"
     )
-    warm_up_steps: int = Field(
-        default=0,
-        ge=0,
-        description="first steps with the plain L1 mean: SSIM has no gradient for large rotations, and the minimum "
-        "gives one only to the source that fits best already",
-    )
     scales: int = Field(default=4, ge=1, le=4, description="pyramid levels of the photometric error")
-    smoothness: Literal["depth-second-order", "disparity-second-order", "disparity-edge-aware"] = Field(
+    smoothness: Literal["depth-second-order", "disparity-edge-aware"] = Field(
         default="depth-second-order", description="smoothed quantity and order of its derivative"
     )
     smoothness_weight: float = Field(default=0.2, ge=0, description="weight of the smoothness term")
     mask_weight: float = Field(
         default=0.0, ge=0, description="weight of the explainability regularisation; needs network.masks"
-    )
-    consistency_weight: float = Field(
-        default=0.0, ge=0, description="weight of the depth consistency of adjacent frames (Bian et al. 2019)"
     )
 
 

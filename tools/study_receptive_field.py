@@ -3,7 +3,7 @@
 The teacher is that of many views, whose poses supervise pose networks alone. Finished trainings are not repeated and
 interrupted ones are resumed, so the same command may be given again.
 
-Example: python tools/study_receptive_field.py --dataset pack --cache pack/teacher --report study.md
+Example: python tools/study_receptive_field.py --dataset pack --cache labels --report study.md
 """
 
 from __future__ import annotations
@@ -196,9 +196,9 @@ def write_page(
     figure.parent.mkdir(parents=True, exist_ok=True)
     draw(figure, rows)
     page = PAGE.format(
-        pack="erfsfm pack --config study --dataset worlds --dataset KITTI --dataset folders --megabytes 200 "
+        pack="erfsfm pack --config study --dataset worlds --dataset KITTI --dataset folders "
         "--quality 95 --set teacher.cache=labels --output pack",
-        command="python tools/study_receptive_field.py --dataset pack --cache pack/teacher "
+        command="python tools/study_receptive_field.py --dataset pack --cache labels "
         f"--seeds {len({row.seed for row in rows})} --networks {' '.join(by_network(rows))} "
         f"--report {report.name}",
         steps=config.training.steps,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,48 +22,11 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-@dataclass(frozen=True)
-class OldNames:
-    """Keys and values of earlier releases and what they are called now, for the errors that refuse them.
-
-    Attributes:
-        keys: dotted old key or section to dotted new one; the keys of a section follow it.
-        values: dotted key and old value to new value.
-    """
-
-    keys: Mapping[str, str] = field(default_factory=dict)
-    values: Mapping[tuple[str, str], str] = field(default_factory=dict)
-
-    def refuse(self, tree: Mapping[str, Any], origin: str) -> None:
-        """Refuse a tree that holds old names.
-
-        Raises:
-            ConfigError: one line with every old name and its new one.
-        """
-        found = []
-        for key, value in _leaves(tree):
-            new_key = self._new_key(key)
-            if new_key is not None:
-                found.append(f"'{key}' is now '{new_key}'")
-            elif isinstance(value, str) and (key, value) in self.values:
-                found.append(f"'{key}: {value}' is now '{key}: {self.values[key, value]}'")
-        if found:
-            raise ConfigError(f"old names in {origin}: {'; '.join(found)}")
-
-    def _new_key(self, key: str) -> str | None:
-        if key in self.keys:
-            return self.keys[key]
-        section, _, last = key.rpartition(".")
-        new_section = self._new_key(section) if section else None
-        return None if new_section is None else f"{new_section}.{last}"
-
-
 def load_config(
     model: type[M],
     file_or_name: str | Path | None,
     overrides: Sequence[str],
     shipped: Sequence[Path],
-    old_names: OldNames | None = None,
     sections: Collection[str] | None = None,
 ) -> M:
     """Read a configuration and change some of its keys.
@@ -74,29 +36,21 @@ def load_config(
         file_or_name: a YAML file, or the name of one in a shipped folder; None for the defaults of the model.
         overrides: ``section.key=value`` each, the value in YAML; later ones win.
         shipped: folders of named configurations, the first one that has a name wins.
-        old_names: of earlier releases.
         sections: of the file that are read, without keys that are unknown now; the others keep their defaults. None
             for all sections, and no unknown key.
 
     Raises:
         ConfigError: one line that names the key and the file or override, what came and what is allowed.
     """
-    old_names = old_names or OldNames()
     tree: dict[str, Any] = {}
     origin = "the defaults"
     if file_or_name is not None:
         path = find_config(file_or_name, shipped)
         origin, tree = str(path), _read_tree(path)
         if sections is not None:
-            tree = {name: tree[name] for name in sections if name in tree}
-        old_names.refuse(tree, origin)
-        if sections is not None:
             known = set(_known_keys(model))
-            tree = {name: _only(section, name, known) for name, section in tree.items()}
+            tree = {name: _only(tree[name], name, known) for name in sections if name in tree}
     for text in overrides:
-        change: dict[str, Any] = {}
-        _override(change, text)
-        old_names.refuse(change, f"--set {text}")
         _override(tree, text)
     try:
         return model.model_validate(tree)
@@ -229,15 +183,6 @@ def _known_keys(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
         yield prefix + name
         if isinstance(declared.annotation, type) and issubclass(declared.annotation, BaseModel):
             yield from _known_keys(declared.annotation, f"{prefix}{name}.")
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys with their values; a section is one where it is empty."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _shown(value: Any) -> str:

@@ -25,7 +25,6 @@ from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.array_cache import ArrayCache
-from erfsfm.data.compact_label import decode
 from erfsfm.data.recordings import Recording
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.drive_poses import drive_poses
@@ -70,20 +69,12 @@ class DriveLabels:
 
     @property
     def weights_file(self) -> Path:
-        """Name of the weights that gave the poses; packs and what older versions measured have none."""
+        """Name of the weights that gave the poses."""
         return self.folder / "slam_weights.txt"
 
     def label_file(self, target: int) -> Path:
-        """Least and most inverse depth of one frame, as measured."""
+        """Least and most inverse depth of one frame."""
         return self.folder / f"{self.size[1]}x{self.size[0]}" / f"{target:06d}.npz"
-
-    def compact_file(self, target: int) -> Path:
-        """The same rounded, in a data set that was packed."""
-        return self.label_file(target).with_suffix(".webp")
-
-    def has_label(self, target: int) -> bool:
-        """Whether a frame has a label in either form."""
-        return self.label_file(target).is_file() or self.compact_file(target).is_file()
 
     def motion(self, first: int, sources: int) -> NDArray[np.float32]:
         """``T_source_target`` ``(N, 4, 4)`` of the snippet that begins at a frame, in camera heights."""
@@ -95,11 +86,8 @@ class DriveLabels:
         Raises:
             TrainingError: the file is missing or damaged.
         """
-        compact = self.compact_file(target)
-        path = compact if compact.is_file() else self.label_file(target)
+        path = self.label_file(target)
         try:
-            if path == compact:
-                return decode(path.read_bytes())
             with np.load(path, allow_pickle=False) as entry:
                 return entry["least"], entry["most"]
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -274,7 +262,7 @@ class ManyViewTeacher:
 
 def _missing(drive: DriveLabels, sources: int) -> Iterator[list[int]]:
     """Frames without a label yet, in portions."""
-    frames = [target for target in drive.targets(sources) if not drive.has_label(target)]
+    frames = [target for target in drive.targets(sources) if not drive.label_file(target).is_file()]
     for first in range(0, len(frames), _CHUNK):
         yield frames[first : first + _CHUNK]
 

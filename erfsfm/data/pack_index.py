@@ -1,6 +1,7 @@
 """A pack: recordings shrunk to the networks' size, in one folder with an index, ``pack.yaml``.
 
-Names, frame numbers and cameras are those of the originals, so that weights record the same training data.
+Frames to train on lie in shards, snippets to validate on in files of their own with the truth beside them. Names, frame
+numbers and cameras are those of the originals, so that weights record the same training data.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ class PackedRecording(ShardedRecording):
 class PackIndex(Section):
     """The content of ``pack.yaml``."""
 
-    recordings: list[PackedRecording]
-    shards: ShardIndex | None = None
-    sharded: list[ShardedRecording] = Field(default_factory=list, description="recordings in shards, to train on")
+    recordings: list[PackedRecording] = Field(description="snippets to validate on")
+    shards: ShardIndex
+    sharded: list[ShardedRecording] = Field(description="recordings in shards, to train on")
 
 
 def image_file(root: Path, folder: str, frame: int) -> Path:
@@ -88,11 +89,9 @@ def read_pack(root: Path) -> list[Recording]:
         raise DataError(str(error)) from error
     except ValidationError as error:
         raise DataError(f"{root / INDEX_FILE} is damaged: {first_problem(error)}; pack again") from error
-    found = [_recording(root, entry) for entry in index.recordings]
-    if index.shards is not None:
-        shards = Shards(root, index.shards)
-        found += [_sharded(shards, number, entry) for number, entry in enumerate(index.sharded)]
-    return found
+    shards = Shards(root, index.shards)
+    held_out = [_recording(root, entry) for entry in index.recordings]
+    return held_out + [_sharded(shards, number, entry) for number, entry in enumerate(index.sharded)]
 
 
 def _sharded(shards: Shards, number: int, entry: ShardedRecording) -> Recording:

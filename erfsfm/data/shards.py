@@ -1,4 +1,4 @@
-"""Tar files of a pack, its shards: the layout, and how one is read, from a disk or over HTTP.
+"""Tar files of a pack, its shards: how one is written, and read from a disk or over HTTP.
 
 The layout is WebDataset's: members whose names agree before the first dot belong together. Here they are a clip, some
 consecutive frames of one recording with what the teacher measured of them. Members are decoded as pictures and arrays
@@ -15,18 +15,17 @@ import tarfile
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from erfsfm.common.config_tree import Section
-from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.common.errors import DataError
 from erfsfm.common.files import read_bytes
 from erfsfm.common.readers.images import decode_image
 from erfsfm.data.compact_label import Bound, decode
@@ -39,7 +38,9 @@ POSES = "poses.npy"
 MOST_SNIPPETS = 32  # of a clip: its frames are these, and those that the last ones need
 _WAITS = (1.0, 4.0, 16.0)  # seconds before a further try
 _TIMEOUT = 60.0  # seconds without a byte
-_KEY = re.compile(r"(\d{6})-(\d{8})")
+_KEY = re.compile(r"(\d{6})-(\d{8})\.(.+)")
+_BLOCK = 512  # bytes of a tar file's header, to which members are filled up
+_END = 10_240  # bytes to which a tar file is filled up, of which two blocks are its end
 
 Key = tuple[int, int]  # number of a recording in the index, and of the clip's first frame
 
@@ -127,7 +128,6 @@ class Shards:
         """The clips of one shard, encoded.
 
         Raises:
-            ConfigError: webdataset is not installed.
             DataError: the shard is missing, damaged, or cannot be reached.
         """
         address = self.index.address
@@ -140,22 +140,59 @@ class Shards:
                 content = read_bytes(Path(place), self.index.most_bytes)
             except OSError as error:
                 raise DataError(f"{place} cannot be read ({error.strerror or error}): copy the pack again") from error
-        expander, grouped = webdataset("tariterators", "tar_file_expander", "group_by_keys")
+        clips: dict[Key, Clip] = {}
         try:
-            found = list(grouped(expander([{"url": place, "stream": io.BytesIO(content)}])))
+            with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
+                for member in tar:
+                    match = _KEY.fullmatch(member.name)
+                    file = tar.extractfile(member) if member.isreg() and not member.issparse() else None
+                    if match is not None and file is not None:
+                        key = int(match[1]), int(match[2])
+                        clip = clips.setdefault(key, Clip(f"{place}, {clip_name(*key)}", key[1], {}))
+                        clip.members[match[3]] = file.read()
         except (tarfile.TarError, ValueError, EOFError, OSError) as error:
             raise DataError(f"{place} is damaged ({type(error).__name__}): copy it again") from error
-        clips = {}
-        for sample in found:
-            match = _KEY.fullmatch(sample["__key__"])
-            if match is not None:
-                key = int(match[1]), int(match[2])
-                clips[key] = Clip(
-                    f"{place}, {sample['__key__']}",
-                    key[1],
-                    {name: data for name, data in sample.items() if isinstance(data, bytes)},
-                )
         return clips
+
+
+class ShardWriter:
+    """Tar files in a folder, each filled up to a number of bytes."""
+
+    def __init__(self, folder: Path, most_bytes: int) -> None:
+        self._folder = folder
+        self._most = most_bytes
+        self._number = 0
+        self._size = _END
+        self._members: list[tuple[str, bytes]] = []
+
+    def write(self, name: str, members: dict[str, bytes]) -> int:
+        """Add a clip; returns the number of the shard it is in.
+
+        Raises:
+            DataError: it is larger than a shard.
+        """
+        size = sum(_BLOCK + -(-len(data) // _BLOCK) * _BLOCK for data in members.values())
+        if size + _END > self._most:
+            raise DataError(
+                f"{len(members)} images and labels take {(size + _END) / 1e6:.2f} MB: raise --shard-megabytes, or "
+                "lower --quality"
+            )
+        if self._size + size > self._most:
+            self.close()
+        self._members += [(f"{name}.{suffix}", data) for suffix, data in members.items()]
+        self._size += size
+        return self._number
+
+    def close(self) -> None:
+        """Complete a shard; the next clip begins another."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(self._folder / shard_name(self._number), "w", format=tarfile.USTAR_FORMAT) as tar:
+            for name, data in self._members:
+                member = tarfile.TarInfo(name)
+                member.size = len(data)
+                tar.addfile(member, io.BytesIO(data))
+        self._number += 1
+        self._size, self._members = _END, []
 
 
 @dataclass(frozen=True)
@@ -175,20 +212,6 @@ def shard_name(number: int) -> str:
 def clip_name(recording: int, first: int) -> str:
     """What the members of a clip have in common."""
     return f"{recording:06d}-{first:08d}"
-
-
-def webdataset(module: str, *names: str) -> tuple[Callable[..., Any], ...]:
-    """Names of the library.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
-    try:
-        import webdataset.tariterators
-        import webdataset.writer
-    except ImportError as error:
-        raise ConfigError(f"shards need webdataset ({error}): pip install 'erfsfm-slam[shards]'") from error
-    return tuple(getattr(getattr(webdataset, module), name) for name in names)
 
 
 def _download(url: str, most: int) -> bytes:

@@ -18,13 +18,11 @@ MINIMUM_Z = 1e-3
 class Projection:
     """Where each target pixel lands in the source image.
 
-    ``grid`` ``(B, H, W, 2)`` in ``grid_sample`` coordinates (align_corners=True), ``z_source``
-    ``(B, 1, H, W)`` the depth of the target's points in the source camera, ``valid`` ``(B, 1, H, W)``
-    boolean: in front of the source camera and inside its image.
+    ``grid`` ``(B, H, W, 2)`` in ``grid_sample`` coordinates (align_corners=True), ``valid`` ``(B, 1, H, W)``: in
+    front of the source camera and inside its image, boolean.
     """
 
     grid: Tensor
-    z_source: Tensor
     valid: Tensor
 
 
@@ -49,7 +47,6 @@ def project_into_source(depth: Tensor, T_source_target: Tensor, K: Tensor) -> Pr
     inside = (normalised.abs() <= slack).all(dim=1, keepdim=True) & (z > MINIMUM_Z)
     return Projection(
         grid=normalised.reshape(batch, 2, height, width).permute(0, 2, 3, 1),
-        z_source=z.reshape(batch, 1, height, width),
         valid=inside.reshape(batch, 1, height, width),
     )
 

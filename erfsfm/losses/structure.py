@@ -1,4 +1,4 @@
-"""Losses of depth and translation against two-view geometry (the teacher), up to its scale error."""
+"""Losses of depth and motion against two-view geometry (the teacher), up to its scale error."""
 
 from __future__ import annotations
 
@@ -92,6 +92,19 @@ def step_disagreement(disparity: Tensor, bounds: Bounds) -> Tensor:
             both = second & second_on
             total = total + ((first_on - first).abs() * both).sum() / both.sum().clamp(min=1)
     return total / (2 * len(STEPS_PX))
+
+
+def rotation_disagreement(R_predicted: Tensor, R_measured: Tensor) -> Tensor:
+    """Mean chordal distance ``|R_p - R_m|_F = 2 sqrt(2) sin(angle / 2)`` over the measured rotations.
+
+    Args:
+        R_predicted: ``(..., 3, 3)``.
+        R_measured: the same shape; NaN marks what was not measured and does not count.
+    """
+    measured = torch.isfinite(R_measured).all(dim=-1).all(dim=-1)
+    difference = (R_predicted - torch.nan_to_num(R_measured)).square().sum(dim=(-2, -1))
+    distance = torch.sqrt(difference + 1e-12) * measured
+    return distance.sum() / measured.sum().clamp(min=1)
 
 
 def translation_disagreement(t_predicted: Tensor, t_measured: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Weights that a run writes: the latest, the best, and their records."""
+"""Weights that a run writes: the latest, the best, and their records; and when no better ones are waited for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, EarlyStopping
 
 import erfsfm
 from erfsfm.checkpoint import KINDS, Absent, Model, save_model
@@ -17,7 +17,7 @@ from erfsfm.common.errors import TrainingError
 from erfsfm.config import TrainedNetworks
 from erfsfm.data.splits import merge
 from erfsfm.model_record import ModelRecord, commit, read_record
-from erfsfm.training.module import SelfSupervision
+from erfsfm.training.module import DECISIVE, SelfSupervision, decisive
 
 logger = logging.getLogger(__name__)
 
@@ -26,8 +26,8 @@ class WeightKeeper(Callback):
     """Writes weights folders: the latest, the best, and those with the best poses.
 
     The best is chosen by what is trained, `decisive`; poses of a network that keeps its weights have no best.
-    The step of the last improvement is read from the record of the best weights, so that a run that is
-    killed and resumed stops at the same step as an uninterrupted one.
+    Lightning's `ModelCheckpoint` keeps the state of the loop, but it cannot keep these: the output folder may be moved
+    before a resume, and holds the latest weights as long as nothing was measured.
     """
 
     def __init__(self, output: Path, seen: list[str], command: str, validates: bool, networks: TrainedNetworks) -> None:
@@ -37,13 +37,9 @@ class WeightKeeper(Callback):
         self.validates = validates
         self._networks = networks
         self._best = dict.fromkeys(self._measures({}), math.inf)
-        self._best_step = 0
         for folder in self._best:
             if (folder / "model.yaml").is_file():
-                record = read_record(folder / "model.yaml")
-                self._best[folder] = self._measures(record.metrics)[folder]
-                if math.isfinite(self._best[folder]):
-                    self._best_step = max(self._best_step, record.step)
+                self._best[folder] = self._measures(read_record(folder / "model.yaml").metrics)[folder]
         self._saved_step = -1
 
     def on_train_batch_end(
@@ -54,40 +50,27 @@ class WeightKeeper(Callback):
             trainer.should_stop = True
 
     def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Write the validated weights; end the run after `patience` validations without improvement."""
-        if trainer.sanity_checking or not isinstance(module, SelfSupervision):
-            return
-        improved = self._improved(module.validation_metrics)
-        if improved:
-            self._best_step = trainer.global_step
-        if trainer.is_global_zero:
-            self.save(module, trainer.global_step)
-        self._best |= improved
-        training = module.config.training
-        since = trainer.global_step - self._best_step
-        if training.patience and self._best_step and since >= training.patience * training.validate_every:
-            trainer.should_stop = True
-            logger.info(
-                "stopped at step %d: no validation since step %d was better", trainer.global_step, self._best_step
-            )
+        """Write the validated weights."""
+        assert isinstance(module, SelfSupervision)
+        self.save(trainer, module)
 
     def on_exception(
         self, trainer: lightning.Trainer, module: lightning.LightningModule, exception: BaseException
     ) -> None:
         """Keep the weights so far, if they are finite."""
-        if not isinstance(module, SelfSupervision) or not trainer.is_global_zero or trainer.global_step == 0:
-            return
-        if _all_finite(module):
+        assert isinstance(module, SelfSupervision)
+        if trainer.is_global_zero and trainer.global_step > 0 and _all_finite(module):
             save_model(self._output / "last", self._model(module, trainer.global_step))
 
-    def save(self, module: SelfSupervision, step: int) -> None:
-        """Write ``last/``, and the folders whose metric is the best so far.
+    def save(self, trainer: lightning.Trainer, module: SelfSupervision) -> None:
+        """Write ``last/``, and the folders whose metric is the best so far; the first process alone does.
 
         Where validation measures nothing, or there is none, the last is the best.
 
         Raises:
             TrainingError: weights are NaN or infinite; nothing is written.
         """
+        step = trainer.global_step
         if step == self._saved_step:
             return
         if not _all_finite(module):
@@ -96,13 +79,18 @@ class WeightKeeper(Callback):
                 "training.gradient_clip or training.precision=32-true, and start again; older weights are in last/"
             )
         self._saved_step = step
+        if not trainer.is_global_zero:
+            return
         model = self._model(module, step)
         save_model(self._output / "last", model)
-        folders = set(self._improved(module.validation_metrics))
+        measured = self._measures(module.validation_metrics)
+        improved = {folder: value for folder, value in measured.items() if value < self._best[folder]}
+        folders = set(improved)
         if not self.validates or math.isinf(self._best[self._output]):
             folders.add(self._output)
         for folder in folders:
             save_model(folder, model)
+        self._best |= improved
 
     def metrics_at(self, step: int) -> dict[str, float]:
         """The measurements of the latest weights, if these are of the given step; else nothing."""
@@ -135,29 +123,36 @@ class WeightKeeper(Callback):
             measures[self._output / "best_pose"] = pose if math.isfinite(pose) else math.inf
         return measures
 
-    def _improved(self, metrics: dict[str, float]) -> dict[Path, float]:
-        return {folder: value for folder, value in self._measures(metrics).items() if value < self._best[folder]}
-
     def state_dict(self) -> dict[str, list[str]]:
         """Recordings trained on, kept over a resume with other data."""
         return {"seen": self._seen}
 
     def load_state_dict(self, state_dict: dict[str, list[str]]) -> None:
         """Add the recordings trained on before the interruption."""
-        self._seen = merge([*self._seen, *state_dict.get("seen", [])])
+        self._seen = merge([*self._seen, *state_dict["seen"]])
+
+
+class Patience(EarlyStopping):
+    """Ends a run after some validations without improvement; those that measured nothing do not count."""
+
+    def __init__(self, validations: int) -> None:
+        super().__init__(
+            DECISIVE, patience=validations, strict=False, check_finite=False, check_on_train_epoch_end=False
+        )
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Decide, and say so: Lightning's own words would come at a level that is silenced."""
+        super().on_validation_end(trainer, module)
+        if self.wait_count >= self.patience and trainer.is_global_zero:
+            logger.info("stopped at step %d: no better in %d validations", trainer.global_step, self.wait_count)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with what was seen before the interruption, and with the patience that is configured now."""
+        super().load_state_dict({**state_dict, "patience": self.patience})
 
 
 def _all_finite(module: SelfSupervision) -> bool:
     return all(bool(torch.isfinite(weights).all()) for weights in module.parameters())
-
-
-def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:
-    """The metric of a validation: error of depth, of poses where these alone are trained; less is better.
-
-    Without ground truth it is the photometric error, which needs both networks; else infinite.
-    """
-    value = metrics.get("snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf))
-    return value if math.isfinite(value) else math.inf
 
 
 def licence_of(seen: list[str]) -> str:

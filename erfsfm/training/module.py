@@ -30,6 +30,8 @@ from erfsfm.training.objective import SnippetBatch, evaluate_objective, to_netwo
 _CONSTANT = 1e-3
 _CONSTANT_STEPS = 100
 
+DECISIVE = "decisive"  # the name under which `decisive` is logged
+
 
 class SelfSupervision(lightning.LightningModule):
     """Depth and pose networks trained together from the photometric error between frames.
@@ -43,8 +45,6 @@ class SelfSupervision(lightning.LightningModule):
         super().__init__()
         self.config = config
         self._clock = clock
-        plain = config.loss.model_copy(update={"ssim_weight": 0.0, "reduction": "mean", "auto_mask": False})
-        self._warm_up = config.model_copy(update={"loss": plain})
         geometric = config.loss.model_copy(update={"photometric_weight": 0.0})
         self._teacher_alone = config.model_copy(update={"loss": geometric})
         self.depth_net, self.pose_net = build_networks(config.network)
@@ -121,9 +121,7 @@ class SelfSupervision(lightning.LightningModule):
 
     def _config_of_step(self) -> ExperimentConfig:
         """The configuration with the loss of this step."""
-        if self.global_step < self.config.teacher.alone_steps:
-            return self._teacher_alone
-        return self._warm_up if self.global_step < self.config.loss.warm_up_steps else self.config
+        return self._teacher_alone if self.global_step < self.config.teacher.alone_steps else self.config
 
     def train(self, mode: bool = True) -> Self:
         """Training mode, except for a network that is not trained: its batch statistics would drift."""
@@ -227,17 +225,24 @@ class SelfSupervision(lightning.LightningModule):
         checkpoint["known"] = self.known
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Networks that were trained; older checkpoints do not tell."""
-        self.known = checkpoint.get("known", "both" if self.config.initial_weights else self.known)
+        """Take over which networks were trained."""
+        self.known = checkpoint["known"]
 
     def on_validation_epoch_end(self) -> None:
+        """Note and log what the first process measured, by which all of them decide what to keep and when to stop."""
+        self.validation_metrics = self.trainer.strategy.broadcast(self.measured())
+        self.log_dict({f"validation/{name}": value for name, value in self.validation_metrics.items()})
+        measure = decisive(self.validation_metrics, self.config.training.networks)
+        if math.isfinite(measure):
+            self.log(DECISIVE, measure, logger=False)
+
+    def measured(self) -> dict[str, float]:
         """Mean of every metric, and the spread of the depth scale, which limits a SLAM system's scale drift."""
         means = {name: float(np.mean(values)) for name, values in self._validation.items()}
         scales = np.array(self._validation.get("depth_scale", []))
         if len(scales) > 1:
             means["depth_scale_spread"] = float(scales.std() / scales.mean())
-        self.validation_metrics = means
-        self.log_dict({f"validation/{name}": value for name, value in means.items()})
+        return means
 
     def _note(self, name: str, value: float) -> None:
         self._validation.setdefault(name, []).append(value)
@@ -252,6 +257,15 @@ class SelfSupervision(lightning.LightningModule):
                 if warped is not None:
                     board.add_image("source warped", warped[0, len(warped[0]) // 2].clamp(0, 1), self.global_step)
                 board.add_image("disparity", shown, self.global_step)
+
+
+def decisive(metrics: dict[str, float], networks: TrainedNetworks = "both") -> float:
+    """The metric of a validation: error of depth, of poses where these alone are trained; less is better.
+
+    Without ground truth it is the photometric error, which needs both networks; else infinite.
+    """
+    value = metrics.get("snippet_ate" if networks == "pose" else "abs_rel", metrics.get("photometric", math.inf))
+    return value if math.isfinite(value) else math.inf
 
 
 def learning_rate_factor(schedule: str, progress: float) -> float:

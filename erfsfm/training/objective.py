@@ -13,15 +13,16 @@ from erfsfm.common.errors import ConfigError
 from erfsfm.config import ExperimentConfig, LossConfig
 from erfsfm.geometry.camera import scale_intrinsics
 from erfsfm.geometry.transforms import pose_vector_to_matrix, with_rotation
-from erfsfm.geometry.warp import MINIMUM_Z, Projection, project_into_source, sample
-from erfsfm.losses.consistency import depth_inconsistency, rotation_disagreement
+from erfsfm.geometry.warp import Projection, project_into_source, sample
 from erfsfm.losses.photometric import photometric_error
-from erfsfm.losses.regularisation import (
-    edge_aware_smoothness,
-    explainability_prior,
-    second_order_smoothness,
+from erfsfm.losses.regularisation import edge_aware_smoothness, explainability_prior, second_order_smoothness
+from erfsfm.losses.structure import (
+    Bounds,
+    disagreement,
+    rotation_disagreement,
+    step_disagreement,
+    translation_disagreement,
 )
-from erfsfm.losses.structure import Bounds, disagreement, step_disagreement, translation_disagreement
 
 HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are then as small as initial outputs
 
@@ -92,12 +93,11 @@ def evaluate_objective(
 
 @dataclass(frozen=True)
 class _Prediction:
-    """Outputs of the networks in the images' precision; ``adjacent`` are disparities of the two nearest sources."""
+    """Outputs of the networks in the images' precision."""
 
     disparities: list[Tensor]
     pose_vectors: Tensor
     masks: list[Tensor] | None
-    adjacent: tuple[Tensor, ...]
 
     @staticmethod
     def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
@@ -117,11 +117,7 @@ class _Prediction:
             pose_vectors = pose_net(target, sources)
         else:
             pose_vectors = target.new_zeros(len(target), len(sources), 6)
-        adjacent: tuple[Tensor, ...] = ()
-        if config.loss.consistency_weight > 0:
-            nearest = [sources[k] for k in _adjacent(len(sources))]
-            adjacent = depth_net(torch.cat(nearest))[0].to(precise).chunk(len(nearest))
-        return _Prediction(disparities, pose_vectors.to(precise), masks, adjacent)
+        return _Prediction(disparities, pose_vectors.to(precise), masks)
 
 
 def needs_depth(config: ExperimentConfig) -> bool:
@@ -151,11 +147,6 @@ def _require_sizes(masks: list[Tensor], disparities: list[Tensor], config: Exper
             )
 
 
-def _adjacent(count: int) -> tuple[int, int]:
-    """Indices of the sources just before and just after the target."""
-    return count // 2 - 1, count // 2
-
-
 def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentConfig) -> ObjectiveResult:
     T_source_target = pose_vector_to_matrix(prediction.pose_vectors)
     loss = config.loss
@@ -166,7 +157,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
     elif config.teacher.rotation_weight > 0 and batch.T_source_target is not None:
         T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
-    finest: tuple[Tensor, Projection] | None = None
+    finest: Tensor | None = None
     for level in range(loss.scales if prediction.disparities else 0):
         scale = _Level.of(batch, prediction.disparities[level], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
@@ -174,7 +165,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
             warped, projection = scale.warp(T_warp)
             mask = prediction.masks[level] if prediction.masks is not None else None
             photometric = photometric + scale.photometric(warped, projection.valid, mask, loss)
-            finest = finest or (warped, projection)
+            finest = warped.reshape(batch.sources.shape) if level == 0 else finest
     terms = {"photometric": photometric, "smoothness": smoothness}
     total = loss.photometric_weight * photometric + loss.smoothness_weight * smoothness
     if prediction.masks is not None and loss.mask_weight > 0:
@@ -185,11 +176,7 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         terms |= teacher_terms
         for name, weight in config.teacher.weights.items():
             total = total + weight * teacher_terms.get(name, total.new_zeros(()))
-    if loss.consistency_weight > 0 and finest is not None:
-        terms["consistency"] = _consistency(prediction.adjacent, finest[1], batch.sources.shape[1])
-        total = total + loss.consistency_weight * terms["consistency"]
-    warped_finest = None if finest is None else finest[0].reshape(batch.sources.shape)
-    return ObjectiveResult(total, terms, prediction.disparities, T_source_target, warped_finest)
+    return ObjectiveResult(total, terms, prediction.disparities, T_source_target, finest)
 
 
 def _teacher_terms(
@@ -260,7 +247,7 @@ class _Level:
         still: Tensor | None = None
         if loss.auto_mask:
             with torch.no_grad():
-                before, after = (self.sources[:, k] for k in _adjacent(count))
+                before, after = self.sources[:, count // 2 - 1], self.sources[:, count // 2]
                 still = torch.minimum(
                     photometric_error(self.target, before, loss.ssim_weight),
                     photometric_error(self.target, after, loss.ssim_weight),
@@ -281,17 +268,4 @@ class _Level:
     def smoothness(self, loss: LossConfig) -> Tensor:
         if loss.smoothness == "depth-second-order":
             return second_order_smoothness(1 / self.disparity)
-        if loss.smoothness == "disparity-second-order":
-            return second_order_smoothness(self.disparity)
         return edge_aware_smoothness(self.disparity, self.target)
-
-
-def _consistency(adjacent: tuple[Tensor, ...], projection: Projection, count: int) -> Tensor:
-    """Depth agreement of the target with its two adjacent sources; ``projection`` has ``B * N`` entries."""
-    terms = []
-    for k, disparity in zip(_adjacent(count), adjacent):
-        part = Projection(projection.grid[k::count], projection.z_source[k::count], projection.valid[k::count])
-        depth_sampled = sample(1 / disparity, part)
-        disagreement = depth_inconsistency(part.z_source.clamp(min=MINIMUM_Z), depth_sampled)
-        terms.append(disagreement[part.valid].mean() if part.valid.any() else depth_sampled.sum() * 0)
-    return torch.stack(terms).mean()

@@ -89,7 +89,7 @@ def _steps_of(checkpoint: Path) -> int:
     """Steps done at a checkpoint. Only tensors and plain values are read: no code in it can run."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-        missing = {"global_step", "state_dict", "optimizer_states", "loops"} - set(state)
+        missing = {"global_step", "state_dict", "optimizer_states", "loops", "known"} - set(state)
         if missing:
             raise KeyError(*sorted(missing))
         if {name.partition(".")[0] for name in state["state_dict"]} != {"depth_net", "pose_net"}:

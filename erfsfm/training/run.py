@@ -36,11 +36,11 @@ from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordi
 from erfsfm.data.splits import merge
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
-from erfsfm.training.keeper import WeightKeeper
+from erfsfm.training.keeper import Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import OutputFolder
-from erfsfm.training.progress import ProgressLine
+from erfsfm.training.progress import StepBar
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output / "teacher", quiet)
+    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, quiet)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
@@ -102,9 +102,9 @@ def train(
             lock.take(output)
             folder.write_config(config)
         _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
+    keeper.save(trainer, module)
     if not trainer.is_global_zero:
         sys.exit()
-    keeper.save(module, trainer.global_step)
     return output
 
 
@@ -143,16 +143,17 @@ def _draws(
     sharded: bool,
     config: ExperimentConfig,
     position: tuple[int, int],
-    measured: Path,
+    output: Path,
     quiet: bool,
 ) -> SnippetDraws | ShardDraws:
-    """What this process trains on; ``position``: steps done and rank; ``measured``: of the teacher."""
+    """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
-    many_views = measured_views(training, config, measured, quiet or rank > 0)
+    folder = config.teacher.cache or output / "teacher"
+    many_views = measured_views(training, config, folder, quiet or rank > 0)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
@@ -259,7 +260,8 @@ def _trainer(
     # Lightning's CSV log starts by deleting an older one of its name
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
-    progress = [] if quiet else [ProgressLine(training.batch * training.processes)]
+    stops = [Patience(training.patience)] if training.patience else []
+    progress = [] if quiet else [StepBar()]
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
@@ -277,9 +279,9 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *progress],
+        callbacks=[latest, *callbacks, *stops, *progress],
         plugins=[AtomicCheckpoints()],
-        enable_progress_bar=False,
+        enable_progress_bar=not quiet,
         enable_model_summary=False,
         default_root_dir=output,
     )

@@ -35,14 +35,14 @@ def _predictor(weights: str) -> DepthPosePredictor:
 
 
 def measured_views(
-    recordings: list[Recording], config: ExperimentConfig, default: Path, quiet: bool
+    recordings: list[Recording], config: ExperimentConfig, folder: Path, quiet: bool
 ) -> ManyViewTeacher | None:
     """The teacher, with what is not there yet measured; None where the experiment has no many views.
 
     Args:
         recordings: to train on.
-        config: its ``teacher.cache`` is the folder of the measurements.
-        default: that folder if it names none.
+        config: of the experiment.
+        folder: of the measurements.
         quiet: no progress bar.
     """
     if config.teacher.views != "many":
@@ -51,7 +51,7 @@ def measured_views(
     measures: Measures = "poses" if config.training.networks == "pose" else "depth and poses"
     cache_mb = labels_mb(config.data)
     guess = GuessedDepth(config.teacher.slam_weights)
-    teacher = ManyViewTeacher(config.teacher.cache or default, size, config.teacher.stride, cache_mb, measures, guess)
+    teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, measures, guess)
     with stage_bars(quiet) as show:
         teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
     return teacher

@@ -20,6 +20,7 @@ from erfsfm.data.pack_index import (
     poses_file,
     write_index,
 )
+from erfsfm.data.shards import ShardIndex
 
 CAMERA = PackedCamera(width=64, height=32, fx=40, fy=41, cx=31, cy=15)
 
@@ -41,7 +42,8 @@ def packed(tmp_path: Path) -> Path:
     entry = PackedRecording(
         name="kitti_odometry/00", start=7, frames=3, folder="0000", camera=CAMERA, poses=True, depth=[8]
     )
-    write_index(tmp_path, PackIndex(recordings=[entry]))
+    shards = ShardIndex(files=1, most_bytes=1000, sources=2, stride=1)
+    write_index(tmp_path, PackIndex(recordings=[entry], shards=shards, sharded=[]))
     return tmp_path
 
 

@@ -3,7 +3,13 @@ import math
 import pytest
 import torch
 
-from erfsfm.losses.structure import Bounds, disagreement, step_disagreement, translation_disagreement
+from erfsfm.losses.structure import (
+    Bounds,
+    disagreement,
+    rotation_disagreement,
+    step_disagreement,
+    translation_disagreement,
+)
 
 
 def bounds(least: float, most: float) -> Bounds:
@@ -111,3 +117,16 @@ def test_steps_to_pixels_without_a_label_do_not_count():
     disparity = torch.rand(1, 1, 8, 8, requires_grad=True)
     step_disagreement(disparity, Bounds(least, most)).backward()
     assert disparity.grad is not None and not disparity.grad[..., ::2, :].any() and disparity.grad[..., 1::2, :].any()
+
+
+def test_rotation_disagreement_is_the_chordal_distance_to_measured_rotations():
+    angle = 0.3
+    turned = torch.eye(3).repeat(1, 2, 1, 1)
+    turned[0, 0, :2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    measured = torch.eye(3).repeat(1, 2, 1, 1)
+    measured[0, 1] = torch.nan
+    predicted = turned.clone().requires_grad_()
+    distance = rotation_disagreement(predicted, measured)
+    assert distance.item() == pytest.approx(2 * math.sqrt(2) * math.sin(angle / 2), abs=1e-5)
+    distance.backward()
+    assert torch.isfinite(predicted.grad).all() and (predicted.grad[0, 1] == 0).all()

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from erfsfm.checkpoint import load_model
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.config import ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
-from erfsfm.training.pack import PackSummary, pack
+from erfsfm.data.snippets import ValidationSnippets, split_recordings
+from erfsfm.training.pack import pack
 from erfsfm.training.run import train, trained_on
 
 Small = dict[str, dict[str, Any]]
@@ -64,51 +63,11 @@ def measure(config: ExperimentConfig) -> None:
 
 
 def on_pack(config: ExperimentConfig, output: Path) -> ExperimentConfig:
-    data = config.data.model_copy(update={"roots": [output]})
-    teacher = config.teacher.model_copy(update={"cache": output / "teacher"})
-    return config.model_copy(update={"data": data, "teacher": teacher})
-
-
-def size_of(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def draws(config: ExperimentConfig) -> SnippetDraws:
-    assert config.teacher.cache is not None
-    teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
-    return SnippetDraws(split_recordings(config.data)[0], config, 100, many_views=teacher)
-
-
-def test_it_trains_with_the_same_record_licence_and_resume(config: ExperimentConfig, tmp_path: Path) -> None:
-    done = pack(config, tmp_path / "pack", megabytes=5)
-    assert (done.real_frames, done.simulated_frames, done.frames_left_out) == (9, 45, 0)
-    files = sorted((tmp_path / "pack").rglob("*"))
-    original = load_model(train(config, tmp_path / "original", device="cpu")).record
-    packed = on_pack(config, tmp_path / "pack")
-    record = load_model(train(packed, tmp_path / "packed", device="cpu")).record
-    assert record.trained_on == original.trained_on == ["simulated/0-2", "kitti_odometry/00[2:11]"]
-    assert record.licence == original.licence
-    assert record.metrics.keys() == original.metrics.keys() >= {"abs_rel", "photometric"}
-    longer = packed.model_copy(update={"training": packed.training.model_copy(update={"steps": 6})})
-    train(longer, tmp_path / "packed", resume=True, device="cpu")
-    assert load_model(tmp_path / "packed" / "last").record.step == 6
-    assert sorted((tmp_path / "pack").rglob("*")) == files, "training measures nothing anew"
-
-
-def test_samples_are_those_of_the_originals(config: ExperimentConfig, tmp_path: Path) -> None:
-    pack(config, tmp_path / "pack", megabytes=5, quality=95)
-    original, packed = draws(config), draws(on_pack(config, tmp_path / "pack"))
-    for number in range(8):
-        one, other = original.draw(number), packed.draw(number)
-        assert (other["target"] - one["target"]).abs().mean() < 0.03
-        torch.testing.assert_close(other["K"], one["K"])
-        torch.testing.assert_close(other["T_source_target"], one["T_source_target"])
-        for bound in ("least", "most"):
-            torch.testing.assert_close(other[bound], one[bound], atol=0, rtol=0.03)
+    return config.model_copy(update={"data": config.data.model_copy(update={"roots": [output]})})
 
 
 def test_validation_is_on_the_same_snippets_with_their_truth(config: ExperimentConfig, tmp_path: Path) -> None:
-    pack(config, tmp_path / "pack", megabytes=5)
+    pack(config, tmp_path / "pack")
     _, held_out = split_recordings(config.data)
     _, packed = split_recordings(on_pack(config, tmp_path / "pack").data)
     original, again = ValidationSnippets(held_out, config), ValidationSnippets(packed, config)
@@ -125,8 +84,8 @@ def test_images_that_cannot_be_read_are_left_out(
     for frame in (5, 8):
         (roots[0] / f"sequences/00/image_2/{frame:06d}.png").write_bytes(b"no image")
     config = config.model_copy(update={"teacher": TeacherConfig()})
-    done = pack(config, tmp_path / "pack", megabytes=5)
-    assert (done.real_frames, done.simulated_frames) == (3, 45)  # 2 to 4; 6 and 7, 9 and 10 are no snippet
+    done = pack(config, tmp_path / "pack")
+    assert done.frames == 3 + 45  # 2 to 4; 6 and 7, 9 and 10 are no snippet
     assert "2 of 54 images cannot be read; 6 are left out" in caplog.text and "000005.png" in caplog.text
     packed = split_recordings(on_pack(config, tmp_path / "pack").data)[0]
     assert trained_on(packed) == ["simulated/0-2", "kitti_odometry/00[2:5]"]
@@ -135,29 +94,8 @@ def test_images_that_cannot_be_read_are_left_out(
     data = config.data.model_copy(update={"roots": roots[:1], "validation": []})
     config = config.model_copy(update={"data": data})
     with pytest.raises(DataError, match=r"no 3 consecutive images can be read: image .*000002\.png"):
-        pack(config, tmp_path / "nothing", megabytes=5)
+        pack(config, tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
-
-
-def test_simulated_drives_are_shortened_until_all_fits(config: ExperimentConfig, tmp_path: Path) -> None:
-    whole = pack(config, tmp_path / "whole", megabytes=5)
-    limit = whole.size - 10_000
-    done = pack(config, tmp_path / "pack", megabytes=limit / 1e6)
-    assert done.size == size_of(tmp_path / "pack") <= limit
-    assert done.real_frames == whole.real_frames
-    assert 0 < done.simulated_frames == whole.simulated_frames - done.frames_left_out < whole.simulated_frames
-    assert done.labels == whole.labels - done.labels_left_out == len(list((tmp_path / "pack").rglob("*.webp")))
-    packed = split_recordings(on_pack(config, tmp_path / "pack").data)[0]
-    assert trained_on(packed) == trained_on(split_recordings(config.data)[0])
-    worlds = [len(recording) for recording in packed if recording.name.startswith("simulated/")]
-    assert max(worlds) - min(worlds) <= max(0, max(worlds) - 10), "the longest lose first"
-    draws(on_pack(config, tmp_path / "pack")).draw(0)
-
-
-def test_real_recordings_that_do_not_fit_are_one_line(config: ExperimentConfig, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"0\.\d MB more at least: allow more --megabytes") as caught:
-        pack(config, tmp_path / "pack", megabytes=0.001)
-    assert "\n" not in str(caught.value) and not (tmp_path / "pack").exists()
 
 
 def test_what_is_there_is_never_overwritten(config: ExperimentConfig, tmp_path: Path) -> None:
@@ -192,8 +130,8 @@ def test_drives_without_a_teacher_keep_their_stops_out(
     drive = write_raw(tmp_path / "raw", drive="2011_10_03_drive_0099", speeds=[5] * 6 + [0] * 3 + [5] * 6)
     tree = small | {"data": small["data"] | {"roots": [drive], "exclude": []}}
     config = ExperimentConfig.model_validate(tree)
-    done: PackSummary = pack(config, tmp_path / "pack")
-    assert (done.real_frames, done.labels) == (24, 0)
+    done = pack(config, tmp_path / "pack")
+    assert (done.frames, done.labels) == (24, 0)
     names = [recording.frames_name for recording in discover(tmp_path / "pack")]
     assert names == [f"kitti_raw/2011_10_03_drive_0099{frames}" for frames in ("[0:6]", "[9:15]") * 2]
     train(on_pack(config, tmp_path / "pack"), tmp_path / "run", device="cpu")

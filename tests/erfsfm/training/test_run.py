@@ -34,8 +34,8 @@ from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.model_record import ModelRecord
-from erfsfm.training.keeper import decisive, licence_of
-from erfsfm.training.module import SelfSupervision, learning_rate_factor
+from erfsfm.training.keeper import licence_of
+from erfsfm.training.module import SelfSupervision, decisive, learning_rate_factor
 from erfsfm.training.run import train
 
 Small = dict[str, dict[str, object]]
@@ -279,14 +279,7 @@ def test_resuming_a_finished_run_changes_nothing(small: Small, world: Path, held
 def test_the_best_weights_stay_in_the_output_folder(
     small: Small, world: Path, held_out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    quality = iter([0.3, 0.2, 0.5, float("nan")])
-    original = SelfSupervision.on_validation_epoch_end
-
-    def scripted_validation(self: SelfSupervision) -> None:
-        original(self)
-        self.validation_metrics["abs_rel"] = next(quality)
-
-    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", scripted_validation)
+    scripted_validation(monkeypatch, "abs_rel", [0.3, 0.2, 0.5, math.nan])
     config = configure(small, [world, held_out], training={"steps": 4, "validate_every": 1})
     output = train(config, tmp_path / "run", device="cpu")
     assert load_model(output).record.step == 2
@@ -296,13 +289,12 @@ def test_the_best_weights_stay_in_the_output_folder(
 
 def scripted_validation(monkeypatch: pytest.MonkeyPatch, name: str, values: list[float]) -> None:
     """Let the k-th validation of the run, counted by its steps, measure the k-th value."""
-    original = SelfSupervision.on_validation_epoch_end
+    original = SelfSupervision.measured
 
-    def on_validation_epoch_end(self: SelfSupervision) -> None:
-        original(self)
-        self.validation_metrics[name] = values[self.global_step - 1]
+    def measured(self: SelfSupervision) -> dict[str, float]:
+        return original(self) | {name: values[self.global_step - 1]}
 
-    monkeypatch.setattr(SelfSupervision, "on_validation_epoch_end", on_validation_epoch_end)
+    monkeypatch.setattr(SelfSupervision, "measured", measured)
 
 
 def poses_measured(world: Path, folder: Path) -> dict[str, Any]:
@@ -764,6 +756,21 @@ def test_workers_start_where_opencv_has_threads(small: Small, world: Path, tmp_p
         cv2.setNumThreads(threads)
 
 
+def test_the_progress_bar_counts_all_steps_on_stderr(
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    config = configure(small, [world, held_out])
+    interrupted(monkeypatch, config, tmp_path / "run", 3)
+    train(config, tmp_path / "run", resume=True, device="cpu", quiet=False)
+    out, err = capfd.readouterr()
+    assert out == "" and "4/4" in err and "loss:" in err
+
+
 def test_lightning_prints_nothing(
     small: Small,
     world: Path,
@@ -812,11 +819,43 @@ def test_half_precision_on_a_cpu_is_announced(
     ]
 
 
-@pytest.mark.slow  # each process imports torch and Lightning
 def free_port() -> int:
     with socket.socket() as each:
         each.bind(("127.0.0.1", 0))
         return int(each.getsockname()[1])
+
+
+def in_processes(config: ExperimentConfig, output: Path, resume: bool = False, before: str = "") -> None:
+    """Train in as many processes as the configuration names; each first runs the lines ``before``.
+
+    Lightning starts the script again for a second device.
+    """
+    script, file = output.with_suffix(".py"), output.with_suffix(".yaml")
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
+        "from erfsfm.training.module import SelfSupervision\nfrom erfsfm.training.run import train\n"
+        f"{before}\n"
+        "if __name__ == '__main__':\n"
+        "    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), '--resume' in sys.argv, device='cpu')\n"
+        "    print('trained')\n"
+    )
+    file.write_text(dump_yaml(config))
+    command = [sys.executable, str(script), str(file), str(output), *(["--resume"] if resume else [])]
+    nodes = config.training.nodes
+    at = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())} if config.training.processes > 1 else {}
+    started = [
+        subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **at, "NODE_RANK": str(node)},
+        )
+        for node in range(nodes)
+    ]
+    said = [process.communicate(timeout=300) for process in started]
+    assert [process.returncode for process in started] == [0] * nodes, said
+    assert "".join(out for out, _ in said) == "trained\n", "by the first process alone"
 
 
 @pytest.mark.slow
@@ -824,36 +863,11 @@ def free_port() -> int:
 def test_two_processes_are_one_with_twice_the_batch(
     small: Small, world: Path, held_out: Path, tmp_path: Path, spread: str, workers: int
 ) -> None:
-    """Batches of 2 in each of two processes; of 4 in one. Lightning starts the script again for a second device."""
-    script = tmp_path / "train.py"
-    script.write_text(
-        "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
-        "from erfsfm.training.run import train\n"
-        "if __name__ == '__main__':\n"
-        "    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), '--resume' in sys.argv, device='cpu')\n"
-        "    print('trained')\n"
-    )
+    """Batches of 2 in each of two processes; of 4 in one."""
 
     def run(name: str, resume: bool = False, **training: Any) -> None:
         config = configure(small, [world, held_out], training=training, data={"workers": workers})
-        file = tmp_path / f"{name}.yaml"
-        file.write_text(dump_yaml(config))
-        command = [sys.executable, str(script), str(file), str(tmp_path / name), *(["--resume"] if resume else [])]
-        nodes = config.training.nodes
-        at = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())} if nodes > 1 else {}
-        started = [
-            subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                env={**os.environ, **at, "NODE_RANK": str(node)},
-            )
-            for node in range(nodes)
-        ]
-        said = [process.communicate(timeout=300) for process in started]
-        assert [process.returncode for process in started] == [0] * nodes, said
-        assert "".join(out for out, _ in said) == "trained\n", "by the first process alone"
+        in_processes(config, tmp_path / name, resume)
 
     run("one", batch=4)
     run("two", batch=2, **{spread: 2})
@@ -865,3 +879,18 @@ def test_two_processes_are_one_with_twice_the_batch(
     run("one", resume=True, batch=4, steps=6)
     for one, two in zip(weights_of(tmp_path / "one" / "last"), weights_of(tmp_path / "two" / "last"), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)  # Adam divides by small moments
+
+
+@pytest.mark.slow
+def test_two_processes_stop_together_though_they_measure_different_things(
+    small: Small, world: Path, held_out: Path, tmp_path: Path
+) -> None:
+    """Each has statistics of its own batches, and thus errors of its own; the first one's decide."""
+    training = {"steps": 6, "validate_every": 1, "patience": 1, "devices": 2}
+    measured = (
+        "SelfSupervision.measured = lambda self: "
+        "{'abs_rel': ([0.3, 0.2, 0.5] if self.global_rank == 0 else [0.3, 0.2, 0.1])[self.global_step - 1]}"
+    )
+    in_processes(configure(small, [world, held_out], training=training), tmp_path / "run", before=measured)
+    assert load_model(tmp_path / "run" / "last").record.step == 3
+    assert load_model(tmp_path / "run").record.metrics == {"abs_rel": 0.2}

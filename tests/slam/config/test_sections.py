@@ -1,10 +1,8 @@
-import re
 from pathlib import Path
 
 import pytest
 import yaml
 
-from slam.config.files import OLD_NAMES
 from slam.config.sections import SlamConfig, dump_yaml, load_config
 from slam.runtime.errors import ConfigError
 
@@ -64,34 +62,6 @@ def test_wrong_override_is_one_clear_line(override, parts):
     assert "\n" not in str(caught.value)
     for part in parts:
         assert part in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("geometry.foresight=false", "'geometry.foresight' is now 'geometry.predicted_flow'"),
-        ("scale.road_top_share=0.4", "'scale.road_top_share' is now 'scale.road_top_ratio'"),
-        ("bridging.enabled=false", "'bridging.enabled' is now 'gaps.enabled'"),
-        ("frontend.use=bridge", "'frontend.use: bridge' is now 'frontend.use: gaps'"),
-    ],
-)
-def test_an_old_key_is_refused_with_its_new_name(tmp_path, override, words):
-    with pytest.raises(ConfigError, match=re.escape(words)):
-        load_config(None, [override])
-    section, key, value = re.split(r"[.=]", override, maxsplit=2)
-    path = tmp_path / "old.yaml"
-    path.write_text(f"{section}: {{{key}: {value}}}\n")
-    with pytest.raises(ConfigError, match=rf"old\.yaml: {re.escape(words)}"):
-        load_config(path)
-
-
-def test_every_new_name_of_an_old_key_exists():
-    tree = SlamConfig().model_dump()
-    for old, new in OLD_NAMES.keys.items():
-        section, _, key = new.partition(".")
-        assert section in tree and (not key or key in tree[section]), new
-        section, _, key = old.partition(".")
-        assert section not in tree or key not in tree[section], old
 
 
 @pytest.mark.parametrize("text", ["[" * 3000, "a: &a [*a]"])

@@ -30,8 +30,8 @@ from erfsfm.config import ExperimentConfig, dump_yaml
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.training.pack import pack
 from erfsfm.training.run import train
-from erfsfm.training.shard_pack import ShardSummary, pack_shards
 
 Small = dict[str, dict[str, Any]]
 SIZE, STRIDE = (32, 64), 3
@@ -82,11 +82,11 @@ def measure(config: ExperimentConfig) -> None:
 
 
 @pytest.fixture
-def pack(config: ExperimentConfig, shared: Path) -> Path:
+def packed(config: ExperimentConfig, shared: Path) -> Path:
     """Its shards, of a few clips each."""
     output = shared / "pack"
     if not output.exists():
-        pack_shards(config, output, megabytes=0.15, quality=95)
+        pack(config, output, megabytes=0.15, quality=95)
     return output
 
 
@@ -119,8 +119,8 @@ def snippets_of(config: ExperimentConfig) -> int:
     return sum(len(recording) - config.network.sources for recording in split_recordings(config.data)[0])
 
 
-def test_every_snippet_comes_once_a_pass_in_an_order_of_the_seed(config: ExperimentConfig, pack: Path) -> None:
-    config = photometric(on_pack(config, pack))
+def test_every_snippet_comes_once_a_pass_in_an_order_of_the_seed(config: ExperimentConfig, packed: Path) -> None:
+    config = photometric(on_pack(config, packed))
     total = snippets_of(config)
     assert total == sum(FRAMES.values()) - 2 * len(FRAMES)
     seen = frames(draws(config, 2 * total))
@@ -133,9 +133,9 @@ def test_every_snippet_comes_once_a_pass_in_an_order_of_the_seed(config: Experim
 
 @pytest.mark.parametrize(("nodes", "workers"), [(2, 0), (2, 2), (1, 2)])
 def test_processes_and_workers_share_a_pass_without_overlap(
-    config: ExperimentConfig, pack: Path, nodes: int, workers: int
+    config: ExperimentConfig, packed: Path, nodes: int, workers: int
 ) -> None:
-    config = changed(photometric(on_pack(config, pack, workers=workers)), training={"nodes": nodes, "batch": 2})
+    config = changed(photometric(on_pack(config, packed, workers=workers)), training={"nodes": nodes, "batch": 2})
     total = snippets_of(config)
     part = total // 2 // (2 * nodes) * 2 * nodes  # lanes are of unequal length: none reaches its second pass
 
@@ -149,11 +149,11 @@ def test_processes_and_workers_share_a_pass_without_overlap(
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_samples_are_those_of_the_originals(config: ExperimentConfig, pack: Path, weight: float) -> None:
+def test_samples_are_those_of_the_originals(config: ExperimentConfig, packed: Path, weight: float) -> None:
     """The motion that warps the images is there without a term of the teacher, too."""
     weights = dict.fromkeys(("structure_weight", "translation_weight"), weight)
     config = config.model_copy(update={"teacher": config.teacher.model_copy(update=weights)})
-    on_shards = on_pack(config, pack)
+    on_shards = on_pack(config, packed)
     assert in_shards(*split_recordings(on_shards.data))
     assert config.teacher.cache is not None
     teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
@@ -175,31 +175,31 @@ def test_samples_are_those_of_the_originals(config: ExperimentConfig, pack: Path
 
 
 def test_ranges_weights_and_several_packs_choose_among_the_shards(
-    config: ExperimentConfig, pack: Path, shared: Path
+    config: ExperimentConfig, packed: Path, shared: Path
 ) -> None:
-    part = photometric(on_pack(config, pack, ranges={"simulated/2": "50:90"}, exclude=["simulated/0", "simulated/1"]))
+    part = photometric(on_pack(config, packed, ranges={"simulated/2": "50:90"}, exclude=["simulated/0", "simulated/1"]))
     recordings = split_recordings(part.data)[0]
     names = sorted(recording.frames_name for recording in recordings)
     assert names == ["kitti_odometry/00[0:45]", "simulated/2[50:90]"]
     total = snippets_of(part)
     assert set(Counter(frames(draws(part, total))).values()) == {1}
-    heavy = photometric(on_pack(config, pack, weights={"simulated": 1.0, "kitti": 9.0}))
+    heavy = photometric(on_pack(config, packed, weights={"simulated": 1.0, "kitti": 9.0}))
     which = [name.startswith("kitti") for name in (r.name for r in split_recordings(heavy.data)[0])]
     share = np.mean([which[row[0] // 20_000_000] for row in frames(draws(heavy, snippets_of(heavy)))])
     assert share == pytest.approx(0.9, abs=0.05), "of the samples; 0.17 of the frames"
     second = shared / "second"
     if not second.exists():
         alone = photometric(changed(config, data={"roots": [shared / "simulated/1"], "validation": []}))
-        pack_shards(alone, second, megabytes=0.15)
-    both = photometric(on_pack(config, pack, second))
+        pack(alone, second, megabytes=0.15)
+    both = photometric(on_pack(config, packed, second))
     assert set(Counter(frames(draws(both, snippets_of(both)))).values()) == {1}
 
 
 def test_it_trains_with_the_same_record_and_resumes_to_the_same_weights(
-    config: ExperimentConfig, pack: Path, tmp_path: Path
+    config: ExperimentConfig, packed: Path, tmp_path: Path
 ) -> None:
-    on_shards = on_pack(config, pack)
-    before = sorted(pack.rglob("*"))
+    on_shards = on_pack(config, packed)
+    before = sorted(packed.rglob("*"))
     record = load_model(train(on_shards, tmp_path / "whole", device="cpu")).record
     assert record.trained_on == ["simulated/0-2", "kitti_odometry/00[0:45]"]
     assert record.metrics.keys() >= {"abs_rel", "photometric"}
@@ -208,11 +208,11 @@ def test_it_trains_with_the_same_record_and_resumes_to_the_same_weights(
     whole, cut = (load_model(tmp_path / name / "last") for name in ("whole", "cut"))
     for one, other in zip(whole.depth_net.state_dict().values(), cut.depth_net.state_dict().values(), strict=True):
         assert torch.equal(one, other)
-    assert sorted(pack.rglob("*")) == before, "nothing is measured anew"
+    assert sorted(packed.rglob("*")) == before, "nothing is measured anew"
 
 
 @pytest.mark.slow
-def test_two_nodes_train_on_different_shards(config: ExperimentConfig, pack: Path, tmp_path: Path) -> None:
+def test_two_nodes_train_on_different_shards(config: ExperimentConfig, packed: Path, tmp_path: Path) -> None:
     """On loopback. Were their samples the same, so would be the mean of their gradients, and the weights of one."""
     script = tmp_path / "train.py"
     script.write_text(
@@ -224,7 +224,7 @@ def test_two_nodes_train_on_different_shards(config: ExperimentConfig, pack: Pat
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    on_shards = on_pack(config, pack, workers=1)
+    on_shards = on_pack(config, packed, workers=1)
     (tmp_path / "two.yaml").write_text(dump_yaml(changed(on_shards, training={"nodes": 2})))
     command = [sys.executable, str(script), str(tmp_path / "two.yaml"), str(tmp_path / "two")]
     at = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
@@ -239,32 +239,32 @@ def test_two_nodes_train_on_different_shards(config: ExperimentConfig, pack: Pat
 
 
 @pytest.fixture
-def server(pack: Path) -> Iterator[str]:
+def server(packed: Path) -> Iterator[str]:
     """The address of the shards' folder."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
             pass
 
-    handler = functools.partial(Quiet, directory=str(pack / "shards"))
+    handler = functools.partial(Quiet, directory=str(packed / "shards"))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as served:
         threading.Thread(target=served.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{served.server_address[1]}"
         served.shutdown()
 
 
-def moved(pack: Path, folder: Path, address: str) -> Path:
+def moved(packed: Path, folder: Path, address: str) -> Path:
     """The pack without its shards, which are at an address."""
-    shutil.copytree(pack, folder, ignore=shutil.ignore_patterns("shards"))
+    shutil.copytree(packed, folder, ignore=shutil.ignore_patterns("shards"))
     index = folder / "pack.yaml"
     index.write_text(index.read_text().replace("address: shards", f"address: {address}"))
     return folder
 
 
-def test_shards_may_be_far_away(config: ExperimentConfig, pack: Path, server: str, tmp_path: Path) -> None:
-    far = on_pack(config, moved(pack, tmp_path / "far", server))
-    assert frames(draws(far, 50)) == frames(draws(on_pack(config, pack), 50))
-    nowhere = on_pack(config, moved(pack, tmp_path / "nowhere", f"{server}/elsewhere"))
+def test_shards_may_be_far_away(config: ExperimentConfig, packed: Path, server: str, tmp_path: Path) -> None:
+    far = on_pack(config, moved(packed, tmp_path / "far", server))
+    assert frames(draws(far, 50)) == frames(draws(on_pack(config, packed), 50))
+    nowhere = on_pack(config, moved(packed, tmp_path / "nowhere", f"{server}/elsewhere"))
     with pytest.raises(DataError, match="404: File not found; is the address") as caught:
         frames(draws(nowhere, 2))
     assert "\n" not in str(caught.value)
@@ -290,13 +290,13 @@ class Shell:
 
 
 def test_nothing_in_a_shard_is_executed(
-    config: ExperimentConfig, pack: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: ExperimentConfig, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     buffer = io.BytesIO()
     np.save(buffer, np.array([Shell()], dtype=object), allow_pickle=True)
     for number, bad in enumerate((pickle.dumps(Shell()), buffer.getvalue())):
-        hostile = shutil.copytree(pack, tmp_path / f"hostile{number}")
+        hostile = shutil.copytree(packed, tmp_path / f"hostile{number}")
         for shard in (hostile / "shards").iterdir():
             rewrite(shard, lambda name, data: bad if name.endswith(".npy") else data)  # noqa: B023
         with pytest.raises(DataError, match="the poses are damaged"):
@@ -316,9 +316,9 @@ def test_nothing_in_a_shard_is_executed(
     ],
 )
 def test_a_damaged_shard_is_one_line(
-    config: ExperimentConfig, pack: Path, tmp_path: Path, damage: Callable[[Path], None], message: str
+    config: ExperimentConfig, packed: Path, tmp_path: Path, damage: Callable[[Path], None], message: str
 ) -> None:
-    broken = shutil.copytree(pack, tmp_path / "broken")
+    broken = shutil.copytree(packed, tmp_path / "broken")
     for shard in (broken / "shards").iterdir():
         damage(shard)
     with pytest.raises(DataError, match=message) as caught:
@@ -326,24 +326,24 @@ def test_a_damaged_shard_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_what_does_not_fit_is_refused(config: ExperimentConfig, pack: Path, shared: Path, tmp_path: Path) -> None:
-    on_shards = on_pack(config, pack)
+def test_what_does_not_fit_is_refused(config: ExperimentConfig, packed: Path, shared: Path, tmp_path: Path) -> None:
+    on_shards = on_pack(config, packed)
     with pytest.raises(DataError, match="hold snippets of 3 images of 64 x 32, the experiment wants 3 of 96 x 32"):
         draws(changed(on_shards, network={"width": 96}), 2)
     with pytest.raises(DataError, match="too few for 99 data loader processes"):
         draws(changed(on_shards, data={"workers": 99}), 2)
     with pytest.raises(DataError, match="not in shards as simulated/0 is"):
-        in_shards(*split_recordings(on_pack(config, pack, shared / "simulated/1").data))
+        in_shards(*split_recordings(on_pack(config, packed, shared / "simulated/1").data))
     with pytest.raises(DataError, match="lies in shards, which are to train on: pack again"):
-        train(on_pack(config, pack, validation=["simulated/1", "simulated/500"]), tmp_path / "run", device="cpu")
-    plain: ShardSummary = pack_shards(photometric(config), tmp_path / "plain", megabytes=0.3)
+        train(on_pack(config, packed, validation=["simulated/1", "simulated/500"]), tmp_path / "run", device="cpu")
+    plain = pack(photometric(config), tmp_path / "plain", megabytes=0.3)
     assert plain.labels == 0 and plain.frames == sum(FRAMES.values())
     with pytest.raises(DataError, match="hold no labels of many views"):
         draws(on_pack(config, tmp_path / "plain"), 2)
     with pytest.raises(DataError, match="raise --shard-megabytes"):
-        pack_shards(config, tmp_path / "tiny", megabytes=0.01)
+        pack(config, tmp_path / "tiny", megabytes=0.01)
     with pytest.raises(DataError, match="lies in shards, which are to train on alone"):
-        pack_shards(photometric(on_shards), tmp_path / "again")
+        pack(photometric(on_shards), tmp_path / "again")
     with pytest.raises(ConfigError, match="is not empty"):
-        pack_shards(config, pack)
+        pack(config, packed)
     assert not (tmp_path / "tiny").exists()

@@ -97,7 +97,8 @@ class RunRequest:
 
     def resumed(self, before: Provenance, place: Path) -> RunRequest:
         """The request of a run that did not end, to go on in its folder with what it was run on."""
-        named = dict.fromkeys(_RECORDING) | before.recording.tree()
+        recording = known(before.recording)
+        named = dict.fromkeys(_RECORDING) | ({} if recording is None else recording.tree())
         weights = (known(before.weights) or "default") if self.weights == "default" else self.weights
         seed = known(before.seed) if self.seed is None else self.seed
         again = replace(self, weights=weights, seed=seed, output=place, continues=None)

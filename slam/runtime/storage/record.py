@@ -115,6 +115,10 @@ class Record(BaseModel):
         except (OSError, ValueError) as error:
             raise RunError(f"{path} is damaged: {' '.join(str(error).split())}; run the sequence again") from error
 
+    def __getitem__(self, key: str) -> Any:
+        """The value of a key as JSON has it, so that a record reads like the file."""
+        return self.tree()[key]
+
     def tree(self) -> dict[str, Any]:
         """The given values as JSON has them, in the order of the fields, reasons beside the missing ones."""
         tree: dict[str, Any] = {}

@@ -198,8 +198,6 @@ def test_another_recording_is_refused(make_recorded: MakeRecorded, tmp_path: Pat
 
     trajectory = folder.trajectory("optimised")
     assert trajectory is not None
-    folder.write_trajectory(
-        "trajectory_optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True)
-    )
+    folder.write_trajectory("optimised", Trajectory(trajectory.stamps + 100, trajectory.T_world_camera, True))
     with pytest.raises(RunError, match="has no frame at the times of"):
         export(folder, "nerfstudio", tmp_path / "scene")

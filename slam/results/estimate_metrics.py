@@ -156,9 +156,10 @@ def _network_snippets(result: Estimate) -> SnippetErrors | None:
 
 def _scale(result: Estimate) -> ScaleMetrics:
     scale, estimate = result.scale, result.scale.estimate
+    said = ScaleMetrics(mode=scale.mode, unit=scale.unit, contradicted_steps=len(scale.contradicted))
     if isinstance(estimate, MeasurementFailure):
-        return ScaleMetrics(mode=scale.mode, unit=scale.unit, value=Missing(estimate.reason))
-    return ScaleMetrics(mode=scale.mode, unit=scale.unit, **asdict(estimate))
+        return said.model_copy(update={"value": Missing(estimate.reason)})
+    return said.model_copy(update=asdict(estimate))
 
 
 def _graph(result: Estimate) -> GraphMetrics:

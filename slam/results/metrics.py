@@ -86,6 +86,7 @@ class ScaleMetrics(Record):
     value: Known[float] = MISSING
     spread: Known[float] = MISSING
     frames_used: Known[Count] = MISSING
+    contradicted_steps: Known[Count] = MISSING
 
 
 class Trajectories(Record):

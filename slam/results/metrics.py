@@ -18,10 +18,10 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence
+from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import umeyama
-from slam.pipeline.doubts import DOUBLED, doubled_frames
 from slam.pipeline.estimate import Estimate
 from slam.results.folder import TRAJECTORIES, RunFolder
 from slam.results.gps import gps_metrics
@@ -67,7 +67,7 @@ def estimate_metrics(
         "optimised": trajectory_metrics(result.optimised, reference),
         **_lidar_metrics(result, sequence),
     }
-    doubled = dict.fromkeys(doubled_frames(result.drive), DOUBLED)
+    doubled = dict.fromkeys(result.drive.doubled, DOUBLED)
     metrics: dict[str, Any] = finite(
         {
             "schema": SCHEMA,

@@ -20,7 +20,8 @@ from slam.loops.places import PLACES, Places
 from slam.pipeline.batch import Progress, SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.observer import FrontEndState, Observer
+from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.observer import Observer
 from slam.results.depth import DepthQuality
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places

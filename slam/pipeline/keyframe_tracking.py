@@ -24,7 +24,7 @@ from slam.pipeline.map_closure import views_of
 _RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
-_LAST = 4  # steps, repeated and unusable frames that may be of the last frames
+_LAST = 4  # number of the last steps, repeated frames and unusable frames that are checked
 _DECISION_STEPS = 30  # triangulated steps after which auto decides
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 

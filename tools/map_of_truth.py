@@ -44,7 +44,8 @@ def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:
     intrinsics = sequence.intrinsics
     exact = np.zeros((intrinsics.height, intrinsics.width), np.float32)
     tsdf_map = TsdfMap(config, intrinsics)
-    for frame in map(int, truth.frames):
+    frames = [int(frame) for frame in truth.frames]
+    for frame in (frames[k] for k in tsdf_map.select(frames, sequence.reference)):
         size = intrinsics.width, intrinsics.height
         depth = cv2.resize(sequence.true_depth(frame).astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
         image = cv2.resize(sequence.frame(frame).image, size, interpolation=cv2.INTER_AREA)

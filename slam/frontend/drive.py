@@ -11,7 +11,18 @@ import cv2
 import numpy as np
 
 from slam.config.sections import MappingConfig
-from slam.frames import DepthMap, Ends, Frame, Image, RelativePose, SnippetPoses, TrackingEvent, View, resized_depth
+from slam.frames import (
+    DepthMap,
+    Ends,
+    Frame,
+    Image,
+    RelativePose,
+    SnippetPoses,
+    TrackingEvent,
+    View,
+    resized_depth,
+    runs,
+)
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
@@ -25,6 +36,7 @@ from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
 
+DOUBLED = "the image repeats the one before while the camera moves"
 _EXAMPLES, _MOST_EXAMPLES = 5, 8
 
 
@@ -95,7 +107,7 @@ class Drive:
         ``roads`` has one entry a frame. ``unusable`` are frames without a measurement, with the reason, ``repeated``
         frames with the image of the one before, ``moving`` those of them just before which the camera moved.
 
-    Added by `slam.frontend.gap_interpolation.completed`, which also leaves out views and keyframes of interpolated
+    Added by `slam.frontend.gap_interpolation.complete_drive`, which also leaves out views and keyframes of interpolated
     frames, fills ``snippets`` to one a target, and smooths the rotations of ``motions``:
         ``trusted`` are the snippets that the network measured on usable frames, ``interpolated`` the frames of gaps
         with the reason, ``gap_steps`` their steps. ``maps`` are those of keyframes, ``map_poses`` the poses by them and
@@ -131,6 +143,16 @@ class Drive:
     def steps(self) -> StepTable:
         """The steps of image geometry by their frames."""
         return StepTable.of(self.motions)
+
+    @property
+    def doubled(self) -> list[int]:
+        """Frames that repeat the one before while the camera moves, not interpolated, at most two in a row.
+
+        More in a row are a camera that stands. At the end of a drive nobody knows.
+        """
+        moving = set(self.moving).difference(self.interpolated)
+        few = [(first, last) for first, last in runs(self.repeated) if last - first < 2 and last < len(self) - 1]
+        return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
     def repeat(self, index: int, moving: bool) -> None:
         """Add a frame with the image of the one before."""

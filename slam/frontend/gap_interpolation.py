@@ -30,7 +30,7 @@ _ROTATION_SIGMA_DEG = 2.0  # rotation sigma of an interpolated step, degrees
 _TRANSLATION_RELATIVE_SIGMA = 0.5  # translation sigma over the length of an interpolated step
 
 
-def completed(
+def complete_drive(
     drive: Drive,
     sources: int,
     maps: Sequence[MapSegment] = (),

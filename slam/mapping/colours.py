@@ -8,7 +8,7 @@ from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from slam.geometry.se3 import FloatArray, apply, invert
-from slam.mapping.store import SubmapStore
+from slam.mapping.merged_submaps import MergedSubmaps
 
 _GREY = 128
 _NEARNESS = 4  # power of the distance that a view's weight falls with
@@ -21,16 +21,16 @@ _EXPOSURE_PRIOR = 0.01  # of equal exposures, over the information in the bright
 class Painter:
     """Colours points by the views of all submaps."""
 
-    def __init__(self, store: SubmapStore, voxel_size_m: float, reach_m: float) -> None:
+    def __init__(self, submaps: MergedSubmaps, voxel_size_m: float, reach_m: float) -> None:
         """Even out the exposure of all views."""
-        self._store, self._voxel, self._range = store, voxel_size_m, reach_m
-        self._gains = np.exp(-evened(store.brightness_steps))
+        self._submaps, self._voxel, self._range = submaps, voxel_size_m, reach_m
+        self._gains = np.exp(-evened(submaps.brightness_steps))
 
     def colours(self, points_world: FloatArray) -> NDArray[np.uint8]:
         """RGB ``(P, 3)`` of points of the surface ``(P, 3)``; one that no view shows has that of the nearest shown."""
         total, weight = np.zeros((len(points_world), 3)), np.zeros(len(points_world))
         low, high = points_world.min(axis=0), points_world.max(axis=0)
-        positions = self._store.T_world_views[:, :3, 3]
+        positions = self._submaps.T_world_views[:, :3, 3]
         away = np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
         for view in np.flatnonzero(away < self._range):
             self._add(int(view), points_world, total, weight)
@@ -45,10 +45,10 @@ class Painter:
 
     def _add(self, view: int, points_world: FloatArray, total: FloatArray, weight: FloatArray) -> None:
         """Add the colours of one view to those of the points that it shows."""
-        number = int(self._store.submap_of_view[view])
-        submap = self._store.read(number)
-        own = view - int(np.searchsorted(self._store.submap_of_view, number))
-        T_camera_world = invert(self._store.T_world_views[view])
+        number = int(self._submaps.submap_of_view[view])
+        submap = self._submaps.read(number)
+        own = view - int(np.searchsorted(self._submaps.submap_of_view, number))
+        T_camera_world = invert(self._submaps.T_world_views[view])
         depth_of_points = points_world @ T_camera_world[2, :3] + T_camera_world[2, 3]
         ahead = np.flatnonzero(depth_of_points > _NEAREST_VOXELS * self._voxel)
         x, y, z = apply(T_camera_world, points_world[ahead]).T

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
-from slam.mapping.patch import Patch, Triangles, in_tile
+from slam.mapping.tile_surface import TileSurface, Triangles, in_tile
 
 _UPWARDS = 0.85  # least cosine to the camera's own upwards
 _FLAT = 0.15  # largest height of a hole's edge over its diameter
@@ -19,8 +19,8 @@ _MOST_EDGES = 100
 
 
 def with_holes_closed(
-    patch: Patch, tile: NDArray[np.int64], voxel_size_m: float, up_world: FloatArray, largest_m: float
-) -> Patch:
+    patch: TileSurface, tile: NDArray[np.int64], voxel_size_m: float, up_world: FloatArray, largest_m: float
+) -> TileSurface:
     """Close holes of at most ``largest_m`` across by triangles around a new vertex in their middle.
 
     Args:

@@ -109,7 +109,7 @@ class TsdfMap:
         self._surface: MapSurface | None = None
 
     def integrate(self, keyframe: KeyframeDepth) -> None:
-        """Filter a depth map, also by the previous keyframe, and fuse it; skip it if the camera hardly moved.
+        """Filter a depth map, also by the previous keyframe, and fuse it.
 
         Raises:
             RunError: a submap cannot be written.
@@ -123,15 +123,15 @@ class TsdfMap:
         previous = self._previous
         if previous is None:
             self._previous = view
-        elif self._has_moved(view.T_world_camera, previous.T_world_camera):
-            if not self._first_is_fused:
-                self._fuse(previous, view)
-                self._first_is_fused = True
-            self._fuse(view, previous)
-            self._previous = view
+            return
+        if not self._first_is_fused:
+            self._fuse(previous, view)
+            self._first_is_fused = True
+        self._fuse(view, previous)
+        self._previous = view
 
-    def moved(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
-        """Which of these frames ``integrate`` does not skip, as positions in ``frames``.
+    def select(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
+        """The frames to integrate, before each of which the camera has moved, as positions in ``frames``.
 
         Args:
             frames: frame numbers in time order.

@@ -21,9 +21,9 @@ from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.colours import Painter
 from slam.mapping.holes import with_holes_closed
-from slam.mapping.patch import Patch, Triangles, extract_patch
-from slam.mapping.store import TILE_BLOCKS, SubmapStore
+from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
 from slam.mapping.submap import BLOCK_SIDE
+from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile
 from slam.runtime.errors import EmptyMapError
 from slam.runtime.progress import Progress
 from slam.runtime.storage.spill import SpilledArray, SpillFile
@@ -92,13 +92,13 @@ class MapSurface:
             EmptyMapError: nothing was fused or seen often enough.
             SlamError: a submap is damaged, or the disk is full.
         """
-        store = SubmapStore(paths)
-        if store.fused == 0:
+        submaps = MergedSubmaps(paths)
+        if submaps.fused == 0:
             raise EmptyMapError("the map is empty: no depth passed the filters")
         self._spill = SpillFile("the map")
         self._pieces: list[Piece] = []
-        self.blocks, self.submaps = store.block_count(), store.submaps
-        self._extract(store, config, progress)
+        self.blocks, self.submaps = submaps.block_count(), submaps.count
+        self._extract(submaps, config, progress)
         if not self._pieces:
             raise EmptyMapError(f"the map is empty: no surface was seen {config.min_weight:g} times")
         self._kept = _chosen(self._pieces, config.min_component_triangles)
@@ -149,15 +149,15 @@ class MapSurface:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
 
-    def _extract(self, store: SubmapStore, config: MappingConfig, progress: Progress | None) -> None:
-        painter = Painter(store, config.voxel_size_m, config.reach_m)
-        tiles = store.tiles()
-        least_weight = min(config.min_weight, float(store.fused))  # with fewer frames nothing would be extracted
+    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress | None) -> None:
+        painter = Painter(submaps, config.voxel_size_m, config.reach_m)
+        tiles = submaps.tiles()
+        least_weight = min(config.min_weight, float(submaps.fused))  # with fewer frames nothing would be extracted
         for done, tile in enumerate(tiles, 1):
-            patch = extract_patch(store, tile, config.voxel_size_m, least_weight)
+            patch = extract_tile(submaps, tile, config.voxel_size_m, least_weight)
             if patch is not None:
                 if config.close_holes_m > 0:
-                    up = _upwards(store, tile, config.voxel_size_m)
+                    up = _upwards(submaps, tile, config.voxel_size_m)
                     patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
                 if patch.own.any():
                     self._pieces.append(_piece(patch, painter, self._spill))
@@ -177,7 +177,7 @@ def _kept_triangles(piece: Piece, kept: _Kept) -> Triangles:
     return chosen
 
 
-def _piece(patch: Patch, painter: Painter, spill: SpillFile) -> Piece:
+def _piece(patch: TileSurface, painter: Painter, spill: SpillFile) -> Piece:
     """The part of a patch that belongs to its tile, with colours and normals."""
     is_used = np.zeros(len(patch.vertices), dtype=bool)
     is_used[patch.triangles[patch.own]] = True
@@ -231,9 +231,9 @@ def _chosen(pieces: list[Piece], least_triangles: int) -> list[_Kept]:
     return kept
 
 
-def _upwards(store: SubmapStore, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:
+def _upwards(submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float) -> FloatArray:
     """Upwards ``(3,)`` in the camera of the view nearest to a tile."""
     middle = (tile + 0.5) * TILE_BLOCKS * BLOCK_SIDE * voxel_size_m
-    nearest = np.linalg.norm(store.T_world_views[:, :3, 3] - middle, axis=1).argmin()
-    up: FloatArray = -store.T_world_views[nearest, :3, 1]
+    nearest = np.linalg.norm(submaps.T_world_views[:, :3, 3] - middle, axis=1).argmin()
+    up: FloatArray = -submaps.T_world_views[nearest, :3, 1]
     return up

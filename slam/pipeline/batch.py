@@ -33,14 +33,15 @@ from slam.loops.closure import LoopClosures, close_loops
 from slam.mapping.filters import KeyframeDepth
 from slam.mapping.map import TsdfMap
 from slam.pipeline.checkpoint import EVERY_FRAMES, CheckpointWriter, SessionCheckpoint
-from slam.pipeline.doubts import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
+from slam.pipeline.drive_warnings import warn_of_another_place, warn_of_contradicted_steps, warn_of_doubts
 from slam.pipeline.estimate import Estimate
+from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.input_checks import require_possible
 from slam.pipeline.keyframe_depth import KeyframeDepths
 from slam.pipeline.map_closure import MapClosure, close_maps
-from slam.pipeline.observer import FrontEndState, Observer
+from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
-from slam.pipeline.reading import read_frame
-from slam.pipeline.requirements import require_possible
+from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d_beside
 from slam.runtime.progress import Progress
 from slam.runtime.threads import read_ahead
@@ -48,6 +49,16 @@ from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
+
+
+def read_frame(sequence: FrameSequence, index: int) -> Frame | SequenceError:
+    """A frame, or why its image cannot be read."""
+    try:
+        frame = sequence.frame(index)
+        frame.image.setflags(write=False)
+        return frame
+    except SequenceError as error:
+        return error
 
 
 class SlamPipeline:
@@ -165,14 +176,17 @@ class SlamPipeline:
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
         warn_of_contradicted_steps(scale)
         factors = make_factors(drive, scale, self._noise, config.frontend, config.geometry)
+        T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):
-            unit = self._unit(chain_odometry(factors, T_network, scale))
+            unit = self._unit(T_odometry)
             scale = scale.in_metres(unit)
             if isinstance(unit, ScaleEstimate):
                 factors = [factor.scaled(unit.value) for factor in factors]
+                T_odometry[:, :3, 3] *= unit.value
         if config.lidar.factors and scale.is_metric:
             factors = with_lidar(factors, by_lidar)
-        return scale, factors, chain_odometry(factors, T_network, scale)
+            T_odometry = chain_odometry(factors, T_network, scale)
+        return scale, factors, T_odometry
 
     def close_maps(self, drive: Drive) -> tuple[Drive, MapClosure | None]:
         """A completed drive with its maps joined by loops among all keyframes; None without maps."""
@@ -204,18 +218,18 @@ class SlamPipeline:
         depths = KeyframeDepths(estimate.drive, scales, T_world_camera, error, intrinsics, config.depth)
         mapping = config.mapping if estimate.scale.is_metric else depths.fitted(config.mapping)
         tsdf_map = TsdfMap(mapping, intrinsics, folder)
-        moved = tsdf_map.moved([keyframe.index for keyframe in keyframes], T_world_camera)
-        with closing(read_ahead(depths.at, moved)) as ahead:
+        selected = tsdf_map.select([keyframe.index for keyframe in keyframes], T_world_camera)
+        with closing(read_ahead(depths.at, selected)) as ahead:
             for done, keyframe in enumerate(self._watch.each("depth refinement", ahead), 1):
                 if compare is not None:
                     compare(keyframe)
                 with self._watch.stage("map"):
                     tsdf_map.integrate(keyframe)
-                self._progress("map", done, len(moved))
+                self._progress("map", done, len(selected))
         return tsdf_map
 
     def require_possible(self) -> None:
-        """Check that this run can succeed; raises as `requirements.require_possible` and `Positioning`."""
+        """Check that this run can succeed; raises as `input_checks.require_possible` and `Positioning`."""
         shortest = self._predictor.sources + 1
         require_possible(self._sequence, self._config, shortest, self._gps_track is not None)
         _ = self._positioning
@@ -261,7 +275,7 @@ class SlamPipeline:
                 if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
                     with self._watch.stage("journal"):
                         checkpoints.keep(observer.state())
-            drive, state = observer.completed(), observer.state()
+            drive, state = observer.complete_drive(), observer.state()
         if isinstance(self._sequence, Continued):
             warn_of_another_place(drive, first)
         return drive, state

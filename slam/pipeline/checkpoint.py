@@ -36,7 +36,7 @@ from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
 from slam.frontend.window.relative_poses import WindowPoses
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.observer import FrontEndState, RecentFrame
+from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.run_files import DRIVE, KEYFRAMES, KEYFRAMES_PART
 from slam.runtime.storage.archive import opened_archive, read_array

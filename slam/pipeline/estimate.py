@@ -13,7 +13,7 @@ from slam.frontend.scale.metric_scale import Scale
 from slam.graph.pose_graph import PoseGraph
 from slam.loops.closure import LoopClosures
 from slam.mapping.map import TsdfMap
-from slam.pipeline.observer import FrontEndState
+from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.positioning import Location
 from slam.runtime.timing import Stopwatch
 

@@ -24,7 +24,7 @@ from slam.pipeline.map_closure import views_of
 _RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
-_DOUBTFUL = 4  # last frames that are repeated or unusable
+_LAST = 4  # number of the last steps, repeated frames and unusable frames that are checked
 _DECISION_STEPS = 30  # triangulated steps after which auto decides
 _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual direction, degrees
 
@@ -116,11 +116,16 @@ class KeyframeTracking:
             self._odometry = None
 
     def measures(self, drive: Drive, index: int) -> bool:
-        """Whether keyframes alone measure the motion to one of the last frames: not by a gap or a repeated image."""
-        doubtful = {*drive.repeated[-_DOUBTFUL:], *list(drive.unusable)[-_DOUBTFUL:]}
-        if self._odometry is None or self._front_end == "both" or not doubtful.isdisjoint((index - 1, index)):
+        """Whether keyframes alone measure the motion to one of the last frames.
+
+        A step measures it by a gap, a repeated image or a lost camera, and before the choice.
+        """
+        if self._odometry is None or self._front_end == "both":
             return False
-        return self._odometry.locates(index - 1, index)
+        by_steps = {motion.ends[1] for motion in drive.motions[-_LAST:]}
+        doubtful = {*drive.repeated[-_LAST:], *list(drive.unusable)[-_LAST:]}
+        is_doubtful = index in by_steps or not doubtful.isdisjoint((index - 1, index))
+        return not is_doubtful and self._odometry.locates(index - 1, index)
 
     def is_keyframe(self, index: int) -> bool:
         """Whether the last frame is a keyframe."""

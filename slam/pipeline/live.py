@@ -20,15 +20,16 @@ from slam.frames import Frame, Image, Intrinsics, Predictor
 from slam.loops.closure import LoopClosures
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.growing import GrowingSequence
+from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import choose
-from slam.pipeline.observer import FrontEndState, Observer
+from slam.pipeline.observer import Observer
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.errors import SlamError
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.timing import Stopwatch
+from slam.sequences.growing import GrowingSequence
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -249,7 +250,7 @@ class Slam:
         self._observer.flush()
         if not self._observer.drive.snippets:
             return LoopClosures(not_sought="there are too few usable frames")
-        drive, closure = self._pipeline.close_maps(self._observer.completed())
+        drive, closure = self._pipeline.close_maps(self._observer.complete_drive())
         estimate = self._pipeline.solve(drive, self._observer.state(), closure)
         self._tracker.correct(estimate.optimised.T_world_camera, estimate.scale)
         return estimate.loops

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Self
@@ -12,23 +12,22 @@ from typing import Any, Self
 import numpy as np
 
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
 from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
-from slam.frontend.gap_interpolation import completed
-from slam.frontend.image_gate import GateState, ImageGate, Verdict
+from slam.frontend.gap_interpolation import complete_drive
+from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
-from slam.frontend.visual.odometry import OdometryState, VisualOdometry
+from slam.frontend.visual.odometry import VisualOdometry
 from slam.frontend.window.odometry import WindowState
 from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
+from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.pipeline.pending import PendingFrame, PendingTask
-from slam.pipeline.reading import predicted_depth
-from slam.runtime.errors import MissingFrameError, SequenceError
+from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
 from slam.runtime.memory import return_freed_memory
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
@@ -37,26 +36,21 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RecentFrame:
-    """A frame to measure steps from, its depth ``(H, W)``, None until that is needed, and camera height, unscaled."""
+class PendingFrame:
+    """A frame submitted to the networks, whose other measurements are pending; None is not asked for."""
 
     frame: Frame
-    depth: DepthMap | None
-    height: float | None
+    depth: Future[DepthMap] | None
+    snippet: Future[SnippetPoses] | None
 
 
 @dataclass(frozen=True)
-class FrontEndState:
-    """A snapshot after a frame; ``keyframes`` is None where the drive is measured by steps alone."""
+class PendingTask:
+    """A task of another thread, the stage that waits for it, and what to do with its ``result``."""
 
-    drive: Drive
-    gate: GateState
-    odometry: OdometryState
-    keyframes: WindowState | None
-    road_directions: tuple[FloatArray, ...]
-    window: tuple[Frame, ...]
-    recent: tuple[RecentFrame, ...]
-    unread: int
+    stage: str
+    result: Future[Any]
+    keep: Callable[[Any], None]
 
 
 class Observer:
@@ -180,7 +174,7 @@ class Observer:
         """As `KeyframeTracking.step`, of a finished frame."""
         return self._keyframes.step(index)
 
-    def completed(self) -> Drive:
+    def complete_drive(self) -> Drive:
         """Everything measured so far with its gaps interpolated; more frames may follow.
 
         Raises:
@@ -189,7 +183,7 @@ class Observer:
         self.flush()
         maps = self._keyframes.maps(self._drive)
         poses = self._keyframes.poses(maps)
-        return completed(self._drive, self._predictor.sources, maps, poses, self._keyframes.events)
+        return complete_drive(self._drive, self._predictor.sources, maps, poses, self._keyframes.events)
 
     def _require_readable(self, error: SequenceError) -> None:
         """Raise after too many unreadable images in a row; missing ones are always accepted."""
@@ -338,3 +332,16 @@ class Observer:
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
             self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))
+
+
+def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
+    """Depth ``(H, W)`` of a frame.
+
+    Raises:
+        SlamError: a user's predictor gives something else.
+    """
+    depth = predictor.depth(frame)
+    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
+    if shape != wanted or kind != np.float32:
+        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
+    return depth

@@ -10,7 +10,7 @@ import numpy as np
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.frontend.factors import chain_odometry, make_factors
-from slam.frontend.gap_interpolation import completed
+from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.network_factors import chain_raw
 from slam.frontend.scale.metric_scale import Scale, find_scale
 from slam.frontend.scale.scale_estimate import resolve_mode
@@ -123,7 +123,7 @@ class Tracker:
         window = observer.drive.since(first)
         if not window.snippets:
             return
-        config, window = self._config, completed(window, self._sources)
+        config, window = self._config, complete_drive(window, self._sources)
         scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
         factors = make_factors(window, scale, self._noise, config.frontend, config.geometry)
         T_odometry = chain_odometry(factors, chain_raw(window.snippets, len(window)), scale)

@@ -17,10 +17,10 @@ from slam.evaluation.coverage import coverage
 from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
 from slam.formats.trajectory import Trajectory, associate
 from slam.frames import Sequence, runs
+from slam.frontend.drive import DOUBLED
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.lidar_odometry import LidarPath
 from slam.geometry.se3 import umeyama
-from slam.pipeline.doubts import DOUBLED, doubled_frames
 from slam.pipeline.estimate import Estimate
 from slam.results.folder import RunFolder
 from slam.results.gps import gps_metrics
@@ -122,7 +122,7 @@ def _sequence(result: Estimate, sequence: Sequence) -> SequenceMetrics:
         fps=(frames - 1) / span if span > 0 else Missing("all stamps are equal"),
         bridged_frames=len(drive.interpolated),
         bridged=_stretches(drive.interpolated),
-        doubled=_stretches(dict.fromkeys(doubled_frames(drive), DOUBLED)),
+        doubled=_stretches(dict.fromkeys(drive.doubled, DOUBLED)),
         unreadable_scans=_stretches(scans),
         continued_at=result.first,
         segments=[Stretch(**asdict(segment)) for segment in drive.segments],

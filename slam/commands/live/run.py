@@ -27,9 +27,8 @@ from slam.config.sections import load_config
 from slam.formats.trajectory import Trajectory
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.growing import GrowingSequence
+from slam.pipeline.input_checks import require_possible
 from slam.pipeline.observer import Observer
-from slam.pipeline.requirements import require_possible
 from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
@@ -38,6 +37,7 @@ from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_rerun
+from slam.sequences.growing import GrowingSequence
 
 logger = logging.getLogger(__name__)
 

@@ -11,9 +11,9 @@ from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
 from slam.commands.live.reader import Arrival, Reader
 from slam.commands.live.source import Source
 from slam.frames import Frame, Image, Intrinsics
-from slam.pipeline.growing import GrowingSequence
 from slam.runtime.errors import SequenceError
 from slam.sequences.camera_file import beside, explicit_camera
+from slam.sequences.growing import GrowingSequence
 from slam.sequences.undistortion import Undistortion
 
 

@@ -21,7 +21,8 @@ from slam.loops.places import Places
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.observer import FrontEndState, Observer
+from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.observer import Observer
 from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder

@@ -36,7 +36,7 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
-_LAST_FRAMES = 4
+_LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
 

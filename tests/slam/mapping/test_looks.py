@@ -9,7 +9,7 @@ from slam.mapping.colours import evened
 from slam.mapping.filters import FILTERS, DepthFilters, KeyframeDepth
 from slam.mapping.holes import with_holes_closed
 from slam.mapping.map import TsdfMap
-from slam.mapping.patch import Patch
+from slam.mapping.tile_surface import TileSurface
 
 
 def test_exposure_is_evened_out(street_map):
@@ -70,7 +70,7 @@ def test_only_holes_that_look_upwards_are_closed(up: tuple[float, float, float],
     squares = [(i, j) for i in range(5) for j in range(5) if (i, j) != (2, 2)]
     corners = np.array([[6 * i + j, 6 * (i + 1) + j, 6 * (i + 1) + j + 1, 6 * i + j + 1] for i, j in squares])
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    sheet = Patch(vertices, triangles, np.ones(48, dtype=bool), np.zeros(48, dtype=bool))
+    sheet = TileSurface(vertices, triangles, np.ones(48, dtype=bool), np.zeros(48, dtype=bool))
     full = with_holes_closed(sheet, np.zeros(3, np.int64), 0.2, np.array(up), 1.5)
     assert len(full.vertices) - 36 == closed and full.filled.sum() == 4 * closed and full.own.all()
     np.testing.assert_allclose(full.vertices[36:], np.tile([1.5, 1.5, 1.0], (closed, 1)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam.config.sections import MappingConfig
-from slam.mapping.store import TILE_BLOCKS, SubmapStore
+from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
 from slam.mapping.submap import BLOCK_SIDE, Submap, remove_submaps, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.runtime.errors import RunError
@@ -54,7 +54,7 @@ def test_finished_submaps_outlive_the_process_that_made_them(street_map, tmp_pat
     paths = submap_paths(tmp_path / SUBMAPS)
     assert len(paths) == 2
     surface = MapSurface(paths, MappingConfig())
-    assert surface.triangles > 1000 and SubmapStore(paths).fused < 18
+    assert surface.triangles > 1000 and MergedSubmaps(paths).fused < 18
     remove_submaps(tmp_path / SUBMAPS)
     assert list(tmp_path.iterdir()) == []
 

@@ -24,11 +24,11 @@ from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.growing import GrowingSequence
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import SlamError
 from slam.sequences.excerpt import Excerpt
+from slam.sequences.growing import GrowingSequence
 from slam.sequences.simulated import SimulatedSequence
 from slam.simulation.street import SimulationOptions
 

@@ -12,8 +12,9 @@ from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
 from slam.geometry.se3 import chain, from_rotation_vector
 from slam.pipeline.checkpoint import SERIALISER
+from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import FrontEnd, choose
-from slam.pipeline.observer import FrontEndState, Observer
+from slam.pipeline.observer import Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
 
@@ -63,7 +64,7 @@ def test_steps_are_measured_where_keyframes_have_no_pose() -> None:
         for k, T in enumerate(truth):
             frame = room.frame(k, T)
             observer.add(k, Frame(k, frame.stamp, np.zeros_like(frame.image)) if k in blank else frame)
-        closed = observer.completed()
+        closed = observer.complete_drive()
     started = min(closed.map_poses.segments)
     assert started < 10 and len(closed.map_poses.segments) == 40 - len(blank) - started
     late = [motion.ends for motion in observer.drive.motions if motion.ends[0] > 19]
@@ -87,7 +88,7 @@ def test_depth_is_predicted_for_all_keyframes_and_few_other_frames(interrupted: 
             observer.add(k, room.frame(k, T))
             if k in interrupted:
                 observer.state()
-        state, closed = observer.state(), observer.completed()
+        state, closed = observer.state(), observer.complete_drive()
     assert state.keyframes is not None
     keyframes = state.keyframes.segments[-1].map.keyframes
     assert all(np.isfinite(keyframe.learned_depth).any() for keyframe in keyframes if keyframe.grey is not None)

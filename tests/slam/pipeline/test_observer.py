@@ -21,12 +21,11 @@ from slam.frames import Frame
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.batch import SlamPipeline
+from slam.pipeline.batch import SlamPipeline, read_frame
 from slam.pipeline.checkpoint import SessionCheckpoint
-from slam.pipeline.doubts import doubled_frames
 from slam.pipeline.estimate import Estimate
-from slam.pipeline.observer import FrontEndState, Observer
-from slam.pipeline.reading import read_frame
+from slam.pipeline.front_end_state import FrontEndState
+from slam.pipeline.observer import Observer
 from slam.prediction.oracle import OracleNoise, OraclePredictor
 from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.timing import Stopwatch
@@ -178,7 +177,7 @@ def test_doubled_frames_are_counted_and_cost_nothing() -> None:
     sequence = Doubled(street(), black, range(0))
     sequence.reference = street().reference[rows]
     result = SlamPipeline(sequence, oracle_of(sequence, rows), config_with("mapping.enabled=false")).run()
-    assert doubled_frames(result.drive) == [21, 42]
+    assert result.drive.doubled == [21, 42]
     assert result.drive.interpolated == {} and ate(result) < 0.6
 
 
@@ -206,7 +205,7 @@ def test_many_gaps_are_counted_in_one_line(caplog: pytest.LogCaptureFixture) -> 
 
 def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
     assert (result := run(bad=range(0))).drive.interpolated == {}
-    assert doubled_frames(result.drive) == []
+    assert result.drive.doubled == []
 
 
 def observe(frames: int, state: FrontEndState | None, damage: Damage, bad: range, *overrides: str) -> FrontEndState:
@@ -288,7 +287,7 @@ def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_p
 
 def assert_same(one: Observer, other: Observer) -> None:
     """Both have measured the same bytes, of every kind."""
-    first, second = one.completed(), other.completed()
+    first, second = one.complete_drive(), other.complete_drive()
     assert len(first.relative_rotations) > 10 and len(first.road_steps) > 5 and len(first.steps) > 15
     assert first.road_steps.keys() == second.road_steps.keys()
     for measured in (

@@ -29,7 +29,7 @@ class Blocks:
     weight: NDArray[np.float32]
 
 
-class SubmapStore:
+class MergedSubmaps:
     """Submaps on disk; of each the block coordinates and the views' poses stay in memory."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -47,7 +47,7 @@ class SubmapStore:
         self.T_world_views: FloatArray = np.concatenate(poses)
         self.brightness_steps: FloatArray = np.concatenate(steps)
         self.submap_of_view = np.array(submap, dtype=np.int64)
-        self.submaps = len(self._keys)
+        self.count = len(self._keys)
         self.read = lru_cache(maxsize=_REMEMBERED)(lambda number: Submap.read(paths[number]))
 
     def tiles(self) -> Keys:

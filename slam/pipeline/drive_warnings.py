@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 
 from slam.frames import runs
-from slam.frontend.drive import Drive
+from slam.frontend.drive import DOUBLED, Drive
 from slam.frontend.image_gate import GateState
 from slam.frontend.scale.metric_scale import Scale
 
 logger = logging.getLogger(__name__)
 
-DOUBLED = "the image repeats the one before while the camera moves"
 _MOST_NAMED = 10
 # real drives with automatic exposure have 0.13 at ten frames a second and 0.51 at two
 _ROLLING_EXPOSURE = 0.6
@@ -27,7 +26,7 @@ def warn_of_doubts(drive: Drive, gate: GateState) -> None:
         more, frames_of_them = gaps[_MOST_NAMED:], sum(last - first + 1 for first, last in gaps[_MOST_NAMED:])
         logger.warning("%d more stretches are interpolated, of %d frames: see metrics.json", len(more), frames_of_them)
     _warn_of_segments(drive)
-    doubled = doubled_frames(drive)
+    doubled = drive.doubled
     if doubled:
         named = ", ".join(map(str, doubled[:_MOST_NAMED])) + (", ..." if len(doubled) > _MOST_NAMED else "")
         logger.warning("of %d frames %s: %s", len(doubled), DOUBLED, named)
@@ -63,16 +62,6 @@ def warn_of_contradicted_steps(scale: Scale) -> None:
         named,
         ", ..." if len(stretches) > _MOST_NAMED else "",
     )
-
-
-def doubled_frames(drive: Drive) -> list[int]:
-    """Frames that repeat the one before while the camera moves, not interpolated, at most two in a row.
-
-    More in a row are a camera that stands. At the end of a drive nobody knows.
-    """
-    moving = set(drive.moving).difference(drive.interpolated)
-    few = [(first, last) for first, last in runs(drive.repeated) if last - first < 2 and last < len(drive) - 1]
-    return [k for first, last in few for k in range(first, last + 1) if k in moving]
 
 
 def _warn_of_segments(drive: Drive) -> None:

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.mapping import patch
-from slam.mapping.patch import extract_patch
+from slam.mapping import tile_surface
+from slam.mapping.tile_surface import extract_tile
 
 
 def test_the_order_of_vertices_in_one_place_is_that_of_their_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Open3D's threads give them in any; here two triangles touch in a corner that each has for itself."""
     vertices = np.array([[1, 1, 1], [2, 1, 1], [1, 2, 1], [1, 1, 1], [0.5, 1, 1], [1, 1, 0.5]])
     triangles = np.array([[0, 1, 2], [3, 4, 5]])
-    store: Any = SimpleNamespace(merged=lambda low, high: None)
+    submaps: Any = SimpleNamespace(merged=lambda low, high: None)
     found = []
     for order in permutations(range(6)):
         place = np.argsort(order)
-        monkeypatch.setattr(patch, "_extract", lambda *_, o=order, p=place: (vertices[list(o)], p[triangles]))
-        mesh = extract_patch(store, np.zeros(3, dtype=np.int64), 0.1, 1.0)
+        monkeypatch.setattr(tile_surface, "_extract", lambda *_, o=order, p=place: (vertices[list(o)], p[triangles]))
+        mesh = extract_tile(submaps, np.zeros(3, dtype=np.int64), 0.1, 1.0)
         assert mesh is not None
         found.append((mesh.vertices, mesh.triangles))
     assert all(np.array_equal(v, found[0][0]) and np.array_equal(t, found[0][1]) for v, t in found)

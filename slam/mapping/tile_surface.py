@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slam.frames import Mask
 from slam.geometry.se3 import FloatArray
 from slam.mapping.fusion import new_grid
-from slam.mapping.store import TILE_BLOCKS, Blocks, SubmapStore
+from slam.mapping.merged_submaps import TILE_BLOCKS, Blocks, MergedSubmaps
 from slam.mapping.submap import BLOCK_SIDE
 from slam.runtime.imports import import_open3d
 
@@ -19,7 +19,7 @@ Triangles = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Patch:
+class TileSurface:
     """Vertices ``(V, 3)`` in the world, triangles ``(T, 3)``, which of them belong to the tile, which close a hole."""
 
     vertices: FloatArray
@@ -35,23 +35,23 @@ class Patch:
         return np.asarray(o3d.geometry.TriangleMesh(vertices, triangles).compute_vertex_normals().vertex_normals)
 
 
-def extract_patch(
-    store: SubmapStore, tile: NDArray[np.int64], voxel_size_m: float, least_weight: float
-) -> Patch | None:
+def extract_tile(
+    submaps: MergedSubmaps, tile: NDArray[np.int64], voxel_size_m: float, least_weight: float
+) -> TileSurface | None:
     """The surface of a tile and of one block around it; None where there is none.
 
     Both sides of a border between tiles see the same voxels, so that vertices there are the same bit by bit. A triangle
     belongs to the tile that its centre is in.
     """
     low = tile * TILE_BLOCKS
-    mesh = _extract(store.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
+    mesh = _extract(submaps.merged(low - 1, low + TILE_BLOCKS + 1), voxel_size_m, least_weight)
     if mesh is None:
         return None
     vertices, triangles = _sorted(*mesh)
     own = in_tile(vertices[triangles].mean(axis=1), tile, voxel_size_m)
     if not own.any():
         return None
-    return Patch(vertices, triangles, own, np.zeros(len(own), dtype=bool))
+    return TileSurface(vertices, triangles, own, np.zeros(len(own), dtype=bool))
 
 
 def in_tile(points: FloatArray, tile: NDArray[np.int64], voxel_size_m: float) -> Mask:

@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 F = TypeVar("F", np.float32, np.float64)
 Array = NDArray[np.float32]
 Device = Literal["cpu", "cuda"]
-DeviceChoice = Literal["auto", "cpu", "cuda"]
 Runtime = Literal["torch", "onnx"]
 Network = Callable[..., Array]
 _GPU_DRIVERS = ("nvidiactl", "dxg", "kfd")  # of Nvidia, of WSL, and of AMD

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from erfsfm.inference import overlapping
+from erfsfm.common.readers.frame_range import overlapping
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.checkpoint import DRIVE, SessionCheckpoint

@@ -171,7 +171,11 @@ def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "schedule, normalisation, optimiser",
-    [("constant", "none", "adam"), ("cosine", "batch", "adam"), ("cosine", "batch", "muon")],
+    [
+        ("constant", "none", "adam"),
+        ("cosine", "batch", "adam"),
+        pytest.param("cosine", "batch", "muon", marks=pytest.mark.slow),
+    ],
 )
 def test_resume_ends_with_identical_weights(
     small: Small,

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import CheckpointError, ConfigError, DataError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.common.readers.images import read_image as read_image  # images are read as for training
 from erfsfm.common.readers.images import resize_image
 from erfsfm.common.threads import usable_cores
-from erfsfm.data.splits import overlapping as overlapping  # for slam, which imports only this module
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
 from erfsfm.networks.onnx_graph import OnnxGraph
@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 F = TypeVar("F", np.float32, np.float64)
 Array = NDArray[np.float32]
 Device = Literal["cpu", "cuda"]
-DeviceChoice = Literal["auto", "cpu", "cuda"]
 Runtime = Literal["torch", "onnx"]
 Network = Callable[..., Array]
 _GPU_DRIVERS = ("nvidiactl", "dxg", "kfd")  # of Nvidia, of WSL, and of AMD

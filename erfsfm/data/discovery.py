@@ -12,11 +12,17 @@ from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, read_camera_file
 from erfsfm.common.readers.folder import image_folder, recording_name, video_name
 from erfsfm.common.readers.images import first_size, list_images
-from erfsfm.common.readers.kitti_calibration import ODOMETRY_CALIBRATION, CalibrationFile
-from erfsfm.common.readers.kitti_drives import ODOMETRY_CAMERAS, OdometryRoot, find_drives, find_odometry_root
+from erfsfm.common.readers.kitti_calibration import CAM_TO_CAM, ODOMETRY_CALIBRATION, CalibrationFile
+from erfsfm.common.readers.kitti_drives import (
+    ODOMETRY_CAMERAS,
+    RAW_CAMERAS,
+    OdometryRoot,
+    drive_name,
+    find_drives,
+    find_odometry_root,
+)
 from erfsfm.common.readers.numbering import by_name, by_number
 from erfsfm.common.readers.video import VIDEO_SUFFIXES, list_videos
-from erfsfm.data.kitti_raw import open_drive
 from erfsfm.data.pack_index import INDEX_FILE, read_pack
 from erfsfm.data.recordings import Recording, split_at_gaps
 from erfsfm.data.video import Video
@@ -83,6 +89,31 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
             poses_file=poses if poses.is_file() else None,
             t_camera_cam0=(tx, ty, tz),
             sequence=sequence.name,
+        )
+        recordings += split_at_gaps(whole, files)
+    return recordings
+
+
+def open_drive(drive: Path) -> list[Recording]:
+    """Its colour cameras, else the first of its grey ones, in parts without gaps; none where it has no images.
+
+    Raises:
+        DataError: calibration is missing, or the images are of another shape than the camera.
+    """
+    drive = drive.absolute()
+    images = {camera: list_images(drive / f"image_{camera}" / "data") for camera in RAW_CAMERAS}
+    present = [camera for camera in RAW_CAMERAS if images[camera]]
+    oxts = drive / "oxts" / "data"
+    recordings = []
+    for camera in [camera for camera in present if int(camera) in _COLOUR] or present[:1]:
+        files = by_number(images[camera])
+        height, width = first_size(files.paths)
+        calibration = CalibrationFile(drive.parent / CAM_TO_CAM)
+        whole = Recording(
+            f"kitti_raw/{drive_name(drive.name)}",
+            files.paths,
+            Camera.of(calibration.rectified_pinhole(camera, width, height)),
+            oxts=oxts if oxts.is_dir() else None,
         )
         recordings += split_at_gaps(whole, files)
     return recordings

@@ -1,4 +1,6 @@
-"""Splits as files: which recordings train, validate and test, each named as in the leak record (`erfsfm.data.splits`).
+"""Splits as files: which recordings train, validate and test, each named as in the leak record.
+
+Names are those of `erfsfm.common.readers.frame_range`.
 
 The shipped ones lie in ``configs/splits``. Single frames are written as runs: ``[0:64:3, 69, 72]`` are the frames
 0, 3, ..., 63, 69 and 72.

@@ -5,7 +5,6 @@ Conventions: ``docs/design/conventions.md``. Poses of a snippet are written in t
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -35,17 +34,6 @@ class SnippetErrors:
     re_mean: float
     re_std: float
     count: int
-    length: int = 5
-
-    @property
-    def rmse_mean(self) -> float:
-        """The position error as a true root mean square: ``sqrt(length) * ate_mean``."""
-        return math.sqrt(self.length) * self.ate_mean
-
-    @property
-    def re_moving_mean(self) -> float:
-        """Rotation error in radians over the frames that can be wrong: all but the first."""
-        return self.re_mean * self.length / (self.length - 1)
 
 
 def snippet_errors(
@@ -79,7 +67,7 @@ def snippet_errors(
     re = rotation_angle(R_error).sum(axis=1) / length
     if fidelity == "paper":
         ate, re = np.pad(ate, (0, _PAPER_ZERO_ROWS)), np.pad(re, (0, _PAPER_ZERO_ROWS))
-    return SnippetErrors(float(ate.mean()), float(ate.std()), float(re.mean()), float(re.std()), count, length)
+    return SnippetErrors(float(ate.mean()), float(ate.std()), float(re.mean()), float(re.std()), count)
 
 
 def snippets_from_trajectory(T_world_camera: FloatArray, length: int = 5) -> FloatArray:

@@ -14,8 +14,8 @@ from lightning.pytorch.callbacks import Callback, EarlyStopping
 import erfsfm
 from erfsfm.checkpoint import KINDS, Absent, Model, save_model
 from erfsfm.common.errors import TrainingError
+from erfsfm.common.readers.frame_range import merge
 from erfsfm.config import TrainedNetworks
-from erfsfm.data.splits import merge
 from erfsfm.model_record import ModelRecord, commit, read_record
 from erfsfm.training.module import DECISIVE, SelfSupervision, decisive
 

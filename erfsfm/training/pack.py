@@ -6,9 +6,10 @@ The snippets to validate on are packed as files, with their true depth and poses
 from __future__ import annotations
 
 import io
+import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.common.files import write_atomically
-from erfsfm.config import ExperimentConfig
+from erfsfm.config import ExperimentConfig, NetworkConfig
 from erfsfm.data.compact_label import encode
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.pack_index import (
@@ -32,7 +33,6 @@ from erfsfm.data.pack_index import (
     poses_file,
     write_index,
 )
-from erfsfm.data.readable import readable_parts
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shards import CLIPS_FILE, FOLDER, MOST_SNIPPETS, POSES, ShardIndex, ShardWriter, clip_name
 from erfsfm.data.snippets import ValidationSnippets, split_recordings, usable
@@ -40,6 +40,8 @@ from erfsfm.data.window import Snippet
 from erfsfm.training.progress import stage_bars
 from erfsfm.training.run import trained_on
 from erfsfm.training.supervision import measured_views
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def pack(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
     training, validation = split_recordings(config.data)
-    training = readable_parts(usable(training, config.network.sources + 1), config.network)
+    training = _readable_parts(usable(training, config.network.sources + 1), config.network)
     teacher = measured_views(training, config, config.teacher.cache or output, quiet)
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
     try:
@@ -109,6 +111,42 @@ def pack(
         shutil.rmtree(unfinished, ignore_errors=True)
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file())
     return PackSummary(size, index.files, sum(map(len, training)), labels)
+
+
+def _readable_parts(recordings: Sequence[Recording], network: NetworkConfig) -> list[Recording]:
+    """Parts of a snippet or more without an unreadable image, in order; one warning counts the images left out.
+
+    Every image is decoded for this.
+
+    Raises:
+        DataError: no part is long enough.
+    """
+    parts: list[Recording] = []
+    least = network.sources + 1
+    reasons: list[str] = []
+    for recording in recordings:
+        ends = [-1]
+        for index in range(len(recording)):
+            try:
+                recording.image(index, network.height, network.width)
+            except DataError as error:
+                reasons.append(str(error))
+                ends.append(index)
+        spans = zip([end + 1 for end in ends], [*ends[1:], len(recording)], strict=True)
+        parts += [recording.part(start, stop) for start, stop in spans if stop - start >= least]
+    if not reasons:
+        return list(recordings)
+    if not parts:
+        raise DataError(f"no {least} consecutive images can be read: {reasons[0]}")
+    total, kept = sum(map(len, recordings)), sum(map(len, parts))
+    logger.warning(
+        "%d of %d images cannot be read; %d are left out, with those of stretches shorter than a snippet: %s",
+        len(reasons),
+        total,
+        total - kept,
+        reasons[0],
+    )
+    return parts
 
 
 def _described(recording: Recording, config: ExperimentConfig) -> dict[str, Any]:

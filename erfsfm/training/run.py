@@ -27,13 +27,13 @@ from erfsfm.checkpoint import KINDS, load_model
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.lock import FolderLock
+from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import single_threaded_opencv
 from erfsfm.config import ExperimentConfig, TrainingConfig
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
-from erfsfm.data.splits import merge
 from erfsfm.inference import choose_device
 from erfsfm.networks.transfer import take_over
 from erfsfm.training.keeper import Patience, WeightKeeper

@@ -8,6 +8,7 @@ The range is read from the right: a folder may have brackets in its own name.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from erfsfm.common.errors import ConfigError
@@ -69,6 +70,30 @@ class FrameRange:
         return f"{self.recording}[{self.start}:{self.stop if self.stop < EVERYTHING else ''}]"
 
 
+def overlapping(names: Iterable[str], seen: Iterable[str]) -> list[str]:
+    """Those of ``names`` that share frames with what was ``seen`` in training; empty where nothing leaks."""
+    ranges = [FrameRange.parse(name) for name in seen]
+
+    def leaks(name: str) -> bool:
+        wanted = FrameRange.parse(name)
+        return any(wanted.covers(each) for each in ranges)
+
+    return [name for name in names if leaks(name)]
+
+
+def merge(names: Iterable[str]) -> list[str]:
+    """A short, sorted leak record: neighbouring simulated seeds become ranges, duplicates go."""
+    seeds: set[int] = set()
+    others: set[str] = set()
+    for name in names:
+        span = seed_span(FrameRange.parse(name).recording)
+        if span is None:
+            others.add(str(FrameRange.parse(name)))
+        else:
+            seeds |= set(range(span[0], span[1] + 1))
+    return _seed_ranges(sorted(seeds)) + sorted(others)
+
+
 def seed_span(recording: str) -> tuple[int, int] | None:
     """The first and last seed of simulated worlds; None of any other recording."""
     match = re.fullmatch(r"simulated/(\d+)(?:-(\d+))?", recording)
@@ -89,3 +114,13 @@ def _drive(recording: str) -> tuple[str, int, int]:
 def _seed_spans_overlap(first: str, second: str) -> bool:
     a, b = seed_span(first), seed_span(second)
     return a is not None and b is not None and a[0] <= b[1] and b[0] <= a[1]
+
+
+def _seed_ranges(seeds: list[int]) -> list[str]:
+    runs: list[list[int]] = []
+    for seed in seeds:
+        if runs and runs[-1][-1] + 1 == seed:
+            runs[-1].append(seed)
+        else:
+            runs.append([seed])
+    return [f"simulated/{r[0]}" if len(r) == 1 else f"simulated/{r[0]}-{r[-1]}" for r in runs]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from erfsfm.inference import overlapping
+from erfsfm.common.readers.frame_range import overlapping
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import Sequence as FrameSequence
 from slam.pipeline.checkpoint import SessionCheckpoint

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from erfsfm.data.discovery import discover
-from erfsfm.data.kitti_raw import open_drive
+from erfsfm.data.discovery import discover, open_drive
 
 WriteDrive = Callable[..., Path]
 NAME = "kitti_raw/2011_09_26_drive_0001"

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import DataConfig, ExperimentConfig, NetworkConfig, TeacherConfig
 from erfsfm.data.discovery import discover
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings, usable
-from erfsfm.data.splits import overlapping
 from slam.simulation.street import SimulatedStreet, SimulationOptions
 
 FRAMES = 9

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.data.split_file import Split, read_split_file
-from erfsfm.data.splits import overlapping
 
 SHIPPED = sorted(path.stem for path in (Path(__file__).parents[3] / "configs" / "splits").glob("*.yaml"))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from erfsfm.common.errors import DataError
-from erfsfm.data.kitti_raw import open_drive
+from erfsfm.data.discovery import open_drive
 from erfsfm.data.recordings import Recording
 from erfsfm.data.standstill import moving_parts
 

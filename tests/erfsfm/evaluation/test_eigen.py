@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import NetworkConfig
-from erfsfm.data.splits import overlapping
 from erfsfm.evaluation.depth_metrics import depth_errors
 from erfsfm.evaluation.eigen import eigen_protocol, read_split
 from erfsfm.inference import DepthPosePredictor

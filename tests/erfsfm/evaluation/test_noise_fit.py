@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from erfsfm.common.errors import DataError
-from erfsfm.data.splits import overlapping
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.evaluation.noise_fit import PairErrors, calibrate, coverage, fit, pair_errors
 
 ROTATION, LENGTH_RATIO, UNIT = 0.002, 0.05, 0.3

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.readers.frame_range import overlapping
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.splits import overlapping
 from erfsfm.evaluation.protocols import depth_protocol, pose_protocol
 from erfsfm.training.pack import pack
 

@@ -10,9 +10,6 @@ import os
 import pickle
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +26,7 @@ from erfsfm.checkpoint import Absent, Model, build_networks, load_model, save_mo
 from erfsfm.common.errors import BusyError, CheckpointError, ConfigError, DataError, TrainingError
 from erfsfm.common.lock import FolderLock
 from erfsfm.common.signals import Terminated
-from erfsfm.config import ExperimentConfig, TrainedNetworks, dump_yaml, load_experiment
+from erfsfm.config import ExperimentConfig, TrainedNetworks, load_experiment
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.inference import DepthPosePredictor
@@ -171,7 +168,11 @@ def test_two_runs_are_equal(small: Small, world: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "schedule, normalisation, optimiser",
-    [("constant", "none", "adam"), ("cosine", "batch", "adam"), ("cosine", "batch", "muon")],
+    [
+        ("constant", "none", "adam"),
+        ("cosine", "batch", "adam"),
+        pytest.param("cosine", "batch", "muon", marks=pytest.mark.slow),
+    ],
 )
 def test_resume_ends_with_identical_weights(
     small: Small,
@@ -819,49 +820,16 @@ def test_half_precision_on_a_cpu_is_announced(
     ]
 
 
-def free_port() -> int:
-    with socket.socket() as each:
-        each.bind(("127.0.0.1", 0))
-        return int(each.getsockname()[1])
-
-
-def in_processes(config: ExperimentConfig, output: Path, resume: bool = False, before: str = "") -> None:
-    """Train in as many processes as the configuration names; each first runs the lines ``before``.
-
-    Lightning starts the script again for a second device.
-    """
-    script, file = output.with_suffix(".py"), output.with_suffix(".yaml")
-    script.write_text(
-        "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
-        "from erfsfm.training.module import SelfSupervision\nfrom erfsfm.training.run import train\n"
-        f"{before}\n"
-        "if __name__ == '__main__':\n"
-        "    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), '--resume' in sys.argv, device='cpu')\n"
-        "    print('trained')\n"
-    )
-    file.write_text(dump_yaml(config))
-    command = [sys.executable, str(script), str(file), str(output), *(["--resume"] if resume else [])]
-    nodes = config.training.nodes
-    at = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())} if config.training.processes > 1 else {}
-    started = [
-        subprocess.Popen(
-            command,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **at, "NODE_RANK": str(node)},
-        )
-        for node in range(nodes)
-    ]
-    said = [process.communicate(timeout=300) for process in started]
-    assert [process.returncode for process in started] == [0] * nodes, said
-    assert "".join(out for out, _ in said) == "trained\n", "by the first process alone"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("spread", "workers"), [("devices", 1), ("nodes", 0)])
 def test_two_processes_are_one_with_twice_the_batch(
-    small: Small, world: Path, held_out: Path, tmp_path: Path, spread: str, workers: int
+    small: Small,
+    world: Path,
+    held_out: Path,
+    tmp_path: Path,
+    in_processes: Callable[..., None],
+    spread: str,
+    workers: int,
 ) -> None:
     """Batches of 2 in each of two processes; of 4 in one."""
 
@@ -883,10 +851,10 @@ def test_two_processes_are_one_with_twice_the_batch(
 
 @pytest.mark.slow
 def test_two_processes_stop_together_though_they_measure_different_things(
-    small: Small, world: Path, held_out: Path, tmp_path: Path
+    small: Small, world: Path, held_out: Path, tmp_path: Path, in_processes: Callable[..., None]
 ) -> None:
     """Each has statistics of its own batches, and thus errors of its own; the first one's decide."""
-    training = {"steps": 6, "validate_every": 1, "patience": 1, "devices": 2}
+    training = {"steps": 6, "validate_every": 1, "patience": 1, "nodes": 2}
     measured = (
         "SelfSupervision.measured = lambda self: "
         "{'abs_rel': ([0.3, 0.2, 0.5] if self.global_rank == 0 else [0.3, 0.2, 0.1])[self.global_step - 1]}"

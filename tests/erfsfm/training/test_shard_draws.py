@@ -5,12 +5,8 @@ from __future__ import annotations
 import functools
 import http.server
 import io
-import os
 import pickle
 import shutil
-import socket
-import subprocess
-import sys
 import tarfile
 import threading
 from collections import Counter
@@ -26,7 +22,7 @@ from torch.utils.data import DataLoader
 
 from erfsfm.checkpoint import load_model
 from erfsfm.common.errors import ConfigError, DataError
-from erfsfm.config import ExperimentConfig, dump_yaml
+from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, split_recordings
@@ -212,25 +208,12 @@ def test_it_trains_with_the_same_record_and_resumes_to_the_same_weights(
 
 
 @pytest.mark.slow
-def test_two_nodes_train_on_different_shards(config: ExperimentConfig, packed: Path, tmp_path: Path) -> None:
-    """On loopback. Were their samples the same, so would be the mean of their gradients, and the weights of one."""
-    script = tmp_path / "train.py"
-    script.write_text(
-        "import sys\nfrom pathlib import Path\nfrom erfsfm.config import load_experiment\n"
-        "from erfsfm.training.run import train\n"
-        "if __name__ == '__main__':\n"
-        "    train(load_experiment(sys.argv[1]), Path(sys.argv[2]), device='cpu')\n"
-    )
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+def test_two_nodes_train_on_different_shards(
+    config: ExperimentConfig, packed: Path, tmp_path: Path, in_processes: Callable[..., None]
+) -> None:
+    """Were their samples the same, so would be the mean of their gradients, and the weights of one."""
     on_shards = on_pack(config, packed, workers=1)
-    (tmp_path / "two.yaml").write_text(dump_yaml(changed(on_shards, training={"nodes": 2})))
-    command = [sys.executable, str(script), str(tmp_path / "two.yaml"), str(tmp_path / "two")]
-    at = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    nodes = [subprocess.Popen(command, stderr=subprocess.PIPE, env=at | {"NODE_RANK": str(n)}) for n in range(2)]
-    said = [node.communicate(timeout=300)[1] for node in nodes]
-    assert [node.returncode for node in nodes] == [0, 0], said
+    in_processes(changed(on_shards, training={"nodes": 2}), tmp_path / "two")
     train(on_shards, tmp_path / "one", device="cpu")
     one, two = (load_model(tmp_path / name / "last") for name in ("one", "two"))
     assert one.record.trained_on == two.record.trained_on and two.record.step == 4

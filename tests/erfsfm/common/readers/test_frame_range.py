@@ -1,12 +1,12 @@
-"""Names of frames where the recording has brackets in its own name."""
+"""Names of recordings and frames, also with brackets in them, and whether two share a frame."""
 
 from __future__ import annotations
 
 import pytest
 
 from erfsfm.common.errors import ConfigError
-from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
-from erfsfm.data.splits import merge, overlapping
+from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange, merge, overlapping
+from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
 
 
 @pytest.mark.parametrize(
@@ -50,3 +50,95 @@ def test_leaks_of_videos_in_one_folder() -> None:
 def test_names_of_data_sets_have_no_brackets(name: str) -> None:
     with pytest.raises(ConfigError, match="names no frames"):
         FrameRange.parse(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "seen", "leaks"),
+    [
+        ("kitti_odometry/00", "kitti_odometry/00", True),
+        ("kitti_odometry/00", "kitti_odometry/01", False),
+        ("kitti_odometry/00[0:250]", "kitti_odometry/00[249:300]", True),
+        ("kitti_odometry/00[0:250]", "kitti_odometry/00[250:]", False),
+        ("kitti_odometry/00[:10]", "kitti_odometry/00[5:6]", True),
+        ("kitti_odometry/00", "kitti_odometry/00[7:8]", True),
+        ("kitti_raw/2011_10_03_drive_0027", "kitti_odometry/00", True),
+        ("kitti_raw/2011_10_03_drive_0027_sync", "kitti_odometry/00[100:200]", True),
+        ("kitti_raw/2011_10_03_drive_0027[0:100]", "kitti_odometry/00[100:200]", False),
+        ("kitti_raw/2011_09_30_drive_0028[0:1100]", "kitti_odometry/08", False),
+        ("kitti_raw/2011_09_30_drive_0028[1100:1101]", "kitti_odometry/08[0:1]", True),
+        ("kitti_raw/2011_09_30_drive_0028[1100:1101]", "kitti_odometry/08[1:]", False),
+        ("kitti_raw/2011_09_26_drive_0013", "kitti_odometry/00", False),
+        ("kitti_raw/2011_09_26_drive_0013", "kitti_raw/2011_09_26_drive_0013_sync", True),
+        ("simulated/17", "simulated/0-499", True),
+        ("simulated/500", "simulated/0-499", False),
+        ("simulated/499-600", "simulated/0-499", True),
+        ("simulated/17", "simulated/17", True),
+        ("simulated/1", "simulated/17", False),
+        ("folder/17", "simulated/17", False),
+        ("folder/my_drive", "folder/my_drive[0:40]", True),
+    ],
+)
+def test_leaks(name: str, seen: str, leaks: bool) -> None:
+    assert overlapping([name], [seen]) == ([name] if leaks else [])
+    assert overlapping([seen], [name]) == ([seen] if leaks else []), "either way round"
+
+
+@pytest.mark.parametrize("sequence", sorted(ODOMETRY_DRIVES))
+def test_every_odometry_sequence_is_its_raw_drive(sequence: str) -> None:
+    drive, first, past_last = ODOMETRY_DRIVES[sequence]
+    cut, whole = FrameRange.parse(f"kitti_raw/{drive}[{first}:{past_last}]"), FrameRange.parse(f"kitti_raw/{drive}")
+    name = f"kitti_odometry/{sequence}"
+    assert cut.counted_in(name) == whole.counted_in(name) == FrameRange(name, 0, past_last - first)
+    assert FrameRange.parse(name).counted_in(cut.recording) == cut
+
+
+def test_frames_of_the_table() -> None:
+    """The lengths of the benchmark."""
+    lengths = [stop - start for _, start, stop in ODOMETRY_DRIVES.values()]
+    assert lengths == [4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201]
+
+
+@pytest.mark.parametrize("name", ["kitti_odometry/00[", "kitti_odometry/00[a:b]", "x[1]", "", "x[1:2]y"])
+def test_bad_brackets(name: str) -> None:
+    with pytest.raises(ConfigError, match="names no frames") as caught:
+        FrameRange.parse(name)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["kitti_odometry/00", "kitti_odometry/00[0:250]", "kitti_odometry/00[250:]", "simulated/0-9", "folder/a b"]
+)
+def test_names_round_trip(name: str) -> None:
+    assert str(FrameRange.parse(name)) == name
+    assert FrameRange.parse(str(FrameRange.parse(name))) == FrameRange.parse(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "recording", "same"),
+    [
+        ("kitti_raw/2011_09_30_drive_0028[1000:1200]", "kitti_odometry/08", "kitti_odometry/08[0:100]"),
+        ("kitti_odometry/08[0:100]", "kitti_raw/2011_09_30_drive_0028", "kitti_raw/2011_09_30_drive_0028[1100:1200]"),
+        ("kitti_raw/2011_09_30_drive_0028[5000:]", "kitti_odometry/08", "kitti_odometry/08[3900:4071]"),
+        ("kitti_raw/2011_09_30_drive_0028[0:1100]", "kitti_odometry/08", None),
+        ("kitti_odometry/08", "kitti_odometry/07", None),
+        ("simulated/500-599[10:]", "simulated/512", "simulated/512[10:]"),
+        ("simulated/500-599", "simulated/499", None),
+        ("folder/a[3:]", "folder/a", "folder/a[3:]"),
+    ],
+)
+def test_the_same_frames_by_other_numbers(name: str, recording: str, same: str | None) -> None:
+    found = FrameRange.parse(name).counted_in(recording)
+    assert (str(found) if found else None) == same
+
+
+def test_merge() -> None:
+    names = ["simulated/3", "simulated/1", "simulated/2", "simulated/7", "folder/b", "folder/a", "folder/b"]
+    assert merge(names) == ["simulated/1-3", "simulated/7", "folder/a", "folder/b"]
+    assert merge([]) == []
+
+
+def test_frames_of_a_drive_before_its_sequence_are_recorded() -> None:
+    """Drive 0028 begins 1100 frames before sequence 08: what was seen there has no name among the sequence's."""
+    record = merge(["kitti_raw/2011_09_30_drive_0028_sync[0:10]", "kitti_raw/2011_09_30_drive_0028_sync[1095:1105]"])
+    assert record == ["kitti_raw/2011_09_30_drive_0028[0:10]", "kitti_raw/2011_09_30_drive_0028[1095:1105]"]
+    assert overlapping(["kitti_odometry/08[0:5]", "kitti_odometry/08[5:]"], record) == ["kitti_odometry/08[0:5]"]

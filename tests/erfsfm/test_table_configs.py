@@ -31,7 +31,7 @@ def test_every_row_has_its_file() -> None:
 
 
 def test_the_guide_names_them_all() -> None:
-    guide = (FILES[0].parents[2] / "docs" / "reproduction.md").read_text()
+    guide = (FILES[0].parents[2] / "docs" / "design" / "reproduction.md").read_text()
     assert set(re.findall(r"^\| `(table[123]-.+?)`", guide, re.MULTILINE)) == ROWS
 
 

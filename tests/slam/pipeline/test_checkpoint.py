@@ -321,7 +321,7 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")
-    with pytest.raises(SlamError, match=r"was made with another window\.use"):
+    with pytest.raises(SlamError, match=r"was made with another keyframes\.use"):
         live(kitti_root, config=load_config(None, ["keyframes.use=always"])).resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="is missing"):
         live(kitti_root).resume(tmp_path / "none.zip")

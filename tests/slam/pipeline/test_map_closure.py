@@ -41,7 +41,7 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
 
 
 def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
-    odometry = WindowOdometry(CONFIG.window, room.INTRINSICS)
+    odometry = WindowOdometry(CONFIG.keyframes, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
         frame = room.frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(frame)

@@ -1,7 +1,7 @@
 """Fit the noise of steps by image geometry, and what it is worth on drives that the fit did not see.
 
-The ratios of ``GeometryConfig`` (jitter, neighbours) are those of greatest likelihood under Student's t; every drive
-has the same weight. For each drive the table has the coverage of its steps with the ratios in use, and with
+The ratios of ``VisualOdometryConfig`` (jitter, neighbours) are those of greatest likelihood under Student's t; every
+drive has the same weight. For each drive the table has the coverage of its steps with the ratios in use, and with
 ratios fitted to all other drives.
 
 Example: python tools/fit_step_noise.py KITTI:00 KITTI:02 KITTI:05 WORLD --weights sim --cache cache
@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
-from slam.config.sections import FrontendConfig, GeometryConfig, load_config
+from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig, load_config
 from slam.evaluation.coverage import LEVELS, squared_bound
 from slam.frames import RelativePose
 from slam.frontend.drive import Drive
@@ -47,7 +47,7 @@ RATIOS = (
     "neighbour_rotation_ratio",
     "neighbour_direction_ratio",
 )
-IN_USE = np.array([getattr(GeometryConfig(), name) for name in RATIOS])
+IN_USE = np.array([getattr(VisualOdometryConfig(), name) for name in RATIOS])
 
 
 @dataclass(frozen=True)
@@ -131,8 +131,8 @@ def measure(name: str, networks: DepthPosePredictor, cache: Path | None) -> Driv
 def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[RelativePose]:
     """The triangulated steps with a length, as they enter the graph."""
     known = Drive(motions=[motion for ends, motion in steps.triangulated.items() if ends in scale.lengths])
-    geometry = GeometryConfig(**dict(zip(RATIOS, ratios.tolist(), strict=True)))
-    return make_factors(known, scale, None, FrontendConfig(use="gaps"), geometry)
+    visual_odometry = VisualOdometryConfig(**dict(zip(RATIOS, ratios.tolist(), strict=True)))
+    return make_factors(known, scale, None, PoseNetworkConfig(use="gaps"), visual_odometry)
 
 
 def main(words: Sequence[str] | None = None) -> None:

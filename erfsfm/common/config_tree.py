@@ -171,8 +171,8 @@ def _nearest_key(key: str, known: Sequence[str]) -> str:
     section, _, last = key.rpartition(".")
     siblings = {name.rpartition(".")[2]: name for name in known if name.rpartition(".")[0] == section}
     others = {name.rpartition(".")[2]: name for name in reversed(known)}
-    for names in (siblings, others):
-        nearest = difflib.get_close_matches(last, names, 1)
+    for names, least_ratio in ((siblings, 0.6), (others, 0.8)):
+        nearest = difflib.get_close_matches(last, names, 1, least_ratio)
         if nearest:
             return f"did you mean '{names[nearest[0]]}'?"
     return f"known keys{f' of {section}' if section else ''}: {', '.join(siblings)}"

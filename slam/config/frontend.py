@@ -1,4 +1,4 @@
-"""Settings of the front end: the pose network's factors, image geometry, gaps, step lengths, LiDAR and scale."""
+"""Settings of the front end: pose network, visual odometry, keyframes, gaps, step lengths, LiDAR, GPS and scale."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from erfsfm.common.config_tree import Section
 ScaleMode = Literal["none", "camera-height", "lidar", "reference", "known", "gps"]
 
 
-class FrontendConfig(Section):
+class PoseNetworkConfig(Section):
     """Factors of the pose network, see ``frontend/network_factors.py``."""
 
     use: Literal["calibrated", "gaps", "always"] = Field(
@@ -21,7 +21,7 @@ class FrontendConfig(Section):
     )
 
 
-class GeometryConfig(Section):
+class VisualOdometryConfig(Section):
     """Relative poses from tracked corners, see ``frontend/visual/odometry.py``."""
 
     enabled: bool = Field(default=True, description="measure relative poses by image geometry")
@@ -86,6 +86,16 @@ class LengthConfig(Section):
     outlier_sigmas: float = Field(
         default=2.0, gt=0, description="residual at which the robust weight of a measurement is one half, sigmas"
     )
+
+
+class KeyframesConfig(Section):
+    """Keyframes with bundle adjustment, see ``frontend/window/odometry.py``."""
+
+    use: Literal["auto", "always", "never"] = Field(
+        default="auto",
+        description="auto: unless a camera height is known or the first steps are a vehicle's; never: steps only",
+    )
+    max_corners: int = Field(default=500, ge=50, le=10000, description="largest number of corners of a keyframe")
 
 
 class GapsConfig(Section):

@@ -15,35 +15,35 @@ from erfsfm.common.config_tree import Section
 from erfsfm.common.config_tree import dump_explained as dump_yaml
 from slam.config.files import load_sections
 from slam.config.frontend import (
-    FrontendConfig,
     GapsConfig,
-    GeometryConfig,
     GpsConfig,
+    KeyframesConfig,
     LengthConfig,
     LidarConfig,
+    PoseNetworkConfig,
     RoadConfig,
     ScaleConfig,
     ScaleMode,
+    VisualOdometryConfig,
 )
-from slam.config.window import WindowConfig
 
 __all__ = [
     "DepthConfig",
-    "FrontendConfig",
     "GapsConfig",
-    "GeometryConfig",
     "GpsConfig",
+    "KeyframesConfig",
     "LengthConfig",
     "LidarConfig",
     "LoopsConfig",
     "MappingConfig",
     "OutputConfig",
     "PoseGraphConfig",
+    "PoseNetworkConfig",
     "RoadConfig",
     "ScaleConfig",
     "ScaleMode",
     "SlamConfig",
-    "WindowConfig",
+    "VisualOdometryConfig",
     "dump_yaml",
     "load_config",
 ]
@@ -147,17 +147,19 @@ class MappingConfig(Section):
     )
     depth_min_m: float = Field(default=1.0, ge=0, description="smallest fused depth, metres")
     depth_max_m: float = Field(default=20.0, gt=0, description="largest fused depth, metres")
-    sure_sigma_m: float = Field(
+    certain_sigma_m: float = Field(
         default=1.2, ge=0, description="largest sigma of depth that is fused beyond depth_max_m, metres"
     )
-    sure_reach: float = Field(default=1.4, ge=1, description="such depth is fused up to this multiple of depth_max_m")
+    certain_range_factor: float = Field(
+        default=1.4, ge=1, description="such depth is fused up to this multiple of depth_max_m"
+    )
     border: float = Field(
         default=0.02,
         ge=0,
         lt=0.5,
         description="width of the left, right and upper border that is left out, over the image's width",
     )
-    bonnet: float = Field(
+    hood_crop: float = Field(
         default=0.0,
         ge=0,
         lt=1,
@@ -166,7 +168,7 @@ class MappingConfig(Section):
     max_depth_step: float = Field(
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
-    consistency: float = Field(
+    max_depth_difference: float = Field(
         default=0.12, gt=0, description="largest relative difference to the depth of the previous keyframe"
     )
     max_relative_sigma: float = Field(default=0.2, gt=0, description="largest sigma of fused depth, over the depth")
@@ -192,7 +194,7 @@ class MappingConfig(Section):
     @property
     def reach_m(self) -> float:
         """Depth up to which anything is fused."""
-        return self.depth_max_m * self.sure_reach
+        return self.depth_max_m * self.certain_range_factor
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
@@ -219,9 +221,9 @@ class SlamConfig(Section):
     """All settings of a run."""
 
     depth: DepthConfig = DepthConfig()
-    frontend: FrontendConfig = FrontendConfig()
-    geometry: GeometryConfig = GeometryConfig()
-    window: WindowConfig = WindowConfig()
+    pose_network: PoseNetworkConfig = PoseNetworkConfig()
+    visual_odometry: VisualOdometryConfig = VisualOdometryConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
     gaps: GapsConfig = GapsConfig()
     road: RoadConfig = RoadConfig()
     lengths: LengthConfig = LengthConfig()

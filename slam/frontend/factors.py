@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config.sections import FrontendConfig, GeometryConfig
+from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
@@ -32,8 +32,8 @@ def make_factors(
     drive: Drive,
     scale: Scale,
     noise: PoseNoise | None,
-    frontend: FrontendConfig,
-    geometry: GeometryConfig,
+    pose_network: PoseNetworkConfig,
+    visual_odometry: VisualOdometryConfig,
 ) -> list[RelativePose]:
     """All relative poses with their noise, in the unit of the scale.
 
@@ -41,17 +41,17 @@ def make_factors(
         drive: completed.
         scale: of each frame, and the lengths of steps.
         noise: of the pose network; None measures it against image geometry on this drive.
-        frontend: which factors of the pose network are used.
-        geometry: noise of image geometry.
+        pose_network: which of its factors are used.
+        visual_odometry: noise of image geometry.
     """
-    geometric = _geometric(drive.steps, scale, geometry)
+    geometric = _geometric(drive.steps, scale, visual_odometry)
     # the noise of the networks is that of their own unit
     unscaled = [pose.scaled(1.0 / scale.unit_at(pose)) for pose in geometric]
     if noise is None:
         networks = network_factors(drive.trusted, measured_noise(drive.trusted, unscaled))
     else:
         networks = calibrated_factors(drive.trusted, unscaled, noise)
-    if frontend.use == "gaps" or (frontend.use == "calibrated" and noise is None):
+    if pose_network.use == "gaps" or (pose_network.use == "calibrated" and noise is None):
         networks = without_measured(networks, geometric)
     window = drive.map_poses
 
@@ -116,7 +116,7 @@ def _precedence(factor: RelativePose) -> tuple[bool, int]:
     return factor.source == WINDOW_SOURCE, factor.from_index
 
 
-def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[RelativePose]:
+def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> list[RelativePose]:
     """Every step of image geometry: with its own length where that was measured, else by learned depth."""
     noise = _step_noise(steps, scale, config)
     factors = []
@@ -130,7 +130,7 @@ def _geometric(steps: StepTable, scale: Scale, config: GeometryConfig) -> list[R
     return factors
 
 
-def _step_noise(steps: StepTable, scale: Scale, config: GeometryConfig) -> Mapping[Ends, StepNoise]:
+def _step_noise(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> Mapping[Ends, StepNoise]:
     """Noise of the triangulated steps besides that of the corners, by their order in the drive."""
     motions = steps.triangulated
     place = {ends: n for n, ends in enumerate(links(motions, len(scale.per_frame))) if ends in motions}

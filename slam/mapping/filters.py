@@ -46,11 +46,11 @@ class DepthFilters:
             intrinsics.rays(intrinsics.pixel_grid()).reshape(-1, 3).T, dtype=np.float32
         )  # (3, H*W) with z = 1
         height, width = intrinsics.height, intrinsics.width
-        border, self._above_bonnet = round(config.border * width), np.ones((height, width), dtype=bool)
+        border, self._above_hood = round(config.border * width), np.ones((height, width), dtype=bool)
         self._top_rows = border + 1
         self._inside = np.zeros((height, width), dtype=bool)
         self._inside[border:, border : width - border] = True
-        self._above_bonnet[height - round(config.bonnet * height) :] = False
+        self._above_hood[height - round(config.hood_crop * height) :] = False
         self._taken = np.zeros(len(FILTERS))
         self._frames = 0
 
@@ -64,12 +64,12 @@ class DepthFilters:
         everything = np.ones(depth.shape, dtype=bool)
         sigma = np.full_like(depth, np.nan) if view.relative_sigma is None else view.relative_sigma
         is_exact = sigma < _EXACT
-        is_sure = depth * np.minimum(sigma, _MOST_SIGMA) <= config.sure_sigma_m
+        is_sure = depth * np.minimum(sigma, _MOST_SIGMA) <= config.certain_sigma_m
         farthest = np.where(is_sure, config.reach_m, config.depth_max_m)
         masks = (
             depth > 0,
             self._inside | is_exact,
-            self._above_bonnet,
+            self._above_hood,
             ~self._is_sky(view.image) | is_exact,
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
@@ -122,7 +122,7 @@ class DepthFilters:
         """Pixels ``(H, W)`` whose depth is consistent with the other view's depth."""
         u, v, z = self.projected(view, other)
         there = sampled(self.trusted(other), u, v)
-        return np.asarray(np.abs(there - z) < np.float32(self._config.consistency) * z)
+        return np.asarray(np.abs(there - z) < np.float32(self._config.max_depth_difference) * z)
 
 
 def sampled(image: NDArray[Any], u: DepthMap, v: DepthMap) -> NDArray[Any]:

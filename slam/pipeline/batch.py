@@ -175,7 +175,7 @@ class SlamPipeline:
         with self._watch.stage("scale"):
             scale = find_scale(self.mode, self._sequence.camera_height_m, drive, by_lidar, config.lengths)
         warn_of_contradicted_steps(scale)
-        factors = make_factors(drive, scale, self._noise, config.frontend, config.geometry)
+        factors = make_factors(drive, scale, self._noise, config.pose_network, config.visual_odometry)
         T_odometry = chain_odometry(factors, T_network, scale)
         if self.mode in ("reference", "known", "gps"):
             unit = self._unit(T_odometry)

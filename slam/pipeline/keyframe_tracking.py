@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from slam.config.sections import LoopsConfig, WindowConfig
+from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
 from slam.frontend.window.descriptors import describe
@@ -32,7 +32,7 @@ _VEHICLE_SCATTER_DEG = 10.0  # median angle of a vehicle's steps to their usual 
 FrontEnd = Literal["steps", "both", "keyframes"]
 
 
-def choose(config: WindowConfig, camera_height_m: float | None, drive: Drive) -> FrontEnd:
+def choose(config: KeyframesConfig, camera_height_m: float | None, drive: Drive) -> FrontEnd:
     """What measures a drive: both, until its first steps show whether the camera is on a vehicle.
 
     A known camera height says that there is a road. Lengths from the road do not enter the map of keyframes yet, and on
@@ -53,7 +53,7 @@ class KeyframeTracking:
 
     def __init__(
         self,
-        config: WindowConfig,
+        config: KeyframesConfig,
         loops: LoopsConfig,
         intrinsics: Intrinsics,
         seed: int,

@@ -211,7 +211,7 @@ class Slam:
 
         Raises:
             SlamError: there are frames already, or the file is missing, damaged or of another camera, other weights or
-                another ``window.use``.
+                another ``keyframes.use``.
         """
         if len(self):
             raise SlamError(f"{path} can only be resumed before the first frame; there are {len(self)} already")
@@ -219,9 +219,9 @@ class Slam:
         mine = (self._sequence.intrinsics, self._sequence.camera_height_m, self._weights_sha256)
         if (checkpoint.intrinsics, checkpoint.camera_height_m, checkpoint.weights_sha256) != mine:
             raise SlamError(f"{path} was made with another camera, camera height or weights: make Slam with the same")
-        front_end = choose(self._config.window, self._sequence.camera_height_m, checkpoint.state.drive)
+        front_end = choose(self._config.keyframes, self._sequence.camera_height_m, checkpoint.state.drive)
         if (front_end == "steps") != (checkpoint.state.keyframes is None):
-            raise SlamError(f"{path} was made with another window.use: make Slam with the same")
+            raise SlamError(f"{path} was made with another keyframes.use: make Slam with the same")
         self._observer.close()
         self._observer, self._is_closed = self._observe(checkpoint.state), False
         self._sequence.stamps = checkpoint.stamps

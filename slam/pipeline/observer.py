@@ -93,9 +93,11 @@ class Observer:
         self._examples = examples or Examples(range(0))
         self._drive = Drive() if state is None else state.drive.copy()
         self._gate = ImageGate(None if state is None else state.gate)
-        self._odometry = VisualOdometry(config.geometry, intrinsics, seed, None if state is None else state.odometry)
+        self._odometry = VisualOdometry(
+            config.visual_odometry, intrinsics, seed, None if state is None else state.odometry
+        )
         keyframes = WindowState() if state is None else state.keyframes
-        self._keyframes = KeyframeTracking(config.window, config.loops, intrinsics, seed, keyframes, camera_height_m)
+        self._keyframes = KeyframeTracking(config.keyframes, config.loops, intrinsics, seed, keyframes, camera_height_m)
         self._keyframes.choose(self._drive)
         self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
@@ -233,7 +235,7 @@ class Observer:
         with self._stopwatch.stage("keyframes"):
             self._keyframes.follow(frame)
         with self._stopwatch.stage("geometry"):
-            measure = self._config.geometry.enabled and not self._keyframes.measures(self._drive, frame.index)
+            measure = self._config.visual_odometry.enabled and not self._keyframes.measures(self._drive, frame.index)
             step = self._measure_step(self._recent[-1], frame) if measure and self._recent else None
             rotation = self._relative_rotation(frame)
         self._finish_tasks()
@@ -245,7 +247,9 @@ class Observer:
         if self._config.road.enabled and step is not None:
             self._tasks.append(self._road_task(self._recent[-1].frame, frame, step))
         self._drive.roads.append(MeasurementFailure("its depth was not predicted"))
-        self._recent = (*self._recent, RecentFrame(frame, None, None))[-self._config.geometry.rotation_baseline_steps :]
+        self._recent = (*self._recent, RecentFrame(frame, None, None))[
+            -self._config.visual_odometry.rotation_baseline_steps :
+        ]
         if pending.depth is not None:
             with self._stopwatch.stage("depth network"):
                 depth = pending.depth.result()
@@ -292,7 +296,7 @@ class Observer:
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
         """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
-        baseline = self._config.geometry.rotation_baseline_steps
+        baseline = self._config.visual_odometry.rotation_baseline_steps
         if baseline < 2 or len(self._recent) < baseline:
             return None
         first = self._recent[-baseline]

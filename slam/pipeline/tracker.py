@@ -125,7 +125,7 @@ class Tracker:
             return
         config, window = self._config, complete_drive(window, self._sources)
         scale = find_scale(self._mode, self._camera_height_m, window, [], config.lengths)
-        factors = make_factors(window, scale, self._noise, config.frontend, config.geometry)
+        factors = make_factors(window, scale, self._noise, config.pose_network, config.visual_odometry)
         T_odometry = chain_odometry(factors, chain_raw(window.snippets, len(window)), scale)
         self.unit_name = scale.unit_name
         by_keyframes = observer.keyframe_step(count - 1) is not None

@@ -106,7 +106,7 @@ def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> N
 def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> None:
     part = Excerpt(street, 40, 70)
     oracle = OraclePredictor(part.reference, lambda k: street.depth(40 + k))
-    exact = ["geometry.enabled=false", "depth.refine=none"]  # true depth is the better one
+    exact = ["visual_odometry.enabled=false", "depth.refine=none"]  # true depth is the better one
     result = SlamPipeline(part, oracle, load_config(None, exact)).run()
     assert result.map is not None
     points = se3.apply(street.street.T_world_camera[40], result.map.cloud().points_world)
@@ -116,7 +116,7 @@ def test_without_noise_the_map_is_as_good_as_its_voxels(street: Rendered) -> Non
 @pytest.mark.slow
 def test_the_graph_alone_reduces_the_error(street: Rendered) -> None:
     part = Excerpt(street, 0, 100)
-    options = ("geometry.enabled=false", "mapping.enabled=false")
+    options = ("visual_odometry.enabled=false", "mapping.enabled=false")
     runs = [drive(part, seed, *options) for seed in range(4)]
     before, after = (np.mean([ate(getattr(run, name), run) for run in runs]) for name in ("network", "optimised"))
     assert after < 0.7 * before

@@ -21,7 +21,7 @@ from slam.runtime.storage.record import Missing, known
 logger = logging.getLogger(__name__)
 
 # sections that the pass over the frames depends on: `run --continue` cannot change them
-_FIXED_SECTIONS = ("depth", "geometry", "gaps", "road", "scale", "loops", "window")
+_FIXED_SECTIONS = ("depth", "visual_odometry", "gaps", "road", "scale", "loops", "keyframes")
 
 
 def provenance_to_resume(

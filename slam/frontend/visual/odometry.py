@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import DepthMap, Ends, Frame, Intrinsics, RelativePose, nearest_depth
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual.depth_error import DepthError
@@ -85,7 +85,7 @@ class VisualOdometry:
 
     def __init__(
         self,
-        config: GeometryConfig,
+        config: VisualOdometryConfig,
         intrinsics: Intrinsics,
         seed: int = 0,
         state: OdometryState | None = None,

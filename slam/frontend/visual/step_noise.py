@@ -3,7 +3,7 @@
 The covariance of corners holds for an ideal pinhole. Time stamps, the mount and the lens add errors, which grow with
 the camera's rotation jitter, its rotation, and the residual of a step to its neighbours. So the sigmas of each step
 are inflated by ratios of the part of these that the noise of corners does not explain. The ratios in
-``GeometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
+``VisualOdometryConfig`` were fitted once (``docs/design/noise-and-the-pose-graph.md``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.geometry.robust import mad_sigmas
 from slam.geometry.se3 import FloatArray, invert
 
@@ -37,7 +37,7 @@ class StepNoise:
 
 
 def inflate_step_sigmas(
-    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: GeometryConfig
+    T_previous_current: Mapping[int, FloatArray], own: Mapping[int, StepNoise], config: VisualOdometryConfig
 ) -> dict[int, StepNoise]:
     """The noise of each step of a drive besides that of the corners.
 

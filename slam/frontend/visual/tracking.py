@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Grey
 from slam.frontend.sparse_flow import Pixels, are_inside, lucas_kanade, new_corners
 from slam.frontend.visual.predicted_flow import PredictedFlow
@@ -64,7 +64,7 @@ class TrackerState:
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(self, config: GeometryConfig, state: TrackerState | None = None) -> None:
+    def __init__(self, config: VisualOdometryConfig, state: TrackerState | None = None) -> None:
         self._config = config
         self._state = state or TrackerState({})
         self._frames_kept = config.rotation_baseline_steps + 2

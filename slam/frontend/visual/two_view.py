@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
     triangulated_depth,
@@ -93,7 +93,7 @@ class TwoViewEstimate:
 class TwoViewEstimator:
     """Estimates the motions of one drive; stateless, the history is an argument."""
 
-    def __init__(self, config: GeometryConfig, focal_px: float, seed: int = 0) -> None:
+    def __init__(self, config: VisualOdometryConfig, focal_px: float, seed: int = 0) -> None:
         self._config = config
         self._focal_px = focal_px
         self._seed = seed

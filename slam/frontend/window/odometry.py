@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.config.sections import WindowConfig
+from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
@@ -87,7 +87,7 @@ class WindowOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map."""
 
     def __init__(
-        self, config: WindowConfig, intrinsics: Intrinsics, seed: int = 0, state: WindowState | None = None
+        self, config: KeyframesConfig, intrinsics: Intrinsics, seed: int = 0, state: WindowState | None = None
     ) -> None:
         """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC."""
         self._config = config

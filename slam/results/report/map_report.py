@@ -27,12 +27,12 @@ _ERRORS: dict[str, _Value] = {
 _FILTERS = {
     "unknown": "no depth",
     "border": "left, right and upper border of the image (mapping.border)",
-    "bonnet": "lower border, the car's own bonnet (mapping.bonnet)",
+    "bonnet": "lower border, the car's own hood (mapping.hood_crop)",
     "sky": "bright or blue above the horizon (mapping.sky_brightness, mapping.sky_blueness)",
-    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m, mapping.sure_reach)",
+    "range": "too near or too far (mapping.depth_min_m, mapping.depth_max_m, mapping.certain_range_factor)",
     "sigma": "refined depth too uncertain (mapping.max_relative_sigma)",
     "edge": "at a step of depth (mapping.max_depth_step)",
-    "agreement": "the keyframe before does not agree (mapping.consistency)",
+    "agreement": "the keyframe before does not agree (mapping.max_depth_difference)",
 }
 _TRUTHS = {
     "exact surface": "the exact surface of the simulated street",

@@ -29,7 +29,7 @@ Call = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., RunFolder]
 
 VERBS = {"run", "evaluate", "export", "simulate", "plot", "localize", "config", "doctor"}
-QUICK = ("--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false")
+QUICK = ("--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false")
 
 
 @pytest.fixture

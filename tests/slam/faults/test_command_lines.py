@@ -41,7 +41,7 @@ HOSTILE = (
     ),
     *("MISSING/a/b", "*", "x" * 300),
 )
-QUICK_RUN = ("--set", "geometry.enabled=false", "--set", "mapping.enabled=false", "--set", "output.report=false")
+QUICK_RUN = ("--set", "visual_odometry.enabled=false", "--set", "mapping.enabled=false", "--set", "output.report=false")
 IMAGES, RUN, WEIGHTS = "in/images", "in/run", "in/weights"
 
 

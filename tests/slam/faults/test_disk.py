@@ -119,7 +119,7 @@ def verbs(kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path) -> 
     """Command lines that write below ``tmp_path / "out"``."""
     out, images = tmp_path / "out", kitti_root / "sequences/sim/image_2"
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--frames", "0:6"]
-    overrides = ("geometry.enabled=false", "mapping.enabled=false", "output.report=false")
+    overrides = ("visual_odometry.enabled=false", "mapping.enabled=false", "output.report=false")
     quick = [word for override in overrides for word in ("--set", override)]
     (tmp_path / "two").mkdir()
     for name in ("000000.png", "000001.png"):

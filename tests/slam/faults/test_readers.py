@@ -144,7 +144,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory, kitti_root: Path, tiny_wei
     write_pose_noise(place / "weights", PoseNoise(**known, pose_sha256=sha256, measured_on=["simulated/1"], pairs=9))
     _write_old_checkpoint(place / "old.pth.tar")
     DiskCache(place / "cache").write("abcdef", (np.arange(12.0).reshape(3, 4), np.zeros(2, np.uint8)))
-    overrides = ["output.keep=keyframes", "output.report=false", "geometry.enabled=false"]
+    overrides = ["output.keep=keyframes", "output.report=false", "visual_odometry.enabled=false"]
     run_slam(kitti_root, "sim", weights=tiny_weights, output=place / "run", frames="0:8", overrides=overrides)
     return place
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from erfsfm.pose_noise import PoseNoise
-from slam.config.sections import FrontendConfig, GeometryConfig
+from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
 from slam.frames import Ends, RelativePose, SnippetPoses
 from slam.frontend.drive import Drive
 from slam.frontend.factors import chain_odometry, make_factors, with_lidar
@@ -65,7 +65,7 @@ def scale(lengths: Mapping[Ends, float] | None = None) -> Scale:
 def factors(
     measured: Drive, scale: Scale, lidar: tuple[RelativePose, ...] = (), use: str = "calibrated", noise=NOISE
 ) -> list[RelativePose]:
-    found = make_factors(measured, scale, noise, FrontendConfig(use=use), GeometryConfig())
+    found = make_factors(measured, scale, noise, PoseNetworkConfig(use=use), VisualOdometryConfig())
     return with_lidar(found, lidar)
 
 

@@ -39,7 +39,7 @@ def run(sequence: SimulatedSequence, *overrides: str) -> Estimate:
         return np.where(depth > 0, depth, 200.0)
 
     oracle = OraclePredictor(sequence.reference, depth_of, NOISE, FACTOR)
-    settings = load_config(None, ["geometry.enabled=false", "mapping.enabled=false", *overrides])
+    settings = load_config(None, ["visual_odometry.enabled=false", "mapping.enabled=false", *overrides])
     return SlamPipeline(sequence, oracle, settings).run()
 
 

@@ -89,7 +89,7 @@ def test_each_filter_counts_what_it_took():
     image[10:30, 30:40] = 250  # bright: sky above the horizon at row 24.5
     image[10:15, 40:50] = (100, 120, 140)
     image[12:18, 60:70] = 250  # a window: in one piece with nothing at the upper border, whose last row is 10
-    config = MappingConfig(border=0.1, bonnet=0.2, max_relative_sigma=0.2)
+    config = MappingConfig(border=0.1, hood_crop=0.2, max_relative_sigma=0.2)
     filters = DepthFilters(config, camera)
     kept = filters.kept(KeyframeDepth(0, depth, sigma, image, np.eye(4)), None)
     shares = filters.shares()
@@ -112,7 +112,7 @@ def test_a_camera_that_looks_down_sees_no_sky():
 def test_how_far_depth_is_fused_depends_on_its_sigma():
     camera = Intrinsics(100, 50, 80.0, 80.0, 49.5, 24.5)
     depth = np.repeat(np.linspace(15, 40, 100, dtype=np.float32)[None], 50, axis=0)
-    config = MappingConfig(depth_max_m=20, sure_reach=1.5, sure_sigma_m=1.2, border=0, max_depth_step=10)
+    config = MappingConfig(depth_max_m=20, certain_range_factor=1.5, certain_sigma_m=1.2, border=0, max_depth_step=10)
     image = np.full((50, 100, 3), 90, np.uint8)
 
     def farthest(relative_sigma: np.ndarray | None) -> float:

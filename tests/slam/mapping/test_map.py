@@ -120,7 +120,7 @@ def test_depth_inconsistent_between_views_is_left_out():
         return depth
 
     assert distance_to_street(street_map(ghost, min_weight=1).mesh().vertices_world).max() < 0.2
-    blind = street_map(ghost, min_weight=1, min_component_triangles=0, consistency=10.0, depth_max_m=22)
+    blind = street_map(ghost, min_weight=1, min_component_triangles=0, max_depth_difference=10.0, depth_max_m=22)
     assert distance_to_street(blind.mesh().vertices_world).max() > 1.0
 
 
@@ -137,7 +137,7 @@ def test_flying_pixels_and_far_depth_are_left_out():
             truncation_voxels=4.5,
             min_weight=1,
             min_component_triangles=0,
-            consistency=10.0,
+            max_depth_difference=10.0,
         )
         tsdf_map = TsdfMap(config, CAMERA)
         for x in (0.0, 0.31):

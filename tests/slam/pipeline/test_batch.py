@@ -36,7 +36,7 @@ CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 HEIGHT_M = 1.5
 FACTOR = 0.2  # unscaled lengths per metre
 NO_NOISE = OracleNoise()
-NO_IMAGES = ("geometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false")
+NO_IMAGES = ("visual_odometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false")
 
 
 class LevelRoad:
@@ -257,7 +257,7 @@ def test_a_standing_camera_stays_at_the_origin(mode: str) -> None:
 def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
     still = LevelRoad(np.tile(np.eye(4), (40, 1, 1)), speckled())
     noise = OracleNoise(np.deg2rad(0.3))
-    options = ("geometry.enabled=true", "geometry.corner_spacing_px=3", "geometry.min_inliers=20")
+    options = ("visual_odometry.enabled=true", "visual_odometry.corner_spacing_px=3", "visual_odometry.min_inliers=20")
     result = run(still, *options, noise=noise)
     assert {factor.source for factor in result.drive.steps.relative_poses} == {STILL_SOURCE}
     rotation = [se3.rotation_angle(t.T_world_camera[:, :3, :3]).max() for t in (result.network, result.optimised)]
@@ -266,7 +266,7 @@ def test_zero_optical_flow_suppresses_the_noise_of_the_pose_network() -> None:
 
 
 def test_images_without_corners_leave_only_network_factors() -> None:
-    result = run(LevelRoad(turning(20)), "geometry.enabled=true")
+    result = run(LevelRoad(turning(20)), "visual_odometry.enabled=true")
     assert len(result.drive.steps) == 0
     pairs = [(first, second) for first, second, _ in result.drive.failures]
     assert pairs == [(k, k + 1) for k in range(19)]
@@ -292,7 +292,12 @@ def drive_street(
         OracleNoise(np.deg2rad(0.2), 0.05, 0.01, 0.03, seed=4),
         FACTOR,
     )
-    overrides = ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", f"frontend.use={use}", f"scale.mode={mode}"]
+    overrides = [
+        "visual_odometry.corner_spacing_px=4",
+        "visual_odometry.min_inliers=20",
+        f"pose_network.use={use}",
+        f"scale.mode={mode}",
+    ]
     settings = load_config(None, overrides)
     return SlamPipeline(street, oracle, settings, progress, noise=noise).run()
 
@@ -339,7 +344,7 @@ def test_examples_are_spread_over_a_drive_that_grows(street: Excerpt) -> None:
             growing.stamps = street.stamps[: k + 1]
             yield street.frame(k)
 
-    settings = load_config(None, ["geometry.enabled=false", "mapping.enabled=false", "loops.enabled=false"])
+    settings = load_config(None, ["visual_odometry.enabled=false", "mapping.enabled=false", "loops.enabled=false"])
     seen = SlamPipeline(growing, oracle, settings).estimate(frames=arriving()).drive
     assert [index for index, _, _ in seen.examples] == [0, 4, 8, 12, 16, 20, 24]
 
@@ -376,7 +381,7 @@ def test_calibrated_network_factors_are_used_at_every_step(street: Excerpt) -> N
 
 def test_mapping_thins_frames_and_can_be_left_out(street: Excerpt) -> None:
     oracle = OraclePredictor(street.reference, lambda k: np.full((64, 208), 10.0))
-    settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "geometry.enabled=false"])
+    settings = load_config(None, ["mapping.frame_stride=5", "mapping.width_px=104", "visual_odometry.enabled=false"])
     seen = SlamPipeline(street, oracle, settings).run().drive
     assert [keyframe.index for keyframe in seen.keyframes] == [0, 5, 10, 15, 20]
     assert seen.keyframes[0].image.shape == (32, 104, 3) and seen.keyframes[0].depth_unscaled.shape == (32, 104)

@@ -181,14 +181,17 @@ def test_graph_mapping_and_output_may_be_changed(go_on: Callable[..., RunFolder]
     "options, message",
     [
         ({"config": "default"}, "leave out --config"),
-        ({"overrides": ["geometry.max_corners=300"]}, "geometry cannot be changed for .*: leave out --set geometry"),
-        ({"overrides": ["window.use=never"]}, "window cannot be changed for .*: leave out --set window"),
+        (
+            {"overrides": ["visual_odometry.max_corners=300"]},
+            "visual_odometry cannot be changed for .*: leave out --set visual_odometry",
+        ),
+        ({"overrides": ["keyframes.use=never"]}, "keyframes cannot be changed for .*: leave out --set keyframes"),
         (
             {"overrides": ["mapping.width_px=96"]},
             "mapping.width_px and mapping.frame_stride are those of the keyframes",
         ),
     ],
-    ids=["configuration", "geometry", "window", "keyframes"],
+    ids=["configuration", "visual_odometry", "keyframes", "map"],
 )
 def test_configuration_of_the_pass_over_the_frames_is_fixed(
     go_on: Callable[..., RunFolder], options: dict[str, Any], message: str
@@ -207,7 +210,10 @@ def test_the_noise_of_the_poses_is_named_and_another_one_is_said(
     kitti_root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     weights = Path(shutil.copytree(find_weights(WEIGHTS), tmp_path / "weights"))
-    options: dict[str, Any] = {"weights": weights, "overrides": ["geometry.enabled=false", "mapping.enabled=false"]}
+    options: dict[str, Any] = {
+        "weights": weights,
+        "overrides": ["visual_odometry.enabled=false", "mapping.enabled=false"],
+    }
     before = run(kitti_root, tmp_path / "before", "0:8", **options)
     sha256 = before.metrics().tree()["provenance"]["noise_sha256"]
     assert sha256 == file_sha256(weights / "noise.yaml")
@@ -315,7 +321,7 @@ def test_live_slam_resumes_before_its_first_frame_with_the_same_camera(kitti_roo
         first.resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="another camera, camera height or weights"):
         live(kitti_root, weights_sha256="9f").resume(tmp_path / "drive.zip")
-    with pytest.raises(SlamError, match=r"was made with another window\.use"):
-        live(kitti_root, config=load_config(None, ["window.use=always"])).resume(tmp_path / "drive.zip")
+    with pytest.raises(SlamError, match=r"was made with another keyframes\.use"):
+        live(kitti_root, config=load_config(None, ["keyframes.use=always"])).resume(tmp_path / "drive.zip")
     with pytest.raises(SlamError, match="is missing"):
         live(kitti_root).resume(tmp_path / "none.zip")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam import Slam
-from slam.config.sections import LoopsConfig, MappingConfig, SlamConfig, WindowConfig
+from slam.config.sections import KeyframesConfig, LoopsConfig, MappingConfig, SlamConfig
 from slam.frames import DepthMap, Frame, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.visual.motion import Motion
@@ -38,18 +38,18 @@ def steps(count: int, scatter: float) -> Drive:
     ("count", "scatter", "front_end"), [(60, 0.02, "steps"), (60, 1.0, "keyframes"), (20, 0.02, "both")]
 )
 def test_a_vehicle_goes_the_same_way_for_a_while(count: int, scatter: float, front_end: FrontEnd) -> None:
-    assert choose(WindowConfig(), None, steps(count, scatter)) == front_end
+    assert choose(KeyframesConfig(), None, steps(count, scatter)) == front_end
 
 
 def test_a_known_camera_height_and_a_setting_choose() -> None:
     by_hand = steps(60, 1.0)
-    assert choose(WindowConfig(), 1.65, by_hand) == "steps"
-    assert choose(WindowConfig(use="never"), None, by_hand) == "steps"
-    assert choose(WindowConfig(use="always"), 1.65, by_hand) == "keyframes"
+    assert choose(KeyframesConfig(), 1.65, by_hand) == "steps"
+    assert choose(KeyframesConfig(use="never"), None, by_hand) == "steps"
+    assert choose(KeyframesConfig(use="always"), 1.65, by_hand) == "keyframes"
 
 
 KEYFRAMES_ALONE = SlamConfig(
-    window=WindowConfig(use="always", max_corners=200),
+    keyframes=KeyframesConfig(use="always", max_corners=200),
     loops=LoopsConfig(enabled=False),
     mapping=MappingConfig(enabled=False),
 )

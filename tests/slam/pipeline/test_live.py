@@ -27,7 +27,7 @@ from slam.simulation.street import SimulationOptions
 FACTOR = 0.2
 FRAMES = 250
 NOISE = OracleNoise(np.deg2rad(0.3), 0.05, 0.005, 0.15, seed=3)
-SETTINGS = ["geometry.enabled=false", "mapping.enabled=false", "loops.frame_stride=3"]
+SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false", "loops.frame_stride=3"]
 
 
 @functools.cache
@@ -243,7 +243,7 @@ def test_a_frame_whose_measurement_fails_is_a_gap_and_the_session_goes_on(
 ) -> None:
     """Whoever catches the error goes on: one row a frame, whether the next image is usable or not."""
     predictor = Failing(8, question)
-    config = load_config(None, [*SETTINGS, "geometry.enabled=true", "loops.enabled=false"])
+    config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true", "loops.enabled=false"])
     with Slam(predictor, drive().intrinsics, config, drive().camera_height_m, update_frames=100) as slam:
         failed = []
         for k in range(20):
@@ -280,7 +280,7 @@ def test_a_failure_at_the_last_frame_is_raised_once() -> None:
 
 def test_a_closed_session_has_no_threads_and_keeps_its_results(tmp_path: Path) -> None:
     before = set(threading.enumerate())
-    config = load_config(None, [*SETTINGS, "geometry.enabled=true"])
+    config = load_config(None, [*SETTINGS, "visual_odometry.enabled=true"])
     with started(config) as slam, started(config) as other:
         for each in (slam, other):
             feed(each, 0, 13)

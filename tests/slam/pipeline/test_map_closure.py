@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slam.config.sections import SlamConfig, WindowConfig
+from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.scale.metric_scale import Scale
@@ -28,7 +28,7 @@ assert _SPEC.loader is not None
 room = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(room)
 
-CONFIG = SlamConfig(window=WindowConfig(max_corners=400))
+CONFIG = SlamConfig(keyframes=KeyframesConfig(max_corners=400))
 
 
 def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> FloatArray:
@@ -41,7 +41,7 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
 
 
 def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
-    odometry = WindowOdometry(CONFIG.window, room.INTRINSICS)
+    odometry = WindowOdometry(CONFIG.keyframes, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
         frame = room.frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(frame)
@@ -115,7 +115,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     truth = np.concatenate([walked[:60], walked[82:]])
     seeds = [0] * 60 + [9] * 6 + [0] * 22
     tracking = KeyframeTracking(
-        WindowConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
+        KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
     )
     for k, T in enumerate(truth):
         frame = room.frame(k, T, seeds[k])
@@ -149,7 +149,7 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
 ) -> None:
     """As by a session that is resumed after every frame, and remembers no earlier map."""
     truth = there_and_back(110, roll=0.4, closer=0.3)[places]
-    config = WindowConfig(max_corners=400, use="always")
+    config = KeyframesConfig(max_corners=400, use="always")
     going_on, resumed = (KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, WindowState()) for _ in range(2))
     for k, T in enumerate(truth):
         frame, depth = room.frame(k, T, 9 if k in unseen else 0), room.depth_map(T)
@@ -199,7 +199,7 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     sequence = open_sequence(recording / "images")
     indices = range(0, 320, 4)
     truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
-    odometry = WindowOdometry(WindowConfig(), sequence.intrinsics)
+    odometry = WindowOdometry(KeyframesConfig(), sequence.intrinsics)
     for k in indices:
         odometry.follow(replace(sequence.frame(k), index=k // 4))
     maps = odometry.state().segments

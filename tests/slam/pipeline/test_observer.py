@@ -111,7 +111,7 @@ def oracle_of(sequence: Damaged, rows: Sequence[int] = range(FRAMES)) -> OracleP
 
 
 def config_with(*overrides: str) -> SlamConfig:
-    return load_config(None, ["geometry.corner_spacing_px=4", "geometry.min_inliers=20", *overrides])
+    return load_config(None, ["visual_odometry.corner_spacing_px=4", "visual_odometry.min_inliers=20", *overrides])
 
 
 def run(damage: Damage = black, bad: range = BAD, *overrides: str) -> Estimate:
@@ -211,7 +211,7 @@ def test_an_undamaged_drive_has_no_interpolated_frames() -> None:
 def observe(frames: int, state: FrontEndState | None, damage: Damage, bad: range, *overrides: str) -> FrontEndState:
     """The state after so many frames of a damaged drive, from a state on."""
     sequence = Damaged(street(), damage, bad)
-    config = config_with("mapping.enabled=false", "geometry.enabled=false", *overrides)
+    config = config_with("mapping.enabled=false", "visual_odometry.enabled=false", *overrides)
     with Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state) as observer:
         for index in range(0 if state is None else len(state.drive.roads), frames):
             observer.add(index, read_frame(sequence, index))

@@ -21,7 +21,7 @@ from slam.sequences.recording import RecordedSequence
 FRAMES = 200
 CAMERA = Intrinsics(width=104, height=32, fx=60.0, fy=60.0, cx=51.5, cy=12.0)
 PLACE = np.array([49.0110, 8.4160, 115.0])
-SETTINGS = ["geometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false", "loops.enabled=false"]
+SETTINGS = ["visual_odometry.enabled=false", "mapping.enabled=false", "gaps.enabled=false", "loops.enabled=false"]
 # the first camera looks east: its x axis points south, its y axis down
 T_ENU_WORLD = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([5.0, -3.0, 1.0]))
 

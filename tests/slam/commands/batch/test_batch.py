@@ -21,7 +21,7 @@ from slam.commands.batch.manifest import Drive, drives_of
 from slam.commands.batch.summary import check_output, write_summary
 from slam.runtime.errors import RunError, SequenceError, SlamError
 
-QUICK = ["--set", "mapping.enabled=false", "--set", "geometry.enabled=false", "--set", "output.report=false"]
+QUICK = ["--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=false", "--set", "output.report=false"]
 
 UNITS_WITHOUT_METRES = ("camera heights", "the networks' own unit")
 

@@ -98,7 +98,7 @@ def test_a_killed_run_goes_on_and_has_the_bytes_of_a_whole_one(
 def test_states_are_kept_at_distances_that_grow(
     kitti_root: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    overrides = [*OVERRIDES, "window.use=always", "mapping.enabled=false"]
+    overrides = [*OVERRIDES, "keyframes.use=always", "mapping.enabled=false"]
     options: dict[str, Any] = {"weights": tiny_weights, "overrides": overrides, "frames": "0:13"}
     uninterrupted = run_slam(kitti_root, "sim", output=tmp_path / "whole", **options).path
     output, add = tmp_path / "run", Observer.add
@@ -190,7 +190,7 @@ def test_what_does_not_fit_is_refused(
     with pytest.raises(RunError, match="run with other weights"):
         run_slam(weights="sim", continues=output)
     with pytest.raises(ConfigError, match="geometry cannot be changed"):
-        run_slam(overrides=["geometry.enabled=false"], continues=output)
+        run_slam(overrides=["visual_odometry.enabled=false"], continues=output)
     (output / DRIVE).write_bytes(b"PK")
     with pytest.raises(RunError, match=r"drive\.zip is damaged"):
         run_slam(continues=output)

@@ -41,7 +41,12 @@ def run(kitti_root: Path, tiny_weights: Path, tmp_path_factory: pytest.TempPathF
 @pytest.fixture
 def quick(kitti_root: Path, tiny_weights: Path, tmp_path: Path) -> dict[str, Any]:
     """Arguments of a run of a second: networks and graph alone."""
-    overrides = ["mapping.enabled=false", "geometry.enabled=false", f"output.root={tmp_path / 'results'}", NO_REPORT]
+    overrides = [
+        "mapping.enabled=false",
+        "visual_odometry.enabled=false",
+        f"output.root={tmp_path / 'results'}",
+        NO_REPORT,
+    ]
     return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:6"}
 
 
@@ -247,4 +252,4 @@ def test_a_run_from_the_cache_runs_no_network_and_leaves_the_same_bytes(
     assert names == sorted(path.name for path in warm.path.iterdir())
     for name in set(names) - {"metrics.json", "run.log", "drive.zip"}:  # these hold times
         assert len({(run.path / name).read_bytes() for run in (plain, cold, warm)}) == 1, name
-    assert run("other", "geometry.max_corners=150").metrics().tree()["status"] == "ok"
+    assert run("other", "visual_odometry.max_corners=150").metrics().tree()["status"] == "ok"

@@ -32,7 +32,7 @@ CopyRoot = Callable[[], Path]
 @pytest.fixture
 def quick(kitti_root: Path, tiny_weights: Path) -> dict[str, Any]:
     """Arguments of a run of a second: networks and graph alone."""
-    overrides = ["geometry.enabled=false", "mapping.enabled=false", "output.report=false"]
+    overrides = ["visual_odometry.enabled=false", "mapping.enabled=false", "output.report=false"]
     return {"dataset": kitti_root, "sequence": "sim", "weights": tiny_weights, "overrides": overrides, "frames": "0:8"}
 
 
@@ -145,7 +145,7 @@ def test_a_run_that_breaks_off_leaves_an_earlier_one_and_stays_beside_it(
 
 @pytest.mark.slow
 def test_a_disk_that_is_full_at_the_map(kitti_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    overrides = ["geometry.enabled=false", "output.report=false", "output.keep=nothing", "loops.enabled=false"]
+    overrides = ["visual_odometry.enabled=false", "output.report=false", "output.keep=nothing", "loops.enabled=false"]
     overrides += ["mapping.voxel_size_m=0.1", "mapping.submap_m=3", "depth.refine=none"]  # a map larger than its parts
     arguments = ["run", "--dataset", kitti_root, "--weights", "sim", "--frames", "0:7"]
     arguments += [word for override in overrides for word in ("--set", override)]
@@ -213,7 +213,7 @@ def kill(*_):
 
 SlamPipeline.fuse = kill
 root, weights, output = sys.argv[1:]
-run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overrides=["geometry.enabled=false"])
+run_slam(root, "sim", weights=weights, output=Path(output), frames="0:8", overrides=["visual_odometry.enabled=false"])
 """
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics, RelativePose
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.visual import odometry
@@ -20,7 +20,7 @@ from slam.frontend.visual.tracking import CornerTracker
 from slam.geometry import se3
 
 CAMERA = Intrinsics(620, 188, 360.0, 360.0, 303.0, 92.0)
-CONFIG = GeometryConfig()
+CONFIG = VisualOdometryConfig()
 UNIT = 0.3  # unscaled lengths per metre
 NO_NOISE = StepNoise(np.zeros(3), np.zeros(3))
 RAYS = CAMERA.rays(CAMERA.pixel_grid())
@@ -145,7 +145,7 @@ def test_failures_carry_a_reason(texture):
     failure = measure(rotation, texture, lambda depth: np.full_like(depth, np.nan))
     assert isinstance(failure, MeasurementFailure)
     assert "trusted depth" in failure.reason
-    failure = measure(rotation, texture, config=GeometryConfig(min_inliers=5000, max_corners=10000))
+    failure = measure(rotation, texture, config=VisualOdometryConfig(min_inliers=5000, max_corners=10000))
     assert isinstance(failure, MeasurementFailure)
 
 

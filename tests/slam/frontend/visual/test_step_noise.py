@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas, neighbour_residual, rotation_jitter
 from slam.geometry.se3 import from_rotation_vector
 
-CONFIG = GeometryConfig()
+CONFIG = VisualOdometryConfig()
 
 
 def own(count: int, sigma_rad: float = 0.0) -> dict[int, StepNoise]:

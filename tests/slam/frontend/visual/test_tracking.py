@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual.epipolar import UnitRelativePose
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.tracking import CornerTracker
 
-CONFIG = GeometryConfig(max_corners=300)
+CONFIG = VisualOdometryConfig(max_corners=300)
 SHIFT_PX = 4
 
 

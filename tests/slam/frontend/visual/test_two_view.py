@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam.config.sections import GeometryConfig
+from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
 from slam.frontend.visual import two_view
 from slam.frontend.visual.epipolar import UnitRelativePose, unit_pose_by_essential
@@ -19,7 +19,7 @@ from slam.frontend.visual.two_view import DEPTH_RELATIVE_SIGMA, INLIER_PX, Match
 from slam.geometry import se3
 from slam.simulation.street import SimulatedStreet, SimulationOptions
 
-CONFIG = GeometryConfig()
+CONFIG = VisualOdometryConfig()
 FOCAL_PX = 240.0
 CAR = 40
 NO_HISTORY = MotionHistory()

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.config.sections import WindowConfig
+from slam.config.sections import KeyframesConfig
 from slam.frames import TrackingEvent
 from slam.frontend.window.local_map import LocalMap, WindowKeyframe
 from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
@@ -18,7 +18,7 @@ assert _SPEC.loader is not None
 room = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(room)
 
-CONFIG = WindowConfig(max_corners=200)
+CONFIG = KeyframesConfig(max_corners=200)
 
 
 def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:

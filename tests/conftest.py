@@ -46,6 +46,24 @@ def _seeded() -> None:
         sys.modules["torch"].manual_seed(0)
 
 
+@pytest.fixture
+def command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Exit code, stdout and stderr of a program with these words, in this process: ``command_line(main, *words)``."""
+
+    def call(main: Callable[[], None], *words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", list(map(str, words)))
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err
+        return int(stopped.value.code or 0), out, err
+
+    return call
+
+
 @pytest.fixture(scope="session")
 def data_root() -> Path:
     """The folder of real recordings: $ERFSFM_DATA, or ``shared/data`` beside the repository."""

@@ -13,6 +13,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from erfsfm.config import ExperimentConfig
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.recordings import Recording
+from erfsfm.data.snippets import split_recordings
 from erfsfm.geometry.camera import Camera
 
 RNG = np.random.default_rng(0)
@@ -148,3 +152,24 @@ def small() -> dict[str, dict[str, object]]:
         "data": {"workers": 0, "validation": [], "cache_mb": 50},
         "training": {"steps": 4, "batch": 2, "checkpoint_every": 2, "log_every": 1, "validate_every": 2},
     }
+
+
+@pytest.fixture(scope="session")
+def measure() -> Callable[[ExperimentConfig, Callable[[Recording, int], float]], None]:
+    """Keeps what a teacher by many views measures: a drive straight on, and one least inverse depth an image."""
+
+    def keep(config: ExperimentConfig, least_of: Callable[[Recording, int], float]) -> None:
+        assert config.teacher.cache is not None
+        size = (config.network.height, config.network.width)
+        teacher = ManyViewTeacher(config.teacher.cache, size, config.teacher.stride)
+        for recording in split_recordings(config.data)[0]:
+            drive = teacher.drive(recording)
+            T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
+            T_world_camera[:, 2, 3] = 0.3 * np.arange(len(recording))
+            drive.keep_poses(T_world_camera)
+            for target in drive.targets(config.network.sources):
+                least = np.full(size, least_of(recording, target), np.float16)
+                drive.label_file(target).parent.mkdir(exist_ok=True)
+                np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
+
+    return keep

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,18 +23,13 @@ SMALL = ["--set", "network.height=32", "--set", "network.width=64", "--set", "tr
 
 
 @pytest.fixture
-def refusal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Refusal:
+def refusal(command_line: Callable[..., tuple[int, str, str]]) -> Refusal:
     """The one line of error of ``erfsfm ARGUMENTS``; nothing on stdout, exit code 1."""
 
     def call(*arguments: object) -> str:
-        monkeypatch.setattr(sys, "argv", ["erfsfm", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        out, err = capsys.readouterr()
+        code, out, err = command_line(main, "erfsfm", *arguments)
         lines = [line for line in err.splitlines() if line.startswith("erfsfm: ")]
-        assert (stopped.value.code, out, len(lines)) == (1, "", 1), err
-        assert "Traceback" not in err
+        assert (code, out, len(lines)) == (1, "", 1), err
         assert err.rstrip().endswith(lines[0]), "the error is the last line"
         return lines[0]
 
@@ -86,10 +80,7 @@ def test_truncated_image(refusal: Refusal, tmp_path: Path, write_root: WriteRoot
 
 
 def test_brackets_in_a_name(
-    refusal: Refusal,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    write_root: WriteRoot,
+    refusal: Refusal, command_line: Callable[..., tuple[int, str, str]], tmp_path: Path, write_root: WriteRoot
 ) -> None:
     """A folder is trained on and predicted from, and its leak is detected by name."""
     root = write_root(tmp_path / "r[o]ot", frames=6)
@@ -101,24 +92,10 @@ def test_brackets_in_a_name(
         [*TRAIN, *small, "--set", "network.height=64", "--set", "network.width=96", "--dataset", root, "--output", run],
         ["predict", images, "--weights", run, "--output", tmp_path / "d[e]pth"],
     ):
-        monkeypatch.setattr(sys, "argv", ["erfsfm", *map(str, command)])
-        with pytest.raises(SystemExit, match="0"):
-            main()
+        assert command_line(main, "erfsfm", *command)[0] == 0
     assert len(list((tmp_path / "d[e]pth").iterdir())) == 12
     error = refusal("evaluate", "pose", "--dataset", root, "--sequence", "s[0]", "--weights", run)
     assert "leak: these weights were trained on kitti_odometry/s[0][0:6]" in error
-
-
-@pytest.fixture
-def trip(tmp_path: Path) -> Path:
-    """A folder with a video of 96 x 64 and its camera."""
-    (tmp_path / "trip").mkdir()
-    writer = cv2.VideoWriter(str(tmp_path / "trip/drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
-    for index in range(8):
-        writer.write(np.full((64, 96, 3), 20 * index, np.uint8))
-    writer.release()
-    (tmp_path / "trip/camera.yaml").write_text("width: 96\nheight: 64\nfx: 60\nfy: 60\ncx: 48\ncy: 32\nfps: 10\n")
-    return tmp_path / "trip"
 
 
 def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
@@ -218,9 +195,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("files", FOREIGN.values(), ids=FOREIGN.keys())
-def test_an_output_with_other_peoples_files(
-    refusal: Refusal, tmp_path: Path, write_root: WriteRoot, files: dict[str, str]
-) -> None:
+def test_an_output_with_other_peoples_files(refusal: Refusal, tmp_path: Path, files: dict[str, str]) -> None:
     output = tmp_path / "mine"
     for name, text in files.items():
         (output / name).parent.mkdir(parents=True, exist_ok=True)

@@ -236,3 +236,15 @@ def test_what_is_no_image_is_refused(predictor: DepthPosePredictor, thing: Any, 
     for use in (predictor.depth, predictor.prepare, lambda image: save_image(tmp_path / "a.png", image)):
         with pytest.raises(ValueError, match=r"image must be \(H, W, 3\) uint8 RGB; got"):
             use(thing)
+
+
+@pytest.mark.parametrize("count", [1, 4, 6])
+def test_another_number_of_images_is_refused(predictor: DepthPosePredictor, count: int) -> None:
+    with pytest.raises(ValueError, match=f"must have 5 images; got {count}"):
+        predictor.poses([image() for _ in range(count)])
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_without_a_gpu_cuda_is_refused() -> None:
+    with pytest.raises(ConfigError, match="use cpu"):
+        choose_device("cuda")

@@ -11,9 +11,7 @@ import pytest
 import yaml
 
 from erfsfm.checkpoint import load_model
-from erfsfm.config import ExperimentConfig, load_experiment
-from erfsfm.data.many_view_teacher import ManyViewTeacher
-from erfsfm.data.snippets import split_recordings
+from erfsfm.config import load_experiment
 from erfsfm.model_record import SHIPPED
 from erfsfm.training.run import train
 
@@ -43,28 +41,13 @@ def data(shared: Path, write_root: Callable[..., Path]) -> list[Path]:
     return roots
 
 
-def measured(config: ExperimentConfig, folder: Path) -> None:
-    """Poses and labels of many views, which the SLAM system would measure for minutes."""
-    size = (config.network.height, config.network.width)
-    teacher = ManyViewTeacher(folder, size, config.teacher.stride)
-    for recording in split_recordings(config.data)[0]:
-        drive = teacher.drive(recording)
-        T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
-        T_world_camera[:, 2, 3] = 0.06 * np.arange(len(recording))
-        drive.keep_poses(T_world_camera)
-        for target in drive.targets(config.network.sources):
-            drive.label_file(target).parent.mkdir(exist_ok=True)
-            least = np.full(size, 0.25, np.float16)
-            np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
-
-
 @pytest.mark.parametrize("weights", sorted(path.name for path in SHIPPED.iterdir()))
 def test_weights_have_the_name_of_the_configuration_that_trains_them(weights: str) -> None:
     assert load_model(weights).record.network == load_experiment(weights).network
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_starts(name: str, data: list[Path], tmp_path: Path) -> None:
+def test_it_starts(name: str, data: list[Path], measure: Callable[..., None], tmp_path: Path) -> None:
     written = load_experiment(name)
     small = ["training.batch=2", "training.steps=1", "data.workers=0", "data.validation=[simulated/500]"]
     small += ["data.validation_snippets=1", "data.cache_mb=50", f"teacher.cache={tmp_path / 'measured'}"]
@@ -75,7 +58,7 @@ def test_it_starts(name: str, data: list[Path], tmp_path: Path) -> None:
         small += ["network.depth_width=1"]
     config = load_experiment(name, small).with_roots(data)
     if config.teacher.views == "many":
-        measured(config, tmp_path / "measured")
+        measure(config, lambda *_: 0.25)
     record = load_model(train(config, tmp_path / "run", device="cpu")).record
     assert record.step == 1
     assert record.network == config.network

@@ -14,6 +14,7 @@ TRAJECTORY_ALONE = ("mapping.enabled=false", "output.report=false")
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_forty_frames_of_kitti(data_root: Path, tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]) -> None:
     run = run_slam(data_root / "kitti_odometry", "00", frames="0:40", output=tmp_path / "run", device="cpu")
     metrics = check_run(run.path)

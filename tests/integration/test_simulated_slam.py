@@ -75,6 +75,7 @@ def round_trip(street: Rendered) -> Estimate:
     return drive(street, 0)
 
 
+@pytest.mark.slow
 def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Estimate) -> None:
     assert len(round_trip.optimised) == 250
     sources = [motion.relative_pose.source for motion in round_trip.drive.steps]
@@ -84,7 +85,8 @@ def test_image_geometry_and_graph_reduce_the_error_of_the_network(round_trip: Es
     assert ate(round_trip.optimised, round_trip) < 2 * 0.109
 
 
-def test_the_camera_height_gives_metres(street: Rendered, round_trip: Estimate) -> None:
+@pytest.mark.slow
+def test_the_camera_height_gives_metres(round_trip: Estimate) -> None:
     estimate = round_trip.scale.estimate
     assert round_trip.scale.mode == "camera-height" and not isinstance(estimate, MeasurementFailure)
     assert estimate.value * FACTOR == pytest.approx(1.0, rel=0.03)
@@ -92,6 +94,7 @@ def test_the_camera_height_gives_metres(street: Rendered, round_trip: Estimate) 
     assert round_trip.optimised.length_m == pytest.approx(round_trip.reference.length_m, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_map_lies_on_the_street(street: Rendered, round_trip: Estimate) -> None:
     assert round_trip.map is not None and round_trip.reference is not None
     points = round_trip.map.cloud().points_world[::7]
@@ -160,6 +163,7 @@ def test_the_system_is_better_than_its_networks(learned: Path, check_run: Callab
     assert (metrics["map"]["triangles"] or 0) > 1000 and metrics["map"]["accuracy_median_m"] < 2 * 0.153
 
 
+@pytest.mark.slow
 def test_the_map_of_a_simulated_root_on_disk_has_an_error(
     tmp_path: Path, check_run: Callable[[Path], dict[str, Any]]
 ) -> None:

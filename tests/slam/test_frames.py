@@ -56,7 +56,7 @@ def test_threads_that_derive_at_once_get_the_same_object() -> None:
     frame, barrier, found = Frame(0, 0.0, image()), threading.Barrier(8), []
 
     def make() -> object:
-        barrier.wait(timeout=10)  # all are making it at once
+        barrier.wait()  # all are making it at once
         return object()
 
     threads = [threading.Thread(target=lambda: found.append(frame.derived("shared", make))) for _ in range(8)]

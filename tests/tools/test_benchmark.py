@@ -7,10 +7,9 @@ import importlib
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -24,50 +23,11 @@ from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics, Provenance, ScaleMetrics, SequenceMetrics
 from slam.runtime.storage.record import Missing
 
-TOOLS = Path(__file__).parents[2] / "tools"
-
-
-@pytest.fixture(scope="module")
-def tools() -> Iterator[Callable[[str], ModuleType]]:
-    """Modules as ``python tools/benchmark.py`` finds them."""
-    sys.path.insert(0, str(TOOLS))
-    yield importlib.import_module
-    sys.path.remove(str(TOOLS))
-
-
-@pytest.fixture(scope="module")
-def benchmark(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmark")
-
-
-@pytest.fixture(scope="module")
-def plan(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.plan")
-
-
-@pytest.fixture(scope="module")
-def work(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.work")
-
-
-@pytest.fixture(scope="module")
-def page(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.page")
-
-
-@pytest.fixture(scope="module")
-def metric_definitions(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.metric_definitions")
-
-
-@pytest.fixture(scope="module")
-def derived_metrics(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.derived_metrics")
-
-
-@pytest.fixture(scope="module")
-def summary(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.summary")
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
+benchmark = importlib.import_module("benchmark")
+derived_metrics, page, plan, work = (
+    importlib.import_module(f"benchmarking.{name}") for name in ("derived_metrics", "page", "plan", "work")
+)
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
@@ -94,12 +54,12 @@ def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics
 
 
 @pytest.fixture
-def job(plan: ModuleType, tmp_path: Path) -> Any:
+def job(tmp_path: Path) -> Any:
     drive = plan.BenchmarkSequence("loop 610", tmp_path / "world")
     return plan.Job(tmp_path / "runs", drive, "sim", plan.EVERYTHING, 0)
 
 
-def results_of(plan: ModuleType, work: ModuleType, job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
+def results_of(job: Any, ates: dict[str, Sequence[float]]) -> list[Any]:
     """Results of configurations, one per seed."""
     return [
         work.JobResult(replace(job, configuration=plan.Configuration(name), seed=seed), metrics(ate), "abc")
@@ -114,9 +74,7 @@ def cells(table: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache(
-    plan: ModuleType, tmp_path: Path
-) -> None:
+def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache(tmp_path: Path) -> None:
     drives = [plan.BenchmarkSequence(name, tmp_path) for name in ("a", "b")]
     jobs = plan.plan(tmp_path, drives, plan.ABLATION, ["sim", "default"], [0, 1, 2], ["loops.min_inliers=25"])
     assert len(jobs) == len({job.place for job in jobs}) == 2 * 2 * 3 * len(plan.ABLATION)
@@ -125,7 +83,7 @@ def test_plan_has_every_combination_and_begins_with_the_one_that_fills_the_cache
     assert all(job.arguments[-2:] == ["--set", "loops.min_inliers=25"] for job in jobs)
 
 
-def test_hazards_are_all_at_once_and_name_their_clean_drive(plan: ModuleType, tmp_path: Path) -> None:
+def test_hazards_are_all_at_once_and_name_their_clean_drive(tmp_path: Path) -> None:
     clean, hard = plan.worlds(tmp_path, ["loop"], [620], 800, ["clean", "hazards"])
     assert clean.root.name == "loop-620-800-v1"
     assert hard.root.name == "loop-620-800-hazards-v1"
@@ -133,9 +91,7 @@ def test_hazards_are_all_at_once_and_name_their_clean_drive(plan: ModuleType, tm
     assert hard.simulate == (*clean.simulate, "--hazards", "moving-cars,exposure,blur,stop,rain")
 
 
-def test_full_size_has_worlds_and_originals_of_kitti(
-    benchmark: ModuleType, plan: ModuleType, page: ModuleType, work: ModuleType, tmp_path: Path
-) -> None:
+def test_full_size_has_worlds_and_originals_of_kitti(tmp_path: Path) -> None:
     for root, name in zip(plan.ORIGINALS, ("00", "03"), strict=True):
         images = tmp_path / "data" / root / "sequences" / name / "image_2"
         images.mkdir(parents=True)
@@ -152,10 +108,8 @@ def test_full_size_has_worlds_and_originals_of_kitti(
     assert text.startswith("## Full-size") and "| KITTI 03 | default | 100 |" in text and "![" not in text
 
 
-def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
-    page: ModuleType, plan: ModuleType, work: ModuleType, job: Any
-) -> None:
-    results = results_of(plan, work, job, {"default": [1.0, 3.0]})
+def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(job: Any) -> None:
+    results = results_of(job, {"default": [1.0, 3.0]})
     results.append(work.JobResult(replace(job, seed=2), Missing("out of memory"), "abc", "out of memory"))
     text = page.accuracy_tables(results)
     *_, head, row = cells(text)
@@ -164,7 +118,7 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_errors_relative_to_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
+def test_errors_relative_to_path_and_network(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     run = metrics(ate=0.9)
     slower = metrics(ate=3.6).trajectories.network
@@ -180,9 +134,7 @@ def test_errors_relative_to_path_and_network(derived_metrics: ModuleType, tmp_pa
 @pytest.mark.parametrize(
     ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
 )
-def test_true_and_false_loops(
-    derived_metrics: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
-) -> None:
+def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float, false: int) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
     T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
@@ -197,14 +149,14 @@ def test_true_and_false_loops(
     assert isinstance(derived_metrics.derive_metrics(tmp_path, in_heights).true_loops, Missing)
 
 
-def test_a_leak_is_reported(page: ModuleType, work: ModuleType, job: Any) -> None:
+def test_a_leak_is_reported(job: Any) -> None:
     assert "LEAK" not in page.accuracy_tables([work.JobResult(job, metrics(), "abc")])
     leaky = metrics().changed(provenance=Provenance(leak=True))
     assert "LEAK: weights sim saw frames of loop 610" in page.accuracy_tables([work.JobResult(job, leaky, "abc")])
 
 
-def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
-    results = results_of(plan, work, job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
+def test_ablation_compares_with_the_same_seed(job: Any) -> None:
+    results = results_of(job, {plan.EVERYTHING.name: [1.0, 2.0], "no loops": [4.0, 2.0]})
     text = page.ablation_tables(results)
     table = cells(text)
     assert [row[:2] for row in table[1:3]] == [["everything on", "1.00 (1.00)"], ["no loops", "2.00 (4.00)"]]
@@ -212,7 +164,7 @@ def test_ablation_compares_with_the_same_seed(page: ModuleType, plan: ModuleType
     assert "– map triangles, loop 610: no map." in text
 
 
-def test_speed_ratios_and_growth(page: ModuleType, plan: ModuleType, work: ModuleType, job: Any) -> None:
+def test_speed_ratios_and_growth(job: Any) -> None:
     asked = replace(job, configuration=plan.SPEED[0])
     grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
     results = [
@@ -227,9 +179,7 @@ def test_speed_ratios_and_growth(page: ModuleType, plan: ModuleType, work: Modul
     assert table[-1][table[-2].index("loops closed")] == "3"
 
 
-def test_a_missing_cache_is_refused(
-    plan: ModuleType, work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_cache_is_refused(job: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "fingerprint", lambda weights: "same")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("ran"))
     monkeypatch.setattr(work, "revision", lambda: "abc")
@@ -238,9 +188,7 @@ def test_a_missing_cache_is_refused(
     assert work.job_result(from_cache).reason.startswith("there is no cache in ")
 
 
-def test_only_successful_runs_of_the_same_sources_are_kept(
-    work: ModuleType, job: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_successful_runs_of_the_same_sources_are_kept(job: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     codes = iter([-9, 0, 0, 0])
     runs = []
 
@@ -267,9 +215,7 @@ def test_only_successful_runs_of_the_same_sources_are_kept(
     assert len(runs) == 4
 
 
-def test_the_fingerprint_depends_on_sources_and_weights(
-    work: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fingerprint_depends_on_sources_and_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "ROOT", tmp_path)
     for name in (*work.SOURCES, "weights"):
         (tmp_path / name).mkdir()
@@ -284,7 +230,7 @@ def test_the_fingerprint_depends_on_sources_and_weights(
     assert len(seen) == 3
 
 
-def test_dask_runs_every_job_once(work: ModuleType, tmp_path: Path) -> None:
+def test_dask_runs_every_job_once(tmp_path: Path) -> None:
     pytest.importorskip("dask.distributed")
     places = [tmp_path / str(n) for n in range(4)]
     with work.workers(2, None) as spread:
@@ -293,7 +239,7 @@ def test_dask_runs_every_job_once(work: ModuleType, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) -> None:
+def test_one_real_run_and_one_that_fails(tmp_path: Path) -> None:
     words = ["accuracy", "--routes", "straight", "--worlds", "610", "--frames", "8", "--seeds", "0"]
     words += ["--weights", "sim", "nonesuch", "--set", "mapping.enabled=false", "--output", str(tmp_path / "out")]
     report = tmp_path / "page.md"
@@ -315,9 +261,7 @@ def test_one_real_run_and_one_that_fails(benchmark: ModuleType, tmp_path: Path) 
     assert record.stat().st_mtime_ns == before
 
 
-def test_maps_need_depth_maps_beside_the_images_and_name_every_part(
-    page: ModuleType, plan: ModuleType, work: ModuleType, tmp_path: Path
-) -> None:
+def test_maps_need_depth_maps_beside_the_images_and_name_every_part(tmp_path: Path) -> None:
     (loop,) = plan.worlds(tmp_path, ["loop"], [610], 50, truth=("depth",))
     assert "--depth" in loop.simulate and loop.root.name.startswith("loop-610-50-depth-")
     (drive,) = plan.raw_drives([tmp_path / "drive_0013"])

@@ -20,7 +20,7 @@ SIZE = (64, 208)
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     root = tmp_path_factory.mktemp("world")
-    write_kitti_root(SimulatedStreet(SimulationOptions(frames=40, seed=704, route="straight")), root / "world")
+    write_kitti_root(SimulatedStreet(SimulationOptions(frames=28, seed=704, route="straight")), root / "world")
     return discover(root / "world")[0]
 
 
@@ -29,14 +29,14 @@ def teacher(recording, tmp_path_factory) -> ManyViewTeacher:
     teacher = ManyViewTeacher(tmp_path_factory.mktemp("teacher"), SIZE, stride=12)
     told = []
     teacher.prepare([recording], 4, "sim", lambda *progress: told.append(progress))
-    assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 3, 3)
+    assert told[0] == ("teacher: poses", 0, 1) and told[-1] == ("teacher: depth", 2, 2)
     return teacher
 
 
 def test_motion_is_in_camera_heights(recording, teacher):
     true = recording.true_poses()
     estimate = teacher.drive(recording).T_world_camera
-    assert estimate.shape == (40, 4, 4)
+    assert estimate.shape == (28, 4, 4)
     length_m = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
     length = np.linalg.norm(np.diff(estimate[:, :3, 3], axis=0), axis=1).sum()
     assert length_m / length == pytest.approx(1.65, rel=0.1)
@@ -44,7 +44,7 @@ def test_motion_is_in_camera_heights(recording, teacher):
 
 def test_a_snippet_has_its_motion_and_its_targets_bounds(recording, teacher):
     drive = teacher.drive(recording)
-    assert list(drive.targets(4)) == [12, 24, 36]
+    assert list(drive.targets(4)) == [12, 24]
     seen = teacher.structure(recording, first=10, sources=4)
     assert seen.least.shape == seen.most.shape == SIZE
     true = recording.true_poses()
@@ -100,24 +100,24 @@ def test_poses_alone_need_no_label(recording, teacher, tmp_path):
     alone = ManyViewTeacher(tmp_path, SIZE, stride=6, measures="poses")
     alone.drive(recording).keep_poses(teacher.drive(recording).T_world_camera)
     alone.prepare([recording], 4, "sim", lambda *progress: pytest.fail(f"measured {progress}"))
-    assert list(alone.drive(recording).targets(4)) == list(range(2, 38))
+    assert list(alone.drive(recording).targets(4)) == list(range(2, 26))
     seen = alone.structure(recording, first=9, sources=4)
     np.testing.assert_array_equal(seen.T_source_target, teacher.drive(recording).motion(9, 4))
     assert not seen.least.any() and np.isinf(seen.most).all()
 
 
 def test_poses_by_other_weights_are_refused(recording, teacher):
-    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:40\] by the weights 'sim', and .* 'default'"):
+    with pytest.raises(TrainingError, match=r"poses of simulated/704\[0:28\] by the weights 'sim', and .* 'default'"):
         teacher.prepare([recording], 4, "default", lambda *_: None)
 
 
 def test_a_damaged_label_is_one_line(recording, teacher):
-    path = teacher.drive(recording).label_file(36)
+    path = teacher.drive(recording).label_file(24)
     whole = path.read_bytes()
     path.write_bytes(whole[:100])
     try:
-        with pytest.raises(TrainingError, match=r"000036\.npz is damaged or missing: delete it and start again"):
-            teacher.drive(recording).label(36)
+        with pytest.raises(TrainingError, match=r"000024\.npz is damaged or missing: delete it and start again"):
+            teacher.drive(recording).label(24)
     finally:
         path.write_bytes(whole)
 

@@ -245,7 +245,7 @@ def test_smoothness_halves_from_scale_to_scale() -> None:
 
 
 @pytest.mark.parametrize("smoothness", ["depth-second-order", "disparity-edge-aware"])
-def test_a_flat_depth_is_smooth(batch: SnippetBatch, plane, smoothness: str) -> None:
+def test_a_flat_depth_is_smooth(batch: SnippetBatch, smoothness: str) -> None:
     outcome = evaluate(batch, experiment(smoothness=smoothness, smoothness_weight=1.0), 0.25, true_poses())
     assert float(outcome.terms["smoothness"]) == pytest.approx(0, abs=1e-12)
 
@@ -350,7 +350,7 @@ def test_evaluation_mode_is_refused(batch: SnippetBatch) -> None:
         evaluate_objective(FixedDepth(0.3).eval(), FixedPose(true_poses()), batch, experiment())
 
 
-def test_the_teacher_loss_is_zero_for_true_outputs_and_positive_for_wrong_ones(batch: SnippetBatch, plane) -> None:
+def test_the_teacher_loss_is_zero_for_true_outputs_and_positive_for_wrong_ones(batch: SnippetBatch) -> None:
     config = ExperimentConfig(
         loss=LossConfig(photometric_weight=0, smoothness_weight=0),
         teacher=TeacherConfig(rotation_weight=1, translation_weight=1, structure_weight=1, unit_weight=1),

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.config import ExperimentConfig, TeacherConfig
 from erfsfm.data.discovery import discover
-from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.snippets import ValidationSnippets, split_recordings
 from erfsfm.training.pack import pack
 from erfsfm.training.run import train, trained_on
@@ -33,7 +31,7 @@ def roots(tmp_path: Path, write_root: Callable[..., Path]) -> list[Path]:
 
 
 @pytest.fixture
-def config(small: Small, roots: list[Path], tmp_path: Path) -> ExperimentConfig:
+def config(small: Small, roots: list[Path], measure: Callable[..., None], tmp_path: Path) -> ExperimentConfig:
     """Of a training by many views, measured already."""
     data = {"roots": roots, "validation": ["simulated/500"], "validation_snippets": 3, "exclude": []}
     teacher = {"views": "many", "stride": STRIDE, "structure_weight": 1.0, "translation_weight": 1.0}
@@ -43,23 +41,8 @@ def config(small: Small, roots: list[Path], tmp_path: Path) -> ExperimentConfig:
         "loss": {"photometric_weight": 0.0},
     }
     config = ExperimentConfig.model_validate(tree)
-    measure(config)
+    measure(config, lambda recording, target: (1 + recording.start + target) / 100)
     return config
-
-
-def measure(config: ExperimentConfig) -> None:
-    """A teacher that sees a slope, whose depth is that of the frame's number."""
-    assert config.teacher.cache is not None
-    teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
-    for recording in split_recordings(config.data)[0]:
-        drive = teacher.drive(recording)
-        T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
-        T_world_camera[:, 2, 3] = 0.3 * np.arange(len(recording))
-        drive.keep_poses(T_world_camera)
-        for target in drive.targets(config.network.sources):
-            least = np.full(SIZE, (1 + recording.start + target) / 100, np.float16)
-            drive.label_file(target).parent.mkdir(exist_ok=True)
-            np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
 
 
 def on_pack(config: ExperimentConfig, output: Path) -> ExperimentConfig:

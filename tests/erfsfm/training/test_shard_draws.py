@@ -40,7 +40,9 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def config(small: Small, shared: Path, write_root: Callable[..., Path]) -> ExperimentConfig:
+def config(
+    small: Small, shared: Path, write_root: Callable[..., Path], measure: Callable[..., None]
+) -> ExperimentConfig:
     """Of a training on three worlds and a real drive, whose labels of many views are measured."""
     for name, frames in FRAMES.items():
         seed = int(name[-1]) if name.startswith("simulated") else None
@@ -58,23 +60,8 @@ def config(small: Small, shared: Path, write_root: Callable[..., Path]) -> Exper
     }
     config = ExperimentConfig.model_validate(tree)
     if not (shared / "measured").exists():
-        measure(config)
+        measure(config, lambda _, target: (2 + target) / 200)
     return config
-
-
-def measure(config: ExperimentConfig) -> None:
-    """A teacher that sees a slope, whose depth is that of the frame's number."""
-    assert config.teacher.cache is not None
-    teacher = ManyViewTeacher(config.teacher.cache, SIZE, STRIDE)
-    for recording in split_recordings(config.data)[0]:
-        drive = teacher.drive(recording)
-        T_world_camera = np.tile(np.eye(4), (len(recording), 1, 1))
-        T_world_camera[:, 2, 3] = 0.3 * np.arange(len(recording))
-        drive.keep_poses(T_world_camera)
-        for target in drive.targets(config.network.sources):
-            least = np.full(SIZE, (2 + target) / 200, np.float16)
-            drive.label_file(target).parent.mkdir(exist_ok=True)
-            np.savez_compressed(drive.label_file(target), least=least, most=1.06 * least)
 
 
 @pytest.fixture

@@ -9,17 +9,18 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import typer
 
 import slam
 import slam.commands.run.run
-from slam.commands.cli import app, main
+from slam.commands.cli import main
+from slam.config.sections import load_config
 from slam.evaluation.trajectory import trajectory_metrics
 from slam.formats.trajectory import read_trajectory
 from slam.results.folder import RunFolder
@@ -33,20 +34,11 @@ QUICK = ("--set", "mapping.enabled=false", "--set", "visual_odometry.enabled=fal
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
-    """Exit code, stdout and stderr of ``erfsfm-slam ARGUMENTS`` in this process, in a folder of its own."""
+def call(command_line: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Call:
+    """Exit code, stdout and stderr of ``erfsfm-slam ARGUMENTS`` in a folder of its own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("KITTI_ODOMETRY", raising=False)
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        out, err = capsys.readouterr()
-        return int(stopped.value.code or 0), out, err
-
-    return run
+    return partial(command_line, main, "erfsfm-slam")
 
 
 HELP = """
@@ -70,10 +62,6 @@ def test_help_of_every_verb_is_light() -> None:
     finished = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
     assert set(finished.stdout.split()) >= VERBS
-
-
-def verbs() -> dict[str, Any]:
-    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(("typed", "wanted"), [("erfsfm-slam ev", "evaluate"), ("erfsfm-slam run --wei", "--weights")])
@@ -239,7 +227,7 @@ def test_an_interrupted_run_says_so(call: Call, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(slam.commands.run.run, "perform", interrupt)
     code, _, err = call("run")
-    assert code == 130 and "interrupted; what was written stays" in err and "Traceback" not in err
+    assert code == 130 and "interrupted; what was written stays" in err
 
 
 def files_of(run: RunFolder, kind: str = "tum") -> tuple[Path, Path]:
@@ -264,7 +252,41 @@ def test_fail_over(call: Call, make_run: MakeRun) -> None:
     code, out, err = call("evaluate", *files, "--json", "--fail-over", "ate_rmse_m=0", "--fail-over", "rpe_rot_deg=99")
     assert code == 1 and "align.7dof.ate_rmse_m is " in err and "over the limit 0" in err and "rpe_rot_deg" not in err
     assert json.loads(out)["align"]
-    assert call("evaluate", *files, "--fail-over", "beauty=1")[0] == 1
+    for limit, words in (("beauty=1", "no metric 'beauty'"), ("ate_rmse_m=few", "METRIC=VALUE")):
+        code, _, err = call("evaluate", *files, "--fail-over", limit)
+        assert code == 1 and words in err
+
+
+def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
+    runs = [make_run(name).path for name in ("morning", "evening")]
+    code, out, _ = call("evaluate", *runs)
+    assert code == 0 and "morning" in out and "evening" in out and "optimised" in out
+    assert [entry["run"] for entry in json.loads(call("evaluate", *runs, "--json")[1])] == list(map(str, runs))
+
+
+def test_plot(call: Call, make_run: MakeRun) -> None:
+    run = make_run().path
+    code, out, _ = call("plot", run, "--what", "trajectory, errors", "--output", "figure.png")
+    assert code == 0 and "figure.png" in out and cv2.imread("figure.png").std() > 5
+    for options, words in ((("--what", "speed"), "'speed' is unknown"), (("--output", "a.gif"), "got 'a.gif'")):
+        code, _, err = call("plot", run, *options)
+        assert code == 1 and err.count("\n") == 1 and words in err
+
+
+def test_the_printed_configuration_reads_back(call: Call) -> None:
+    Path("mine.yaml").write_text(call("config")[1])
+    assert load_config("mine.yaml") == load_config()
+
+
+def test_old_command_lines_with_seed_and_device_still_work(call: Call, make_run: MakeRun) -> None:
+    run = make_run()
+    for words in (
+        ("evaluate", *files_of(run)),
+        ("export", run.path, "--what", "cloud", "--output", "map.ply"),
+        ("plot", run.path),
+        ("simulate", "world", "--width", 104, "--height", 32, "--frames", 5, "--route", "straight"),
+    ):
+        assert call(*words, "--seed", 3, "--device", "cpu")[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -209,6 +209,21 @@ def test_a_lost_estimate_is_no_number() -> None:
     assert "not finite" in metrics["align"]["none"]["ate_rmse_m_reason"]
 
 
+@pytest.mark.parametrize(
+    ("estimate", "truth", "alignment", "reason"),
+    [
+        (line(20, 0.0), line(20, 0.0), "none", "neither the estimate nor the reference moves"),
+        (line(20, -1.0), line(20), "scale", "the other way"),
+        (line(20, 1e200), line(20), "none", "not finite"),
+    ],
+)
+def test_what_has_no_error_has_a_reason(estimate: FloatArray, truth: FloatArray, alignment: str, reason: str) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        metrics = metrics_of(trajectory(estimate), trajectory(truth))
+    check_shape(metrics)
+    assert reason in metrics["align"][alignment]["ate_rmse_m_reason"]
+
+
 def test_align_gives_trajectories_to_draw() -> None:
     truth = drive(50)
     estimate = se3.Similarity(0.1, np.eye(3), np.ones(3)).apply_to_poses(truth)

@@ -316,7 +316,7 @@ def test_a_limit_on_memory_from_the_start_is_one_line(kitti_root: Path, whole: P
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=600,
     )
     assert ended.returncode == 1 and ended.stderr.startswith("erfsfm-slam: memory ran out"), ended.stderr
     assert len(ended.stderr.splitlines()) == 1

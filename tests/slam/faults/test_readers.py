@@ -23,7 +23,6 @@ from erfsfm.common.readers.kitti_oxts import read_packet
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.config import load_experiment
 from erfsfm.convert import read_old
-from erfsfm.data.pack_index import read_pack
 from erfsfm.data.recordings import Recording
 from erfsfm.data.split_file import read_split_file
 from erfsfm.inference import DepthPosePredictor
@@ -66,10 +65,6 @@ def _is_sequence(sequence: Any) -> bool:
 
 def _is_noise(noise: PoseNoise | None) -> bool:
     return noise is None or bool(np.isfinite(noise.coefficients).all())
-
-
-def _pack_poses(folder: Path) -> Any:
-    return [recording.true_poses() for recording in read_pack(folder)]
 
 
 def _odometry_poses(path: Path) -> Any:

@@ -123,6 +123,11 @@ def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, format: str, words
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("row", ["1.0003 0 0 0 0 0.9998 0.0002 0 0 0 1 0", "0 0 0 0 0 0 0.7071 0.7071"])
+def test_rounded_rotations_are_repaired(tmp_path: Path, row: str) -> None:
+    assert se3.is_se3(read_trajectory(written(tmp_path, row)).T_world_camera, tolerance=1e-12)
+
+
 def test_what_is_no_text_file(tmp_path: Path) -> None:
     with pytest.raises(TrajectoryError, match="no such file"):
         read_trajectory(tmp_path / "missing.txt")

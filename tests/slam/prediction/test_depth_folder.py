@@ -136,3 +136,18 @@ def test_files_that_are_no_depth_are_found_before_the_run(tmp_path: Path, name: 
     with pytest.raises(SlamError, match=message) as caught:
         opened(tmp_path, FrameNumbers(3, 0, 3), kind)
     assert f"1.{kind}" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "kind", "words"),
+    [
+        (lambda path: path.write_bytes(path.read_bytes()[:-100]), "npy", "truncated"),
+        (lambda path: np.save(path, np.ones((WIDTH, HEIGHT), np.float32)), "npy", "write rows as rows"),
+        (lambda path: None, "png", r"holds no \.png file"),
+    ],
+)
+def test_folders_that_do_not_fit_are_one_line(tmp_path: Path, damage: Any, kind: str, words: str) -> None:
+    damage(folder_of(tmp_path, ["0.npy"]) / "0.npy")
+    with pytest.raises(SlamError, match=words) as caught:
+        opened(tmp_path, FrameNumbers(1, 0, 1), kind)
+    assert "\n" not in str(caught.value)

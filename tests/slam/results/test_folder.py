@@ -145,11 +145,15 @@ def test_a_run_that_did_not_end_is_opened_with_one_note(make_run: MakeRun, caplo
     assert RunFolder.open(folder.path).metrics().tree()["status"] == "running"
 
 
-def test_output_with_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
+@pytest.mark.parametrize("place", [".", "unfinished"])
+def test_output_with_other_things_is_refused_and_left_alone(make_run: MakeRun, tmp_path: Path, place: str) -> None:
+    output = tmp_path if place == "." else make_run("mine").path
+    (output / place).mkdir(exist_ok=True)
+    (output / place / "thesis.tex").write_text("years of work")
+    before = contents(output)
     with pytest.raises(RunError, match="holds no run"):
-        RunFolder.create(tmp_path, tmp_path, "sim")
-    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+        RunFolder.create(output, tmp_path, "sim")
+    assert contents(output) == before and (output / place / "thesis.tex").read_text() == "years of work"
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:

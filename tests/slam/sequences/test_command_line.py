@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,8 +20,8 @@ SETTINGS = ["--set", "mapping.enabled=false", "--set", "output.report=false"]
 
 @pytest.fixture
 def run(
+    command_line: Callable[..., tuple[int, str, str]],
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     tmp_path: Path,
     tiny_weights: Path,
@@ -31,18 +30,8 @@ def run(
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: object) -> tuple[int, str]:
-        words = ["erfsfm-slam", "run", "--weights", tiny_weights, *SETTINGS, *arguments]
-        monkeypatch.setattr(sys, "argv", list(map(str, words)))
-        capsys.readouterr()
         caplog.clear()
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        else:
-            code = 0
-        err = capsys.readouterr().err
-        assert "Traceback" not in err
+        code, _, err = command_line(main, "erfsfm-slam", "run", "--weights", tiny_weights, *SETTINGS, *arguments)
         assert len([line for line in err.splitlines() if line.startswith("erfsfm-slam: ")]) == (code != 0), err
         return code, caplog.text + err
 

@@ -126,3 +126,10 @@ def test_resize_down_averages() -> None:
     image = np.zeros((8, 8, 3), np.uint8)
     image[::2] = 100
     assert (resize_image(image, 4, 4) == 50).all()
+
+
+def test_two_formats_of_one_image_are_refused(tmp_path: Path) -> None:
+    for name in ("0.png", "0.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match="image 0 in two formats"):
+        list_images(tmp_path)

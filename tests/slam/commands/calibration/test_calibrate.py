@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,23 +21,9 @@ FISHEYE = {"model": "fisheye", "distortion": (-0.02, 0.01, -0.003, 0.0005)}
 
 
 @pytest.fixture
-def calibrate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
+def calibrate(command_line: Call, tmp_path: Path) -> Call:
     """Exit code, stdout and stderr."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        words = ["erfsfm-slam", "calibrate", "--output", tmp_path / "camera.yaml", *arguments]
-        monkeypatch.setattr(sys, "argv", list(map(str, words)))
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        else:
-            code = 0
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        return code, said.out, said.err
-
-    return call
+    return partial(command_line, main, "erfsfm-slam", "calibrate", "--output", tmp_path / "camera.yaml")
 
 
 def require_close(camera: CameraFile, studio) -> None:
@@ -93,6 +79,11 @@ def test_among_the_images_the_picture_is_none_of_them(make_studio, make_views, w
     code, _, err = calibrate(folder, "--board", "9x6", "--output", folder / "settings.yaml")
     assert code == 1 and "settings.yaml exists and is no camera file" in err
     assert (folder / "settings.yaml").read_text() == "mapping: {enabled: false}"
+    photo = folder.parent / "camera.png"
+    photo.write_bytes(b"what the camera looks like")
+    code, _, err = calibrate(folder, "--board", "9x6", "--output", folder.parent / "camera.yaml")
+    assert code == 1 and "camera.png exists and is of no earlier calibration" in err
+    assert photo.read_bytes() == b"what the camera looks like"
 
 
 def test_a_video_gives_its_rate(tmp_path: Path, make_studio, make_views, calibrate: Call) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import sys
 import tarfile
 import threading
 import zipfile
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,23 +130,14 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture
-def download(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, server: Server
-) -> Call:
+def download(command_line: Call, tmp_path: Path, server: Server) -> Call:
     """Exit code, stdout and stderr, which is one line at most."""
 
     def call(*arguments: str) -> tuple[int, str, str]:
-        words = ["download", "--to", str(tmp_path / "to"), "--mirror", server.address, *arguments]
-        monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        else:
-            code = 0
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err and len(said.err.splitlines()) <= 1, said.err
-        return code, said.out, said.err
+        words = ["erfsfm-slam", "download", "--to", tmp_path / "to", "--mirror", server.address, *arguments]
+        code, out, err = command_line(main, *words)
+        assert len(err.splitlines()) <= 1, err
+        return code, out, err
 
     return call
 
@@ -270,3 +261,27 @@ def test_a_part_of_another_file_is_thrown_away(tmp_path: Path, server: Server, d
     assert any(name.endswith(".tgz.part") for name in found(tmp_path / "to"))
     server.cuts_left, server.tag = 0, "two"
     assert download(*TUM)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wrong", "words"),
+    [
+        (KITTI, {"gives_ranges": False}, "gives no parts of files"),
+        (TUM, {"gives_ranges": False}, "gives no parts of files"),
+        (KITTI, {"change_after": 5}, "was changed on the server"),  # after three tables of contents and two files
+        (TUM, {"is_damaged": True}, "arrived damaged"),
+    ],
+)
+def test_a_server_that_gives_something_else_is_named_and_nothing_of_it_is_kept(
+    tmp_path: Path, server: Server, download: Call, arguments: tuple[str, ...], wrong: dict[str, Any], words: str
+) -> None:
+    sound = dict(server.files)
+    for name, value in wrong.items():
+        setattr(server, name, value)
+    if "is_damaged" in wrong:  # the CRC of gzip
+        server.files = {name: data[:-8] + bytes(4) + data[-4:] for name, data in sound.items()}
+    code, _, err = download(*arguments)
+    assert code == 1 and words in err
+    assert found(tmp_path / "to") < WHOLE if "change_after" in wrong else not found(tmp_path / "to")
+    server.files, server.gives_ranges, server.change_after = sound, True, None
+    assert download(*arguments)[0] == 0

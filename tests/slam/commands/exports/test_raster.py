@@ -137,7 +137,7 @@ def test_geotiff_has_the_roof_at_its_place_on_earth(scene: Ply, tmp_path: Path, 
     ]
 
 
-def test_a_run_from_above(make_recorded: Callable[..., RunFolder], sheet: Ply, tmp_path: Path) -> None:
+def test_a_run_from_above(make_recorded: Callable[..., RunFolder], tmp_path: Path) -> None:
     written = export(make_recorded(), "raster", tmp_path / "raster", options=ExportOptions(resolution=0.2))
     described = yaml.safe_load((written / "raster.yaml").read_text())
     assert described["top_left"] == [0.0, 5.0] and described["unit"] == "metres"

@@ -235,3 +235,20 @@ def test_where_the_truth_is_known_errors_and_success_are_said(run: RunFolder, al
     assert whole["images"][1]["error_m"] == pytest.approx(3.0, abs=0.5) and whole["images"][3]["error_m"] is None
     assert "50% of 4 images within 0.5 m and 2 deg" in summary_line(numbers_of)
     assert len(localisation_table(found, errors).columns) == 9
+
+
+def test_nothing_found_is_nothing_written(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="none of 1 images was found"):
+        write_localisations(tmp_path / "found.tum", list(localise(album / "50.png", run)))
+    assert not (tmp_path / "found.tum").exists()
+
+
+def test_what_cannot_be_localised_is_one_line(run: RunFolder, album: Path, tmp_path: Path) -> None:
+    write_kitti(tmp_path / "truth.txt", Trajectory(np.arange(4.0), reference()[:4]))
+    with pytest.raises(RunError, match=r"has 4 poses and .* 5 images"):
+        true_poses(tmp_path / "truth.txt", album, range(5))
+    with pytest.raises(SequenceError, match="reaches outside"):
+        image_numbers(album, "0:6")
+    run.write(PLACES, Places(places().intrinsics, (), np.zeros((0, 4, 4))).write)
+    with pytest.raises(RunError, match=r"has no places: it ran with loops\.enabled=false"):
+        list(localise(album, run))

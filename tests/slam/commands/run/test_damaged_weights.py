@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,19 +14,16 @@ from slam.commands.cli import main
 
 @pytest.mark.parametrize("kind", ["depth", "pose"])
 def test_a_run_refuses_them_in_one_line(
-    tiny_weights: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_weights: Path, tmp_path: Path, kind: str, command_line: Callable[..., tuple[int, str, str]]
 ) -> None:
     shutil.copytree(tiny_weights, tmp_path / "weights")
     path = tmp_path / "weights" / f"{kind}.safetensors"
     tensors = load_file(path)
     next(value for value in tensors.values() if value.is_floating_point()).view(-1)[0] = float("nan")
     save_file(tensors, path)
-    words = ["run", "--frames", "0:4", "--weights", str(tmp_path / "weights"), "--output", str(tmp_path / "run")]
-    monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    out, err = capsys.readouterr()
-    assert (stopped.value.code, out) == (1, "")
+    words = ["run", "--frames", "0:4", "--weights", tmp_path / "weights", "--output", tmp_path / "run"]
+    code, out, err = command_line(main, "erfsfm-slam", *words)
+    assert (code, out) == (1, "")
     assert err.startswith(f"erfsfm-slam: {path}: '")
     assert err.count("\n") == 1
     assert not (tmp_path / "run").exists()

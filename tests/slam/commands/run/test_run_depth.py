@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -217,7 +216,7 @@ def test_bad_sources_are_one_line_and_exit_1(
     arrays: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    command_line: Callable[..., tuple[int, str, str]],
     source: str,
     message: str,
 ) -> None:
@@ -228,11 +227,8 @@ def test_bad_sources_are_one_line_and_exit_1(
     for k in range(24):
         np.save(tmp_path / "unknown" / f"{k}.npy", np.full((64, 208), [np.nan, 0.0, -1.0, np.inf][k % 4], np.float32))
     (tmp_path / "damaged.onnx").write_bytes(b"\x08\x07" * 99)
-    words = ["run", "--dataset", str(world), "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
-    monkeypatch.setattr(sys, "argv", ["erfsfm-slam", *words])
-    with pytest.raises(SystemExit) as ended:
-        slam.commands.cli.main()
-    lines = capsys.readouterr().err.strip().splitlines()
-    (line,) = [each for each in lines if not each.startswith("WARNING")]
-    assert ended.value.code == 1 and message in line
+    words = ["run", "--dataset", world, "--weights", "sim", "--output", "out", "--set", f"depth.source={source}"]
+    code, _, err = command_line(slam.commands.cli.main, "erfsfm-slam", *words)
+    (line,) = [each for each in err.strip().splitlines() if not each.startswith("WARNING")]
+    assert code == 1 and message in line
     assert (tmp_path / "out").exists() == (source == "npy:unknown"), "all else is found before the run begins"

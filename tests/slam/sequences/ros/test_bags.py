@@ -119,7 +119,7 @@ def test_red_stays_red(new_bag: NewBag, encoding: str) -> None:
     assert open_sequence(bag.close()).frame(0).image[12, 20].tolist() == [200, 20, 20]
 
 
-def test_calibration(new_bag: NewBag, kind: str, tmp_path: Path, camera_yaml: str) -> None:
+def test_calibration(new_bag: NewBag, kind: str) -> None:
     bag = new_bag(kind)
     drive(bag, "/raw/image_raw")
     drive(bag, "/flat/image_rect")

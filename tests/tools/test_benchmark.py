@@ -57,17 +57,7 @@ def page(tools: Callable[[str], ModuleType]) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def metric_definitions(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.metric_definitions")
-
-
-@pytest.fixture(scope="module")
-def derived_metrics(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.derived_metrics")
-
-
-@pytest.fixture(scope="module")
-def summary(tools: Callable[[str], ModuleType]) -> ModuleType:
-    return tools("benchmarking.summary")
+    return tools("benchmarking.metrics")
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
@@ -164,25 +154,23 @@ def test_accuracy_is_mean_and_deviation_over_the_seeds_that_ended_well(
     assert "Failed: loop 610, sim, everything on, seed 2: out of memory" in text
 
 
-def test_errors_relative_to_path_and_network(derived_metrics: ModuleType, tmp_path: Path) -> None:
+def test_errors_relative_to_path_and_network(work: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     run = metrics(ate=0.9)
     slower = metrics(ate=3.6).trajectories.network
     run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
-    derived = derived_metrics.derive_metrics(tmp_path, run)
+    derived = work.derive_metrics(tmp_path, run)
     shares = derived.network_percent, derived.optimised_percent, derived.of_network
     assert shares == pytest.approx((4.0, 1.0, 0.25))
     assert derived.false_loops == Missing("the sequence has no true poses")
     run = run.changed(sequence=SequenceMetrics(length_m=Missing("no truth")))
-    assert derived_metrics.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
+    assert work.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
 
 
 @pytest.mark.parametrize(
     ("moved_m", "turned_deg", "false"), [(0.0, 0.0, 0), (1.9, 4.9, 0), (2.1, 0.0, 1), (0.0, 5.1, 1)]
 )
-def test_true_and_false_loops(
-    derived_metrics: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int
-) -> None:
+def test_true_and_false_loops(work: ModuleType, tmp_path: Path, moved_m: float, turned_deg: float, false: int) -> None:
     T_world_camera = np.tile(np.eye(4), (3, 1, 1))
     T_world_camera[:, :3, 3] = [[0, 0, 0], [4, 0, 0], [4, 0, 7]]
     T_world_camera[2, :3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
@@ -191,10 +179,10 @@ def test_true_and_false_loops(
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
-    derived = derived_metrics.derive_metrics(tmp_path, metrics())
+    derived = work.derive_metrics(tmp_path, metrics())
     assert (derived.true_loops, derived.false_loops) == (1 - false, false)
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
-    assert isinstance(derived_metrics.derive_metrics(tmp_path, in_heights).true_loops, Missing)
+    assert isinstance(work.derive_metrics(tmp_path, in_heights).true_loops, Missing)
 
 
 def test_a_leak_is_reported(page: ModuleType, work: ModuleType, job: Any) -> None:

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from benchmarking.metric_definitions import rows
-from benchmarking.page import PICTURE, section, with_section
-from benchmarking.picture import draw, drawable
+from benchmarking.metrics import rows
+from benchmarking.page import PICTURE, draw, drawable, section, summary_table, with_section
 from benchmarking.plan import (
     ABLATION,
     ACCURACY,
@@ -42,10 +41,9 @@ from benchmarking.plan import (
     recordings,
     worlds,
 )
-from benchmarking.summary import summary_table
 from benchmarking.work import ROOT, measured, workers
+from shared.command import one_line_errors, parser_of
 
-from slam.runtime.errors import SlamError
 from slam.runtime.storage.files import write_atomically
 
 
@@ -80,22 +78,17 @@ MODES = {
 }
 
 
+@one_line_errors()
 def main(words: Sequence[str] | None = None) -> None:
     """Plan the runs, execute those that are missing, write tables."""
     options = _parser().parse_args(words)
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)
-    try:
-        jobs = _jobs(options)
-    except SlamError as error:
-        raise SystemExit(str(error)) from error
+    jobs = _jobs(options)
     if not jobs:
         raise SystemExit("nothing to measure: give --routes or --kitti")
-    try:
-        with workers(at_a_time, scheduler) as spread:
-            results = measured(jobs, spread)
-    except SlamError as error:
-        raise SystemExit(str(error)) from error
+    with workers(at_a_time, scheduler) as spread:
+        results = measured(jobs, spread)
     table_of_runs = rows(results)
     with (options.output / f"{options.mode}.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, table_of_runs[0])
@@ -169,7 +162,7 @@ def _command(options: argparse.Namespace) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join(MODES))
     for name, mode in MODES.items():
         add = modes.add_parser(

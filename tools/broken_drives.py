@@ -7,7 +7,6 @@ Example: python tools/broken_drives.py --fault black --fault wiper
 
 from __future__ import annotations
 
-import argparse
 import logging
 import tempfile
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from shared.command import parser_of
 
 from slam import run_slam
 from slam.geometry.se3 import FloatArray, umeyama
@@ -223,7 +223,7 @@ def ate(
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run broken drives and print one row of a table each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--fault", action="append", choices=list(FAULTS))
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--weights", default="sim")

@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from shared.command import markdown, one_line_errors, parser_of
 
-from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor, save_image
 from slam.config.sections import load_config
 from slam.frames import DepthMap, Image
@@ -27,7 +27,6 @@ from slam.mapping.filters import KeyframeDepth
 from slam.pipeline.batch import SlamPipeline
 from slam.prediction.networks import NetworkPredictor
 from slam.results.depth import true_depth
-from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 
 EDGES_M = (1, 5, 10, 20, 40, 80)
@@ -47,17 +46,15 @@ class Shown:
     truth: DepthMap | None
 
 
+@one_line_errors()
 def main(words: Sequence[str] | None = None) -> None:
     """Run with each of the weights, draw, print one table."""
     options = _parser().parse_args(words)
     errors: Errors = {}
     shown: dict[int, Shown] = {}
-    try:
-        drive = open_sequence(options.dataset, options.sequence, None, options.frames)
-        for weights in options.weights:
-            run(drive, weights, options.set, partial(_note, drive, Path(weights).name, errors, shown))
-    except (SlamError, ErfsfmError) as error:
-        raise SystemExit(str(error)) from error
+    drive = open_sequence(options.dataset, options.sequence, None, options.frames)
+    for weights in options.weights:
+        run(drive, weights, options.set, partial(_note, drive, Path(weights).name, errors, shown))
     rows = [shown[min(shown, key=lambda index: abs(index - wanted))] for wanted in options.show]
     save_image(options.output, picture(rows))
     print(table(errors))
@@ -93,13 +90,13 @@ def _note(drive: FrameSequence, name: str, errors: Errors, shown: dict[int, Show
 def table(errors: Errors) -> str:
     """Mean and median relative error of each method, whole and over distance, as Markdown."""
     bins = list(pairwise(EDGES_M))
-    lines = ["| depth | all | " + " | ".join(f"{a}-{b} m" for a, b in bins) + " |", "|---|" + "---|" * (len(bins) + 1)]
+    rows = []
     for method, parts in errors.items():
         truth, relative = np.concatenate(parts, axis=1)
         chosen = [np.ones(len(truth), bool), *((truth >= a) & (truth < b) for a, b in bins)]
         cells = [f"{relative[c].mean():.3f} / {np.median(relative[c]):.3f}" if c.any() else "-" for c in chosen]
-        lines.append(f"| {method} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        rows.append([method, *cells])
+    return markdown(["depth", "all", *(f"{a}-{b} m" for a, b in bins)], rows)
 
 
 def picture(rows: Sequence[Shown]) -> Image:
@@ -152,7 +149,7 @@ def _sparse(truth: DepthMap, height: int) -> Image:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     add = parser.add_argument
     add("output", type=Path, help=".jpg or .png")
     add("--dataset", type=Path, help="as for erfsfm-slam run; default: the embedded sequence")

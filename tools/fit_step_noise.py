@@ -9,7 +9,6 @@ Example: python tools/fit_step_noise.py KITTI:00 KITTI:02 KITTI:05 WORLD --weigh
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +18,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy.optimize import minimize
+from shared.command import one_line_errors, parser_of
 
-from erfsfm.common.errors import ErfsfmError
 from erfsfm.inference import DepthPosePredictor
 from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig, load_config
 from slam.evaluation.coverage import LEVELS, squared_bound
@@ -135,18 +134,16 @@ def _factors(steps: StepTable, scale: Scale, ratios: FloatArray) -> list[Relativ
     return make_factors(known, scale, None, PoseNetworkConfig(use="gaps"), visual_odometry)
 
 
+@one_line_errors()
 def main(words: Sequence[str] | None = None) -> None:
     """Measure all drives, fit, print one table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("drives", nargs="+", metavar="ROOT[:SEQUENCE]", help="recordings with true poses")
     parser.add_argument("--weights", default="default")
     parser.add_argument("--cache", type=Path, help="cache folder of the networks' outputs")
     options = parser.parse_args(words)
-    try:
-        networks = DepthPosePredictor.from_weights(options.weights, runtime="onnx")
-        drives = [measure(name, networks, options.cache) for name in options.drives]
-    except (SlamError, ErfsfmError) as error:
-        raise SystemExit(str(error)) from error
+    networks = DepthPosePredictor.from_weights(options.weights, runtime="onnx")
+    drives = [measure(name, networks, options.cache) for name in options.drives]
     shown = Table("drive", "steps", "50 / 90 / 95 %, in use", "50 / 90 / 95 %, fitted to the others")
     for drive in drives:
         others = fit([other for other in drives if other is not drive])

@@ -5,15 +5,15 @@ Example: python tools/label_errors.py --dataset worlds/600 --weights default
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from shared.command import one_line_errors, parser_of
 
-from erfsfm.common.errors import DataError, ErfsfmError
+from erfsfm.common.errors import DataError
 from erfsfm.common.readers.images import read_image
 from erfsfm.data.discovery import discover
 from erfsfm.data.many_view_teacher import DriveLabels, Guess, ManyViewTeacher
@@ -28,18 +28,16 @@ FARTHEST_M = 80.0
 WIDEST = 1.5  # most over least inverse depth of what counts as known
 
 
+@one_line_errors()
 def main() -> None:
     """One line for each recording and kind of label."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, required=True, help="with true depth, or a drive of KITTI raw")
     parser.add_argument("--weights", default="default", help="of the poses and of the guessed depth")
     arguments = parser.parse_args()
-    try:
-        for recording in discover(arguments.dataset):
-            for line in compared(recording, arguments.weights):
-                print(line)
-    except ErfsfmError as error:
-        raise SystemExit(str(error)) from error
+    for recording in discover(arguments.dataset):
+        for line in compared(recording, arguments.weights):
+            print(line)
 
 
 def compared(recording: Recording, weights: str) -> list[str]:

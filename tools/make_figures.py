@@ -6,7 +6,6 @@ Example: python tools/make_figures.py results/latest docs/images/map-0013.jpg --
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import cv2
@@ -14,12 +13,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from shared.command import one_line_errors, parser_of
 
 from erfsfm.inference import DepthPosePredictor
 from slam.frames import Sequence
 from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMeshFile
-from slam.results.report.map_picture import MapScene
+from slam.results.report.map_view import MapScene
 from slam.results.report.plots import depth_figure, map_figure, trajectories_figure, trajectories_of
 from slam.runtime.run_files import MAP_MESH
 from slam.sequences.catalogue import open_sequence
@@ -28,9 +28,10 @@ WIDTH_PX = 1600
 NEAR_M = 100.0
 
 
+@one_line_errors()
 def main() -> None:
     """One picture: depth of some frames above the trajectories and the map, or a frame above the map from its seat."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--dataset", type=Path, help="of the run; default: the embedded sequence")

@@ -5,11 +5,11 @@ Example: python tools/map_of_truth.py --dataset world --set mapping.voxel_size_m
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import cv2
 import numpy as np
+from shared.command import one_line_errors, parser_of
 
 from slam.config.sections import load_config
 from slam.evaluation.map import PlacedMetrics, compare, placed_metrics
@@ -22,17 +22,15 @@ from slam.runtime.errors import SlamError
 from slam.sequences.catalogue import open_sequence
 
 
+@one_line_errors()
 def main() -> None:
     """Fuse every true depth map of a data set, and compare the surface with the truth."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, help="with true poses and depth maps; default: the embedded sequence")
     parser.add_argument("--sequence")
     parser.add_argument("--set", nargs="+", default=(), metavar="KEY=VALUE", help="changes to the configuration")
     arguments = parser.parse_args()
-    try:
-        print(errors(arguments.dataset, arguments.sequence, arguments.set))
-    except SlamError as error:
-        raise SystemExit(str(error)) from error
+    print(errors(arguments.dataset, arguments.sequence, arguments.set))
 
 
 def errors(dataset: Path | None, name: str | None, overrides: list[str]) -> str:

@@ -5,7 +5,6 @@ Example: python tools/settings_page.py
 
 from __future__ import annotations
 
-import argparse
 import re
 import types
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from shared.command import parser_of
 
 from erfsfm.common.files import write_atomically
 from erfsfm.config import ExperimentConfig
@@ -42,7 +42,7 @@ HEADER = "| setting | values | default | meaning |\n|---|---|---|---|\n"
 
 def main() -> None:
     """Write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--output", type=Path, default=Path("docs/settings.md"), help="the page to write")
     output: Path = parser.parse_args().output
     write_atomically(output, lambda path: path.write_text(page(), encoding="utf-8"))

@@ -5,9 +5,10 @@ Example: python tools/ship_weights.py runs/sim sim --data "60 simulated worlds, 
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
+
+from shared.command import markdown, one_line_errors, parser_of
 
 from erfsfm.checkpoint import Model, load_model, save_model
 from erfsfm.model_record import FILES, SHIPPED
@@ -37,9 +38,10 @@ Measured (`{evaluation}`):
 """
 
 
+@one_line_errors()
 def main() -> None:
     """Write ``erfsfm/weights/NAME``."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("run", type=Path, help="output folder of erfsfm train")
     parser.add_argument("name", help="name of the shipped weights")
     parser.add_argument("--data", required=True, help="one line: what it was trained on")
@@ -81,11 +83,9 @@ def main() -> None:
 def _table(path: Path | None, fallback: dict[str, float]) -> str:
     rows = json.loads(path.read_text()) if path else [fallback]
     keys = list(rows[0])
-    lines = ["| " + " | ".join(keys) + " |", "|" + "---|" * len(keys)]
-    for row in rows:
-        cells = (f"{row[k]:.4f}" if isinstance(row[k], float) else str(row[k]) for k in keys)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    return markdown(
+        keys, [[f"{row[k]:.4f}" if isinstance(row[k], float) else str(row[k]) for k in keys] for row in rows]
+    )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ Example: python tools/study_receptive_field.py --dataset pack --cache labels --r
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import sys
@@ -21,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.stats import t as student
+from shared.command import markdown, one_line_errors, parser_of
 from torch import Tensor
 
 from erfsfm.checkpoint import load_model
@@ -128,9 +128,10 @@ class UnseenSnippets:
         return errors.ate_mean, errors.re_mean
 
 
+@one_line_errors()
 def main() -> None:
     """Train what is missing, measure, write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--dataset", type=Path, action="append", required=True, help="to train and to measure on")
     parser.add_argument("--cache", type=Path, required=True, help="the teacher's poses; made where missing")
     parser.add_argument("--config", default="study", help="budget and objective")
@@ -229,20 +230,16 @@ def by_network(rows: Sequence[StudyRow]) -> dict[str, list[StudyRow]]:
 def table(rows: Sequence[StudyRow], width: float) -> str:
     """Markdown rows: cost and errors of each network."""
     cost = {summary.name: summary for summary in describe(width=width)}
-    lines = [
-        f"| network | field (px) | parameters | multiply-adds | CPU s | {' | '.join(FIELDS.values())} |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ["network", "field (px)", "parameters", "multiply-adds", "CPU s", *FIELDS.values()]
+    cells = []
     for name, runs in by_network(rows).items():
         summary = cost[name]
         work = f"{summary.multiply_adds / 1e6:.0f} M" if summary.multiply_adds else "-"
         figures = [spread([getattr(row, field) for row in runs]) for field in FIELDS]
         seconds = np.median([row.cpu_seconds for row in runs])
-        lines.append(
-            f"| `{name}` | {summary.receptive_field} | {summary.parameters:,} | {work} | {seconds:.0f} | "
-            f"{' | '.join(figures)} |"
-        )
-    return "\n".join(lines)
+        size = f"{summary.receptive_field}", f"{summary.parameters:,}"
+        cells.append([f"`{name}`", *size, work, f"{seconds:.0f}", *figures])
+    return markdown(head, cells)
 
 
 def spread(values: Sequence[float]) -> str:
@@ -273,11 +270,11 @@ def _wider(runs: dict[str, list[StudyRow]]) -> list[str]:
 def differences(rows: Sequence[StudyRow]) -> str:
     """Each wider network against the plain one."""
     runs = by_network(rows)
-    lines = [f"| pair | {' | '.join(FIELDS.values())} |", "|---|---|---|---|---|"]
+    cells = []
     for name in _wider(runs):
-        cells = ["{:.2f} ({:.2f} to {:.2f})".format(*ratio_interval(runs[PLAIN], runs[name], f)) for f in FIELDS]
-        lines.append(f"| `{name}` / `{PLAIN}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        ratios = ["{:.2f} ({:.2f} to {:.2f})".format(*ratio_interval(runs[PLAIN], runs[name], f)) for f in FIELDS]
+        cells.append([f"`{name}` / `{PLAIN}`", *ratios])
+    return markdown(["pair", *FIELDS.values()], cells)
 
 
 def conclusion(rows: Sequence[StudyRow]) -> str:

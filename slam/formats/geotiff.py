@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.runtime.errors import RunError
-from slam.runtime.imports import import_rasterio
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
 
 
@@ -40,7 +40,7 @@ def write_geotiff(
     Raises:
         SlamError: rasterio is not installed, or (`RunError`) the file cannot be written.
     """
-    rasterio = import_rasterio()
+    (rasterio,) = import_extra("geotiff")
     count, height, width = bands.shape
     is_height = np.issubdtype(bands.dtype, np.floating)
     profile: dict[str, Any] = {

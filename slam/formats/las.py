@@ -9,7 +9,7 @@ import numpy as np
 
 from slam.formats.ply import Ply
 from slam.runtime.errors import RunError
-from slam.runtime.imports import import_laspy
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
 
 _STEP = 1e-4  # coordinates are integers of this unit: 214 km to either side
@@ -23,7 +23,7 @@ def write_las(path: Path, cloud: Ply) -> None:
     Raises:
         SlamError: laspy is not installed, or (`RunError`) the file cannot be written.
     """
-    laspy = import_laspy()
+    _, laspy = import_extra("las")
     points, colours = cloud.points, cloud.colours_or_grey
     header = laspy.LasHeader(point_format=_RGB_POINTS, version="1.2")
     header.scales = np.full(3, _STEP)

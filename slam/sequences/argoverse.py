@@ -17,7 +17,7 @@ from slam.formats.trajectory import nearest_pairs
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import SequenceError
-from slam.runtime.imports import import_feather
+from slam.runtime.imports import import_extra
 from slam.sequences.camera_file import own_camera
 from slam.sequences.images import ImageFiles
 from slam.sequences.loader import Asked, Loader, Opener
@@ -82,7 +82,7 @@ def _stamp(path: Path) -> float:
 
 def _read(path: Path) -> Table:
     """A feather file by columns."""
-    feather = import_feather()
+    (feather,) = import_extra("argoverse")
     try:
         table: Table = feather.read_table(path).to_pydict()
     except (OSError, ValueError, MemoryError) as error:  # pyarrow's own errors, also of a size announced but not there

@@ -25,9 +25,7 @@ from slam.runtime.storage.record import Missing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
-derived_metrics, page, plan, work = (
-    importlib.import_module(f"benchmarking.{name}") for name in ("derived_metrics", "page", "plan", "work")
-)
+page, plan, work = (importlib.import_module(f"benchmarking.{name}") for name in ("page", "plan", "work"))
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
@@ -123,12 +121,12 @@ def test_errors_relative_to_path_and_network(tmp_path: Path) -> None:
     run = metrics(ate=0.9)
     slower = metrics(ate=3.6).trajectories.network
     run = run.changed(trajectories=run.trajectories.model_copy(update={"network": slower}))
-    derived = derived_metrics.derive_metrics(tmp_path, run)
+    derived = work.derive_metrics(tmp_path, run)
     shares = derived.network_percent, derived.optimised_percent, derived.of_network
     assert shares == pytest.approx((4.0, 1.0, 0.25))
     assert derived.false_loops == Missing("the sequence has no true poses")
     run = run.changed(sequence=SequenceMetrics(length_m=Missing("no truth")))
-    assert derived_metrics.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
+    assert work.derive_metrics(tmp_path, run).optimised_percent == Missing("no truth")
 
 
 @pytest.mark.parametrize(
@@ -143,10 +141,10 @@ def test_true_and_false_loops(tmp_path: Path, moved_m: float, turned_deg: float,
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "loops.json").write_text(json.dumps({"accepted": loops}))
     RunFolder(tmp_path).write_trajectory("reference", Trajectory(np.arange(3.0), T_world_camera))
-    derived = derived_metrics.derive_metrics(tmp_path, metrics())
+    derived = work.derive_metrics(tmp_path, metrics())
     assert (derived.true_loops, derived.false_loops) == (1 - false, false)
     in_heights = metrics().changed(scale=ScaleMetrics(mode="none", unit="camera heights", value=1.0))
-    assert isinstance(derived_metrics.derive_metrics(tmp_path, in_heights).true_loops, Missing)
+    assert isinstance(work.derive_metrics(tmp_path, in_heights).true_loops, Missing)
 
 
 def test_a_leak_is_reported(job: Any) -> None:

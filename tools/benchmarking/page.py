@@ -1,4 +1,4 @@
-"""Tables of results in Markdown, and the page that holds them."""
+"""Tables of results in Markdown, the picture of all drives, and the page that holds them."""
 
 from __future__ import annotations
 
@@ -7,59 +7,28 @@ import os
 import platform
 import re
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from statistics import fmean
 
-from benchmarking.cells import (
-    Cell,
-    average,
-    average_among,
-    configuration,
-    drive,
-    grouped,
-    mean,
-    over_seeds,
-    table,
-    values,
-    weights,
-)
-from benchmarking.derived_metrics import FALSE_DEG, FALSE_M
-from benchmarking.metric_definitions import (
-    ATE_6,
-    ATE_7,
-    COMMAND,
-    COVERAGE,
-    CPU,
-    ERRORS,
-    FALSE_LOOPS,
-    FRAMES,
-    FUSION,
-    LENGTH,
-    LOAD,
-    LOOPS,
-    MAP_ERRORS,
-    MAP_SIZES,
-    MEMORY,
-    MESH,
-    OF_NETWORK,
-    PERCENT,
-    R_REL,
-    RATE,
-    SCALE,
-    TIME,
-    TRIANGLES,
-    MetricDefinition,
-    stage_seconds,
-    stages,
-)
-from benchmarking.picture import drawable
+import numpy as np
+from benchmarking import metrics as m
+from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, over_seeds, table, values, weights
 from benchmarking.plan import EVERYTHING, GROWTH
-from benchmarking.summary import summary_table
-from benchmarking.work import JobResult
+from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
 
 from slam.results.error_columns import DASH
+from slam.results.folder import RunFolder
+from slam.results.report.plots import draw_trajectories, trajectories_of
+from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing, known
 
 PICTURE = "images/trajectories.png"  # beside the page
+SIDE_IN = 1.9
+DPI = 90
+COLOURS = 48  # a third of the bytes of a full palette, without a visible difference
 PAGE = """# Benchmarks
 
 Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
@@ -80,8 +49,8 @@ def accuracy_tables(results: Sequence[JobResult]) -> str:
 
 def error_tables(results: Sequence[JobResult], picture: str = "") -> str:
     """One row for each kind of drive, then one for each sequence and weights."""
-    definitions = (FRAMES, LENGTH, *ERRORS, PERCENT, OF_NETWORK, R_REL, SCALE)
-    definitions += (LOOPS, FALSE_LOOPS, COVERAGE, RATE, MEMORY)
+    definitions = (m.FRAMES, m.LENGTH, *m.ERRORS, m.PERCENT, m.OF_NETWORK, m.R_REL, m.SCALE)
+    definitions += (m.LOOPS, m.FALSE_LOOPS, m.COVERAGE, m.RATE, m.MEMORY)
     columns = {q.title: over_seeds(q) for q in definitions}
     return f"""Every kind of drive: median and, in brackets, the worst run. ATE is that of the optimised
 trajectory, 7-dof; a loop is false that is more than {FALSE_M:g} m or {FALSE_DEG:g} degrees off the truth.
@@ -95,18 +64,18 @@ Every drive:
 
 def ablation_tables(results: Sequence[JobResult]) -> str:
     """Ablation: errors relative to those of everything on, then the errors themselves."""
-    errors, others = (ATE_7, ATE_6, R_REL), (LOOPS, COVERAGE, TRIANGLES, MEMORY)
+    errors, others = (m.ATE_7, m.ATE_6, m.R_REL), (m.LOOPS, m.COVERAGE, m.TRIANGLES, m.MEMORY)
     columns = {f"{q.title}: ratio (worst)": against_everything(q, results) for q in errors}
-    columns |= {q.title: average(q) for q in others}
+    columns |= {q.title: m.average(q) for q in others}
     drives = grouped(results, drive, weights)
-    by_drive = {", ".join(label): average_among(ATE_7, group) for label, group in drives.items()}
-    rows = {"configuration": configuration}
+    by_drive = {", ".join(label): m.average_among(m.ATE_7, group) for label, group in drives.items()}
+    rows = {"configuration": m.configuration}
     return f"""Errors over those of the same sequence, weights and seed with everything on, geometric mean and worst:
 above 1, the part helps. The rest are means.
 
 {table(rows, columns, results)}
 
-{ATE_7.title}, metres:
+{m.ATE_7.title}, metres:
 
 {table(rows, by_drive, results)}{notes(results, (*errors, *others))}"""
 
@@ -115,10 +84,11 @@ def speed_tables(results: Sequence[JobResult]) -> str:
     """Frames a second, shares of the stages, growth with the number of frames."""
     growth = [o for o in results if o.job.configuration.name == GROWTH.name]
     whole = [o for o in results if o not in growth]
-    rows = {"sequence": drive, "weights": weights, "configuration": configuration}
-    costs, grown = (FRAMES, RATE, TIME, CPU, COMMAND, MEMORY, LOAD), (TIME, CPU, MEMORY, LOOPS, LOAD)
-    shares = {stage: stage_share(stage) for stage in stages(whole)} | {"rest": rest_share}
-    by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in stages(growth)}
+    rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
+    costs = (m.FRAMES, m.RATE, m.TIME, m.CPU, m.COMMAND, m.MEMORY, m.LOAD)
+    grown = (m.TIME, m.CPU, m.MEMORY, m.LOOPS, m.LOAD)
+    shares = {stage: stage_share(stage) for stage in m.stages(whole)} | {"rest": rest_share}
+    by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in m.stages(growth)}
     return f"""Everything on. Frames a second count all from the first image to the evaluation; the whole command also
 start and report.
 
@@ -135,19 +105,19 @@ Growth with the number of frames, without fusion; stages in ms / frame:
 
 def maps_tables(results: Sequence[JobResult]) -> str:
     """Errors of the map with everything on and with one part turned off; sizes and cost."""
-    rows = {"sequence": drive, "weights": weights, "configuration": configuration}
+    rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
     whole = [o for o in results if o.job.configuration.name == EVERYTHING.name]
-    costs = (*MAP_SIZES, FUSION, MESH, MEMORY)
+    costs = (*m.MAP_SIZES, m.FUSION, m.MESH, m.MEMORY)
     sizes = table({"sequence": drive, "weights": weights}, {q.title: over_seeds(q) for q in costs}, whole)
     return f"""Errors of the map after one rigid motion, by the best truth of each drive
 ([metrics](metrics.md#error-of-the-map)). *Double walls* is the share of the mesh's area with a parallel surface 0.3 to
 2 m before it.
 
-{table(rows, {q.title: over_seeds(q) for q in MAP_ERRORS}, results)}
+{table(rows, {q.title: over_seeds(q) for q in m.MAP_ERRORS}, results)}
 
 Sizes and cost:
 
-{sizes}{notes(results, (*MAP_ERRORS, *costs))}"""
+{sizes}{notes(results, (*m.MAP_ERRORS, *costs))}"""
 
 
 TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
@@ -177,18 +147,18 @@ def against_everything(definition: MetricDefinition, results: Sequence[JobResult
 
 def stage_share(stage: str) -> Cell:
     """Per cent of the time of a run."""
-    return lambda group: mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
+    return lambda group: m.mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
 
 
 def rest_share(group: Sequence[JobResult]) -> str:
     """Per cent outside of every stage."""
-    shares = [100 - 100 * sum(_stage(o, s) for s in stages([o])) / _seconds(o) for o in group if not o.reason]
-    return mean(shares, 1)
+    shares = [100 - 100 * sum(_stage(o, s) for s in m.stages([o])) / _seconds(o) for o in group if not o.reason]
+    return m.mean(shares, 1)
 
 
 def stage_ms(stage: str) -> Cell:
     """Milliseconds a frame."""
-    return lambda group: mean(
+    return lambda group: m.mean(
         [1e3 * _stage(o, stage) / frames for o in group if (frames := known(o.metrics.sequence.frames))], 2
     )
 
@@ -233,8 +203,80 @@ def with_section(page: str, new: str) -> str:
 
 
 def _stage(o: JobResult, stage: str) -> float:
-    return known(stage_seconds(o, stage)) or 0.0
+    return known(m.stage_seconds(o, stage)) or 0.0
 
 
 def _seconds(o: JobResult) -> float:
     return known(o.metrics.timing.seconds_total) or math.nan
+
+
+def summary_table(results: Sequence[JobResult]) -> str:
+    """One row for each kind of drive and weights; every number is over all of its runs."""
+    columns: dict[str, Cell] = {
+        "runs": lambda group: str(len(group)),
+        "failed": lambda group: str(sum(bool(o.reason) for o in group)),
+        "ATE, % of path: median (worst)": m.middle_and_extreme(m.PERCENT, max),
+        "the network's": m.middle_and_extreme(m.NETWORK_PERCENT, max),
+        "over the network's": m.middle_and_extreme(m.OF_NETWORK, max),
+        "over the clean drive's": against_clean(results),
+        "drives with a true loop": found,
+        "false loops": lambda group: f"{sum(values(group, m.FALSE_LOOPS)):.0f}",
+        "frames / s": m.middle_and_extreme(m.RATE, min),
+        "CPU ms / frame": m.middle_and_extreme(m.CPU, max),
+        "peak RSS (MiB)": m.middle_and_extreme(m.MEMORY, max),
+    }
+    return table({"drives": kind, "weights": weights}, columns, results)
+
+
+def kind(o: JobResult) -> str:
+    """Kind of the drive."""
+    return o.job.drive.kind
+
+
+def found(group: Sequence[JobResult]) -> str:
+    """Number of runs with at least one true accepted loop."""
+    return f"{sum(count > 0 for count in values(group, m.TRUE_LOOPS))} of {len(group)}"
+
+
+def against_clean(results: Sequence[JobResult]) -> Cell:
+    """Optimised 7-dof errors over those of the same drives without hazards."""
+
+    def key(name: str, o: JobResult) -> tuple[str, str, str, int]:
+        return name, o.job.weights, o.job.configuration.name, o.job.seed
+
+    by_run = {key(o.job.drive.name, o): o for o in results}
+
+    def cell(group: Sequence[JobResult]) -> str:
+        twins = [(o, by_run[key(o.job.drive.clean, o)]) for o in group if key(o.job.drive.clean, o) in by_run]
+        pairs = [(values([o], m.ATE_7), values([twin], m.ATE_7)) for o, twin in twins]
+        return m.spread([ate / clean for [ate], [clean] in (p for p in pairs if all(p)) if clean > 0], 2, max)
+
+    return cell
+
+
+def drawable(results: Sequence[JobResult]) -> list[JobResult]:
+    """The first run of every drive that ended well."""
+    return [runs[0] for runs in grouped([o for o in results if not o.reason], drive).values()]
+
+
+def draw(results: Sequence[JobResult], path: Path) -> None:
+    """Network, odometry and optimised trajectory over the truth, a panel a drive."""
+    chosen = drawable(results)
+    columns = math.ceil(math.sqrt(1.6 * len(chosen)))
+    rows = math.ceil(len(chosen) / columns)
+    figure = Figure(figsize=(columns * SIDE_IN, rows * SIDE_IN + 0.5), dpi=DPI, layout="constrained")
+    panels = figure.subfigures(rows, columns, squeeze=False).flat
+    for o, panel in zip(chosen, panels):
+        [axes] = draw_trajectories(panel, trajectories_of(RunFolder.open(o.job.place / "run")), "")
+        legend = axes.get_legend()
+        if legend is not None:
+            legend.remove()
+        axes.set(xlabel="", ylabel="")
+        axes.set_title(drive(o), fontsize=8)
+        axes.tick_params(labelsize=6)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(columns, len(labels)), fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    light = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(COLOURS)
+    write_atomically(path, lambda file: light.save(file, format="png", optimize=True))

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -16,20 +15,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from benchmarking import plan
-from benchmarking.derived_metrics import DerivedMetrics, derive_metrics
 from benchmarking.plan import BenchmarkSequence, Job
 
 from slam.commands.batch import cluster
 from slam.commands.batch.cluster import Spread
-from slam.results.metrics import Metrics
-from slam.runtime.run_files import GRAPH, MAP_CLOUD, MAP_MESH, METRICS, PLACES
+from slam.commands.batch.execution import why_ended
+from slam.geometry.se3 import FloatArray, invert, rotation_angle
+from slam.results.folder import RunFolder
+from slam.results.metrics import LoopsFile, Metrics
+from slam.runtime.run_files import GRAPH, LOOPS, MAP_CLOUD, MAP_MESH, METRICS, PLACES
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import MISSING, Missing
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("erfsfm", "slam", "configs")  # folders that results depend on
 BULKY = (MAP_MESH, MAP_CLOUD, PLACES, GRAPH)  # removed after a run: no table reads them
+FALSE_M, FALSE_DEG = 2.0, 5.0  # a loop with a larger error is false
+
+
+@dataclass(frozen=True)
+class DerivedMetrics:
+    """Relative errors, and the number of true and of false accepted loops.
+
+    ``*_percent`` are 7-dof ATE in per cent of the true path, ``of_network`` the optimised over the network's,
+    ``fusion_ms`` the time of fusion for a fused keyframe, without the refinement of its depth.
+    """
+
+    network_percent: float | Missing
+    optimised_percent: float | Missing
+    of_network: float | Missing
+    fusion_ms: float | Missing
+    true_loops: int | Missing
+    false_loops: int | Missing
 
 
 @dataclass(frozen=True)
@@ -76,7 +95,7 @@ def perform(job: Job) -> None:
     else:
         start = time.perf_counter()
         finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
-        record |= {"seconds": time.perf_counter() - start, "reason": _reason(finished)}
+        record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
         for name in BULKY:
             (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
@@ -105,15 +124,6 @@ def _read_result(job: Job, record: Mapping[str, Any]) -> JobResult:
 def _slam(*arguments: str) -> list[str]:
     """``erfsfm-slam`` of this interpreter, whatever the working directory holds."""
     return [sys.executable, "-P", "-m", "slam", *arguments]
-
-
-def _reason(finished: subprocess.CompletedProcess[str]) -> str:
-    """Why a process failed, in one line; empty where it did not."""
-    if finished.returncode == 0:
-        return ""
-    if finished.returncode < 0:
-        return f"killed by {signal.Signals(-finished.returncode).name}"
-    return (finished.stderr.strip().splitlines() or [f"exit code {finished.returncode}"])[-1]
 
 
 def fingerprint(weights: str) -> str:
@@ -169,3 +179,48 @@ def _read(path: Path) -> dict[str, Any]:
     """A JSON object; an empty one where there is no file."""
     tree: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
     return tree
+
+
+def derive_metrics(folder: Path, metrics: Metrics) -> DerivedMetrics:
+    """What follows from the metrics of a run and its files."""
+    length, trajectories, stages = metrics.sequence.length_m, metrics.trajectories, metrics.timing.stages
+    network, optimised = trajectories.network.align.dof7.ate_rmse_m, trajectories.optimised.align.dof7.ate_rmse_m
+    fusion = stages if isinstance(stages, Missing) else stages.get("map", Missing("no map"))
+    return DerivedMetrics(
+        _ratio(network, length, 100.0),
+        _ratio(optimised, length, 100.0),
+        _ratio(optimised, network, 1.0),
+        _ratio(fusion, metrics.map.frames_fused, 1e3),
+        *_loops(folder, metrics),
+    )
+
+
+def _ratio(part: float | Missing, whole: float | Missing, unit: float) -> float | Missing:
+    if isinstance(part, Missing):
+        return part
+    if isinstance(whole, Missing):
+        return whole
+    return unit * part / whole if whole else Missing("nothing to compare with")
+
+
+def _loops(folder: Path, metrics: Metrics) -> tuple[int | Missing, int | Missing]:
+    """Number of true and of false loops."""
+    reference, number = RunFolder.open(folder).trajectory("reference"), metrics.loops.accepted
+    if reference is None:
+        number = Missing("the sequence has no true poses")
+    elif not metrics.is_metric:
+        number = Missing(f"loops in {metrics.unit} cannot be compared with metres")
+    if reference is None or isinstance(number, Missing):
+        return number, number
+    accepted = list(LoopsFile.read(folder / LOOPS).accepted)
+    false = sum(
+        is_false(np.array(loop.T_from_to), *reference.T_world_camera[[loop.from_, loop.to]]) for loop in accepted
+    )
+    return len(accepted) - false, false
+
+
+def is_false(T_from_to: FloatArray, T_world_from: FloatArray, T_world_to: FloatArray) -> bool:
+    """Whether a measured relative pose, metres, is too far off the true one."""
+    off = invert(invert(T_world_from) @ T_world_to) @ T_from_to
+    far = np.linalg.norm(off[:3, 3]) > FALSE_M
+    return bool(far or rotation_angle(off[:3, :3]) > np.deg2rad(FALSE_DEG))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,9 +12,7 @@ from slam.commands.options import Config, Device, Overrides, Seed
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.progress import progress_bar
 from slam.runtime.storage.files import from_anywhere
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from slam.runtime.terminal import print_table
 
 verbs = typer.Typer()
 
@@ -65,12 +62,12 @@ def batch(
     with dask_workers(min(workers, len(planned)), scheduler) as spread, progress_bar() as progress:
         outcomes = run_drives(planned, output, Limits(each, memory), spread, progress)
     write_summary(output, outcomes)
-    _print(summary_table(outcomes))
+    print_table(summary_table(outcomes))
     kept = sum(outcome.status == "kept" for outcome in outcomes)
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / PAGE}, {output / CSV}")
     if failed:
-        _print(failure_table(outcomes))
+        print_table(failure_table(outcomes))
         first = next(outcome for outcome in outcomes if outcome.status == "failed")
         rest = "; the others are whole" if failed < len(outcomes) else ""
         raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")
@@ -80,10 +77,3 @@ def _seen_from_here(override: str) -> str:
     """The path of ``depth.source`` holds in the folder of a drive, too."""
     kind, colon, path = override.partition(":")
     return f"{kind}:{from_anywhere(path)}" if kind.startswith("depth.source=") and colon else override
-
-
-def _print(table: Table) -> None:
-    from rich.console import Console
-
-    on_terminal = sys.stdout is not None and sys.stdout.isatty()
-    Console(width=None if on_terminal else 200).print(table)

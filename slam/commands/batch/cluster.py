@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from slam.runtime.errors import SlamError
-from slam.runtime.imports import import_dask
+from slam.runtime.imports import import_extra
 
 Spread = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
@@ -33,7 +33,7 @@ def workers(count: int, scheduler: str | None = None, by_value: Sequence[ModuleT
     if count == 1 and scheduler is None:
         yield _one_after_another
         return
-    cloudpickle, distributed = import_dask()
+    cloudpickle, distributed = import_extra("cluster")
     for module in by_value:
         cloudpickle.register_pickle_by_value(module)
     try:

@@ -81,7 +81,8 @@ def run_drive(drive: Drive, output: Path, limits: Limits) -> Outcome:
             process.wait()
     if exceeded:
         return Outcome(drive, folder, "failed", exceeded)
-    reason = _reason(process.returncode, log)
+    said = log.read_text(encoding="utf-8", errors="replace")[-_MOST_STDERR:]
+    reason = why_ended(process.returncode, said)
     if not reason and not _is_whole(folder, arguments):
         reason = "it ended well and left no whole run: leave out options that only ask something"
     return Outcome(drive, folder, "failed" if reason else "whole", reason)
@@ -123,12 +124,11 @@ def _is_whole(folder: Path, arguments: list[str]) -> bool:
     return metrics.status == "ok" and metrics.provenance.command == shlex.join(["erfsfm-slam", *arguments])
 
 
-def _reason(code: int, log: Path) -> str:
-    """Why a process failed, in one line; empty where it did not."""
+def why_ended(code: int, stderr: str) -> str:
+    """Why a process of ``erfsfm-slam`` failed, in one line; empty where it did not."""
     if code == 0:
         return ""
     if code < 0:
         return f"killed by {signal.Signals(-code).name}"
-    text = log.read_text(encoding="utf-8", errors="replace")[-_MOST_STDERR:]
-    lines = [line.removeprefix("erfsfm-slam: ").strip() for line in text.splitlines() if line.strip()]
+    lines = [line.removeprefix("erfsfm-slam: ").strip() for line in stderr.splitlines() if line.strip()]
     return lines[-1] if lines else f"exit code {code}"

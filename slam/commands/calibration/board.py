@@ -49,11 +49,6 @@ class Board:
         row, column = np.mgrid[: self.rows, : self.columns]
         return self.square_m * np.stack([column.ravel(), row.ravel(), np.zeros(row.size)], axis=1)
 
-    @property
-    def size_m(self) -> float:
-        """The diagonal of the corners."""
-        return self.square_m * float(np.hypot(self.columns - 1, self.rows - 1))
-
     def charuco(self) -> Any:
         """OpenCV's ChArUco board.
 

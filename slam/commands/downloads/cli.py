@@ -32,20 +32,20 @@ def download(
 
     Example: erfsfm-slam download kitti-odometry --sequence 09 --to KITTI
     """
-    from slam.commands.downloads import kitti, licences, tum
+    from slam.commands.downloads import kitti, tum
 
-    is_kitti = data_set == "kitti-odometry"
-    typer.echo(licences.KITTI if is_kitti else licences.TUM)
+    source = kitti if data_set == "kitti-odometry" else tum
+    typer.echo(source.LICENCE)
     if not accept_licence:
         if not sys.stdin.isatty():
             raise DownloadError("the licence above is to be accepted: give --accept-licence")
         if not typer.confirm("Do you accept it?"):
             raise DownloadError("the licence was not accepted: nothing is downloaded")
+    server = mirror or source.SERVER
     with progress_bar() as progress:
-        if is_kitti:
-            server, is_grey = mirror or kitti.SERVER, camera == "grey"
-            count = kitti.download_kitti(sequence, to, server, is_grey, lidar, progress)
+        if source is kitti:
+            count = kitti.download_kitti(sequence, to, server, camera == "grey", lidar, progress)
             typer.echo(f"{count} files in {to}: erfsfm-slam run --dataset {to} --sequence {sequence}")
         else:
-            folder = tum.download_tum(sequence, to, mirror or tum.SERVER, progress)
+            folder = tum.download_tum(sequence, to, server, progress)
             typer.echo(f"{folder}: erfsfm-slam run --dataset {folder}")

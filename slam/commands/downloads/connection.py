@@ -1,17 +1,21 @@
-"""Requests for parts of a file on a server, which must stay the same file."""
+"""Requests for parts of a file on a server, which must stay the same file, and what all downloads check."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
 
 from slam.runtime.errors import DownloadError
-from slam.runtime.imports import import_remotezip
+from slam.runtime.imports import import_extra
 
-TIMEOUT_S = 30.0
-ATTEMPTS = 3
+CHUNK = 1 << 20
+_TIMEOUT_S = 30.0
+_ATTEMPTS = 3
 
+T = TypeVar("T")
 Identity = tuple[str | None, str | None, str]  # ETag, Last-Modified, size
 
 
@@ -36,7 +40,7 @@ class Connection:
         Raises:
             DownloadError: remotezip is not installed.
         """
-        _, requests, _ = import_remotezip()
+        _, requests, _ = import_extra("download")
         self.url = url
         self._session: Any = requests.Session()
         self._identity: Identity | None = None
@@ -51,7 +55,7 @@ class Connection:
         """
         wanted = f"bytes={first}-{'' if last is None else last}" if first >= 0 else f"bytes={first}"
         headers = {"Range": wanted, "Accept-Encoding": "identity"}
-        response = self._session.get(self.url, headers=headers, stream=True, timeout=TIMEOUT_S)
+        response = self._session.get(self.url, headers=headers, stream=True, timeout=_TIMEOUT_S)
         response.raise_for_status()
         given = response.headers.get("Content-Range")
         if given is None:
@@ -81,7 +85,7 @@ def connection_errors(url: str, what: str) -> Iterator[None]:
         BrokenError: with what to do.
         DownloadError: the address is none of a server.
     """
-    remotezip, requests, urllib3 = import_remotezip()
+    remotezip, requests, urllib3 = import_extra("download")
     exceptions = requests.exceptions
     try:
         yield
@@ -89,6 +93,29 @@ def connection_errors(url: str, what: str) -> Iterator[None]:
         raise DownloadError(f"{url} is no address: give --mirror as https://HOST/FOLDER") from error
     except (OSError, EOFError, remotezip.RemoteZipError, urllib3.HTTPError) as error:
         raise BrokenError(f"{url}: {what} ({_cause(error)}); run the same command again to go on") from error
+
+
+def retried(attempt: Callable[[], T]) -> T:
+    """The result of an attempt; after a `BrokenError` there are two more."""
+    for _ in range(_ATTEMPTS - 1):
+        with suppress(BrokenError):
+            return attempt()
+    return attempt()
+
+
+def require_space(folder: Path, size: int) -> None:
+    """Refuse before anything is fetched where the disk is too small.
+
+    Args:
+        folder: where files are written; it is there.
+        size: bytes that are still missing.
+
+    Raises:
+        DownloadError: with both sizes.
+    """
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise DownloadError(f"{folder} has {free / 1e9:.1f} GB free, {size / 1e9:.1f} GB are needed: give another --to")
 
 
 def _cause(error: BaseException) -> str:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
-import shutil
-import zipfile
 from pathlib import Path
 
+from slam.commands.downloads.connection import require_space
 from slam.commands.downloads.zip_members import ZipMembers
 from slam.runtime.errors import DownloadError
 from slam.runtime.progress import Progress
 
+LICENCE = """KITTI odometry: A. Geiger, P. Lenz, C. Stiller, R. Urtasun; Karlsruhe Institute of Technology and Toyota
+Technological Institute at Chicago. Licence: Creative Commons Attribution-NonCommercial-ShareAlike 3.0
+(https://creativecommons.org/licenses/by-nc-sa/3.0/): name the authors, not for commercial purposes, share what
+you derive under the same licence. Terms: https://www.cvlibs.net/datasets/kitti/
+Cite: A. Geiger, P. Lenz, R. Urtasun: Are we ready for Autonomous Driving? CVPR 2012."""
 SERVER = "https://s3.eu-central-1.amazonaws.com/avg-kitti"
 _WITH_POSES = 11  # sequences 00 to 10
 _SEQUENCES = 22
@@ -54,7 +58,9 @@ def download_kitti(
     for name, prefixes in wanted:
         source = ZipMembers(f"{server.rstrip('/')}/{name}")
         parts.append((source, source.matching(*prefixes)))
-    _require_space(folder, [member for _, members in parts for member in members])
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = (m for _, members in parts for m in members if not (folder / m.filename).is_file())
+    require_space(folder, sum(member.file_size for member in missing))
     total, done = sum(len(members) for _, members in parts), 0
     for source, members in parts:
         for member in members:
@@ -62,14 +68,3 @@ def download_kitti(
             done += 1
             progress("files", done, total)
     return total
-
-
-def _require_space(folder: Path, members: list[zipfile.ZipInfo]) -> None:
-    """Refuse before anything is fetched where the disk is too small for all."""
-    missing = sum(member.file_size for member in members if not (folder / member.filename).is_file())
-    folder.mkdir(parents=True, exist_ok=True)
-    free = shutil.disk_usage(folder).free
-    if missing > free:
-        raise DownloadError(
-            f"{folder} has {free / 1e9:.1f} GB free, {missing / 1e9:.1f} GB are needed: give another --to"
-        )

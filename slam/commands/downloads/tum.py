@@ -10,13 +10,16 @@ import tarfile
 import zlib
 from pathlib import Path
 
-from slam.commands.downloads.connection import ATTEMPTS, BrokenError, Connection, connection_errors
+from slam.commands.downloads.connection import CHUNK, BrokenError, Connection, connection_errors, require_space, retried
 from slam.runtime.errors import DownloadError
 from slam.runtime.progress import Progress
 
+LICENCE = """TUM RGB-D: J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers; Technical University of Munich.
+Licence: Creative Commons Attribution 4.0 (https://creativecommons.org/licenses/by/4.0/): name the authors.
+Terms: https://cvg.cit.tum.de/data/datasets/rgbd-dataset
+Cite: J. Sturm et al.: A Benchmark for the Evaluation of RGB-D SLAM Systems. IROS 2012."""
 SERVER = "https://cvg.cit.tum.de/rgbd/dataset"
 _NAME = re.compile(r"(?:rgbd_dataset_)?(?P<name>freiburg(?P<camera>[123])_\w+)")
-_CHUNK = 1 << 20
 
 
 def download_tum(sequence: str, folder: Path, server: str, progress: Progress) -> Path:
@@ -44,13 +47,7 @@ def download_tum(sequence: str, folder: Path, server: str, progress: Progress) -
     folder.mkdir(parents=True, exist_ok=True)
     part = folder / f"{name}.tgz.part"
     url = f"{server.rstrip('/')}/freiburg{match['camera']}/{name}.tgz"
-    for attempt in range(1, ATTEMPTS + 1):
-        try:
-            _fetch(url, part, progress)
-            break
-        except BrokenError:
-            if attempt == ATTEMPTS:
-                raise
+    retried(lambda: _fetch(url, part, progress))
     _unpack(part, name, whole, url)
     return whole
 
@@ -67,12 +64,10 @@ def _fetch(url: str, part: Path, progress: Progress) -> None:
         part.unlink(missing_ok=True)
         known.write_text(json.dumps(identity), encoding="utf-8")
     there = part.stat().st_size if part.is_file() else 0
-    free = shutil.disk_usage(part.parent).free
-    if size - there > free:
-        raise DownloadError(f"{part.parent} has {free / 1e9:.1f} GB free, {(size - there) / 1e9:.1f} GB are needed")
+    require_space(part.parent, size - there)
     if there < size:
         with connection_errors(url, "broke off"), connection.get(there) as response, part.open("ab") as file:
-            for chunk in response.iter_content(_CHUNK):
+            for chunk in response.iter_content(CHUNK):
                 file.write(chunk)
                 progress("bytes", file.tell(), size)
     if part.stat().st_size != size:
@@ -88,7 +83,7 @@ def _unpack(part: Path, name: str, whole: Path, url: str) -> None:
         with gzip.open(part) as file:
             with tarfile.open(fileobj=file, mode="r:") as archive:
                 archive.extractall(folder, filter="data")
-            while file.read(_CHUNK):  # to the end, where gzip compares the CRC
+            while file.read(CHUNK):  # to the end, where gzip compares the CRC
                 pass
         if not (folder / name / "rgb.txt").is_file():
             raise tarfile.TarError(f"it has no {name}/rgb.txt")

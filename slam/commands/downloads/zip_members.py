@@ -5,16 +5,13 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from slam.commands.downloads.connection import ATTEMPTS, BrokenError, Connection, connection_errors
+from slam.commands.downloads.connection import CHUNK, BrokenError, Connection, connection_errors, retried
 from slam.runtime.errors import DownloadError
-from slam.runtime.imports import import_remotezip
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
-
-_CHUNK = 1 << 20
 
 
 class ZipMembers:
@@ -28,7 +25,7 @@ class ZipMembers:
         """
         self.url = url
         self._connection = Connection(url)
-        self._archive: Any = self._opened()
+        self._archive: Any = retried(self._open)
 
     def matching(self, *prefixes: str) -> list[zipfile.ZipInfo]:
         """Files whose names begin with one of the prefixes, in the order in which they are stored.
@@ -56,36 +53,28 @@ class ZipMembers:
         if _is_whole(path, member):
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        for attempt in range(1, ATTEMPTS + 1):
-            try:
-                write_atomically(path, lambda partial: self._copy(member, partial), DownloadError, sync=False)
-                return
-            except (zipfile.BadZipFile, zlib.error) as error:  # the CRC, which zipfile compares
-                if attempt == ATTEMPTS:
-                    raise DownloadError(f"{self.url}: {member.filename} arrives damaged ({error})") from error
-            except BrokenError:
-                if attempt == ATTEMPTS:
-                    raise
-            self._archive = self._opened()
+        retried(lambda: self._fetch(member, path))
 
-    def _copy(self, member: zipfile.ZipInfo, path: Path) -> None:
+    def _fetch(self, member: zipfile.ZipInfo, path: Path) -> None:
+        archive, self._archive = self._archive or self._open(), None  # after a failure it is opened again
+        try:
+            write_atomically(path, lambda partial: self._copy(archive, member, partial), DownloadError, sync=False)
+        except (zipfile.BadZipFile, zlib.error) as error:  # the CRC, which zipfile compares
+            raise BrokenError(f"{self.url}: {member.filename} arrives damaged ({error})") from error
+        self._archive = archive
+
+    def _copy(self, archive: Any, member: zipfile.ZipInfo, path: Path) -> None:
         with path.open("wb") as file:
-            for chunk in self._chunks(member):
+            for chunk in self._chunks(archive, member):
                 file.write(chunk)
 
-    def _chunks(self, member: zipfile.ZipInfo) -> Iterator[bytes]:
-        with connection_errors(self.url, f"{member.filename} broke off"), self._archive.open(member) as source:
-            while chunk := source.read(_CHUNK):
+    def _chunks(self, archive: Any, member: zipfile.ZipInfo) -> Iterator[bytes]:
+        with connection_errors(self.url, f"{member.filename} broke off"), archive.open(member) as source:
+            while chunk := source.read(CHUNK):
                 yield chunk
 
-    def _opened(self) -> Any:
-        for _ in range(ATTEMPTS - 1):
-            with suppress(BrokenError):
-                return self._open()
-        return self._open()
-
     def _open(self) -> Any:
-        remotezip, *_ = import_remotezip()
+        remotezip, *_ = import_extra("download")
         connection, url = self._connection, self.url
 
         class Fetcher:
@@ -114,6 +103,6 @@ def _is_whole(path: Path, member: zipfile.ZipInfo) -> bool:
         return False
     crc = 0
     with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
+        while chunk := file.read(CHUNK):
             crc = zlib.crc32(chunk, crc)
     return crc == member.CRC

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from slam.commands.exports.map_file import has_map, map_file
 from slam.commands.exports.nerfstudio import interpolated, write_scene
 from slam.commands.exports.occupancy import occupancy_grid
 from slam.commands.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
+from slam.commands.exports.parts import PARTS, check_options, check_target
 from slam.commands.exports.raster import height_raster, write_raster
 from slam.commands.exports.surface import prepared
-from slam.commands.exports.target import check_target
+from slam.config.sections import load_stored
 from slam.formats.colmap import write_colmap
 from slam.formats.g2o import check_g2o
 from slam.formats.gltf import write_gltf
@@ -24,20 +27,20 @@ from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry import se3
 from slam.loops.places import Places
+from slam.mapping.submap import Submap, submap_paths
+from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
 from slam.runtime.progress import Progress
-from slam.runtime.run_files import ESTIMATE, GRAPH, PLACES
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import known
 
-Writer = Callable[[Path, Ply], None]
+logger = logging.getLogger(__name__)
 
-_WRITERS: dict[str, dict[str, Writer]] = {
-    "mesh": {".ply": write_ply, ".glb": write_gltf, ".gltf": write_gltf},
-    "cloud": {".ply": write_ply, ".las": write_las, ".laz": write_las},
-}
+_MAPS = {"mesh": MAP_MESH, "cloud": MAP_CLOUD}
+_WRITERS = {".ply": write_ply, ".glb": write_gltf, ".gltf": write_gltf, ".las": write_las, ".laz": write_las}
 
 
 def export(
@@ -72,9 +75,9 @@ def export(
             that are not found, or a file that cannot be written.
     """
     options = options or ExportOptions()
-    options.check(what, up)
+    check_options(what, up, options)
     check_target(folder, what, output)
-    if what in _WRITERS:
+    if what in _MAPS:
         _export_map(folder, what, output, up, options, progress)
     elif what == "trajectory":
         write = write_tum if output.name.endswith((".tum", ".tum.txt")) else write_kitti
@@ -98,17 +101,16 @@ def export(
 def _export_map(
     folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress | None
 ) -> None:
-    writers = _WRITERS[what]
-    write = writers.get(output.suffix.lower())
-    if write is None:
-        known = ", ".join(writers)
-        raise RunError(f"a {what} is written as {known}; got '{output.name}', give a name that ends in one of these")
-    with map_file(folder, what, progress) as source:
+    suffix, suffixes = output.suffix.lower(), PARTS[what].beginnings
+    if suffix not in suffixes:
+        named = ", ".join(suffixes)
+        raise RunError(f"a {what} is written as {named}; got '{output.name}', give a name that ends in one of these")
+    with _map_file(folder, what, progress) as source:
         ply = read_ply(source)
-        if write is write_ply and up == "y-down" and options == ExportOptions():
+        if suffix == ".ply" and up == "y-down" and options == ExportOptions():
             write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
         else:
-            write(output, _rotated(prepared(ply, options), up))
+            _WRITERS[suffix](output, _rotated(prepared(ply, options), up))
 
 
 def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress | None) -> None:
@@ -145,14 +147,33 @@ def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, p
 
 
 def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress | None) -> Ply | None:
-    """The cloud of the map, None where the run has none."""
-    return _map(folder, "cloud", up, options, progress) if has_map(folder, "cloud") else None
+    """The cloud of the map, None where the run has neither it nor submaps of which it can be made."""
+    if not (folder.path / MAP_CLOUD).is_file() and not submap_paths(folder.path / SUBMAPS):
+        return None
+    return _map(folder, "cloud", up, options, progress)
 
 
 def _map(folder: RunFolder, what: str, up: str, options: ExportOptions, progress: Progress | None) -> Ply:
     """The mesh or cloud of the map as the options want it, in the given axes."""
-    with map_file(folder, what, progress) as source:
+    with _map_file(folder, what, progress) as source:
         return _rotated(prepared(read_ply(source), options), up)
+
+
+@contextmanager
+def _map_file(folder: RunFolder, what: str, progress: Progress | None) -> Iterator[Path]:
+    """The ``mesh`` or ``cloud`` as a PLY file, which may be gone afterwards; of a killed run that of its submaps."""
+    paths = submap_paths(folder.path / SUBMAPS)
+    if (folder.path / _MAPS[what]).is_file() or not paths:
+        yield folder.require(_MAPS[what])
+        return
+    logger.warning("%s has no whole map: its %d finished submaps are used", folder.path, len(paths))
+    settings = load_stored(folder.require(CONFIG), "mapping").mapping
+    voxel_size = float(Submap.read(paths[0]).voxel_size)  # which follows the scene where no metres were known
+    surface = MapSurface(paths, settings.in_unit(voxel_size / settings.voxel_size_m), progress)
+    with tempfile.TemporaryDirectory(prefix="erfsfm-slam-map-") as temporary:
+        path = Path(temporary) / _MAPS[what]
+        (surface.write_mesh if what == "mesh" else surface.write_cloud)(path)
+        yield path
 
 
 def _rotated(ply: Ply, up: str) -> Ply:

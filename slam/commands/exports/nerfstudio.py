@@ -11,17 +11,18 @@ import cv2
 import numpy as np
 
 from erfsfm.common.errors import ErfsfmError
+from slam.commands.exports.raster import write_png
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps
 from slam.formats.transforms import TRANSFORMS, write_transforms
-from slam.frames import Image, Sequence
+from slam.frames import Sequence
 from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
 from slam.runtime.progress import Progress
 from slam.runtime.run_files import PLACES
-from slam.runtime.storage.files import remove, write_atomically
+from slam.runtime.storage.files import remove
 from slam.runtime.storage.record import Missing, known
 from slam.sequences.camera_file import is_field_of_view
 from slam.sequences.catalogue import open_sequence
@@ -71,7 +72,7 @@ def write_scene(
         except (SlamError, ErfsfmError):
             continue
         name = f"images/{k:06d}.png"
-        _write_image(output / name, image)
+        write_png(output / name, np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8))
         poses[name] = trajectory.T_world_camera[k]
     if not poses:
         raise RunError(f"no image of {folder.path} can be read: check the data set")
@@ -144,10 +145,3 @@ def _given(folder: RunFolder, dataset: Path | None) -> dict[str, Any]:
 def interpolated(folder: RunFolder) -> set[int]:
     """Frames of a run without a usable image."""
     return {k for gap in folder.metrics().sequence.bridged for k in range(gap.first, gap.last + 1)}
-
-
-def _write_image(path: Path, image: Image) -> None:
-    done, content = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    if not done:
-        raise RunError(f"{path}: cannot be encoded")
-    write_atomically(path, lambda partial: partial.write_bytes(content.tobytes()), RunError)

@@ -1,4 +1,4 @@
-"""Options of an export: read from text, and refused where they have no effect."""
+"""Options of an export, and how they are read from text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
 
-WHATS = ("mesh", "cloud", "trajectory", "graph", "colmap", "nerfstudio", "raster", "occupancy")
 # from a camera's x right, y down, z ahead
 R_UP_WORLDS: dict[str, FloatArray] = {
     "y-down": np.eye(3),
@@ -20,15 +19,6 @@ R_UP_WORLDS: dict[str, FloatArray] = {
     "y-up": np.diag([1.0, -1.0, -1.0]),  # x right, y up, z backwards
 }
 DEFAULT_RESOLUTION = 0.1
-_MIN_TRIANGLES = 4
-_TAKEN_BY = {
-    "voxel": ("mesh", "cloud", "colmap", "nerfstudio"),
-    "triangles": ("mesh",),
-    "crop": ("mesh", "cloud", "colmap", "nerfstudio", "raster", "occupancy"),
-    "resolution": ("raster", "occupancy"),
-    "origin": ("raster",),
-    "dataset": ("nerfstudio",),
-}
 _LATITUDE, _LONGITUDE, _HEADING = 90.0, 180.0, 360.0
 
 
@@ -72,30 +62,6 @@ class ExportOptions:
     resolution: float | None = None
     origin: Origin | None = None
     dataset: Path | None = None
-
-    def check(self, what: str, up: str) -> None:
-        """Refuse what does not exist, has no effect or makes no sense.
-
-        Raises:
-            RunError: one line.
-        """
-        if what not in WHATS:
-            raise RunError(f"--what {what!r} is unknown: choose one of {', '.join(WHATS)}")
-        if up not in R_UP_WORLDS:
-            raise RunError(f"--up {up!r} is unknown: choose {', '.join([*R_UP_WORLDS][:-1])} or {[*R_UP_WORLDS][-1]}")
-        for name, takers in _TAKEN_BY.items():
-            if getattr(self, name) is not None and what not in takers:
-                raise RunError(f"--{name} does nothing for {what}: it is for {', '.join(takers)}")
-        for name in ("voxel", "resolution"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise RunError(f"--{name} {value} must be a positive length")
-        if self.triangles is not None and self.triangles < _MIN_TRIANGLES:
-            raise RunError(f"--triangles {self.triangles} is too few: give {_MIN_TRIANGLES} or more")
-        if what == "graph" and up != "y-down":
-            raise RunError("a graph is exported as the run has it: leave --up out or give --up y-down")
-        if what in ("raster", "occupancy") and up == "y-up":
-            raise RunError(f"{what}: seen from above, x right and y ahead: leave --up out or give --up z")
 
 
 def parse_crop(text: str | None) -> Crop | None:

@@ -17,7 +17,7 @@ from slam.formats.geotiff import local_projection, write_geotiff
 from slam.formats.ply import Ply, rotated
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
-from slam.runtime.imports import import_rasterio
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import remove, write_atomically
 
 RASTER = "raster.yaml"
@@ -55,7 +55,7 @@ def height_raster(mesh: Ply, resolution: float, origin: Origin | None) -> Raster
         SlamError: too many cells, or rasterio, which writes rasters with an origin, is not installed.
     """
     if origin is not None:
-        import_rasterio()
+        import_extra("geotiff")
         mesh = rotated(mesh, _to_east_north(origin.heading_deg))
     grid = Grid.around(mesh.points, resolution)
     cells = grid.width * grid.height
@@ -87,9 +87,9 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     while (high - offset) / step > _HEIGHT_STEPS - 1:
         step *= 10
     steps = np.where(known, np.rint((np.nan_to_num(raster.heights).astype(np.float64) - offset) / step), 0)
-    _write_png(output / "height.png", steps.astype(np.uint16))
+    write_png(output / "height.png", steps.astype(np.uint16))
     opacity = np.where(known, _OPAQUE, 0).astype(np.uint8)[..., None]
-    _write_png(output / "colour.png", np.concatenate([raster.colours[..., ::-1], opacity], axis=2))
+    write_png(output / "colour.png", np.concatenate([raster.colours[..., ::-1], opacity], axis=2))
     for name in ("height.pgw", "colour.pgw"):
         _write_text(output / name, _world_file(grid))
     if raster.crs is None:
@@ -113,6 +113,14 @@ def write_raster(output: Path, raster: Raster, unit: str) -> None:
     description |= {} if raster.crs is None else {"crs": raster.crs}
     text = yaml.safe_dump(description, sort_keys=False, default_flow_style=None, width=200)
     _write_text(output / RASTER, text)
+
+
+def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Write an image as OpenCV has it, BGR or of one channel; `RunError` where it cannot be written."""
+    done, content = cv2.imencode(".png", image)
+    if not done:
+        raise RunError(f"{path}: cannot be encoded")
+    write_atomically(path, lambda partial: partial.write_bytes(content.tobytes()), RunError)
 
 
 def is_own_raster(folder: Path) -> bool:
@@ -147,10 +155,3 @@ def _world_file(grid: Grid) -> str:
 
 def _write_text(path: Path, text: str) -> None:
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"), RunError)
-
-
-def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    done, content = cv2.imencode(".png", image)
-    if not done:
-        raise RunError(f"{path}: cannot be encoded")
-    write_atomically(path, lambda partial: partial.write_bytes(content.tobytes()), RunError)

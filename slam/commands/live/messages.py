@@ -11,7 +11,7 @@ from typing import Any, TextIO
 from slam.formats.trajectory import Trajectory
 from slam.pipeline.tracker import Tracked
 from slam.runtime.errors import SlamError
-from slam.runtime.imports import import_zmq
+from slam.runtime.imports import import_extra
 
 _LAST_PORT = 65535
 
@@ -44,7 +44,7 @@ def emitters(stream: TextIO, address: str | None) -> Iterator[Emit]:
     if address is None:
         yield lambda message: _write(stream, message)
         return
-    zmq = import_zmq()
+    (zmq,) = import_extra("live")
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.linger = 1000
         try:

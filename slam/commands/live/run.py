@@ -36,7 +36,7 @@ from slam.results.folder import RunFolder
 from slam.results.output_folder import check_output
 from slam.results.run_log import run_log
 from slam.runtime.errors import SlamError
-from slam.runtime.imports import import_rerun
+from slam.runtime.imports import import_extra
 from slam.sequences.growing import GrowingSequence
 
 logger = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     if request.output is not None:
         check_output(request.output)
     if request.view:
-        import_rerun("--view")
+        import_extra("rerun")
     settings = load_config(request.config, request.overrides or ())
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     source = open_source(request.camera, request.wait)

@@ -10,7 +10,7 @@ from slam.frontend.drive import Drive
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.tracker import Tracked
-from slam.runtime.imports import import_rerun
+from slam.runtime.imports import import_extra
 
 _EVERY = 6  # pixel of the depth map, and frame, whose points are shown
 _PATH = (40, 110, 240)
@@ -21,7 +21,7 @@ class Viewer:
 
     def __init__(self, intrinsics: Intrinsics) -> None:
         """Start it; ``SlamError`` where rerun is not installed."""
-        self._rr = import_rerun("--view")
+        (self._rr,) = import_extra("rerun")
         self._intrinsics = intrinsics
         self._positions: list[FloatArray] = []
         self._stream = self._rr.RecordingStream("erfsfm-slam live")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ from erfsfm.common.errors import ErfsfmError
 from erfsfm.common.signals import Terminated
 from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
+from slam.evaluation.double_walls import double_wall_share
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Intrinsics
 from slam.frames import Sequence as FrameSequence
 from slam.loops.places import Places
+from slam.mapping.submap import remove_submaps
+from slam.mapping.surface import positions
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import CheckpointWriter, SessionCheckpoint
 from slam.pipeline.estimate import Estimate
@@ -27,16 +31,19 @@ from slam.results.depth import DepthQuality
 from slam.results.estimate_metrics import estimate_metrics, lidar_trajectory, timing_of
 from slam.results.folder import RunFolder
 from slam.results.gps import write_places
-from slam.results.map import write_map
-from slam.results.metrics import Metrics, Provenance
+from slam.results.map_error import map_errors
+from slam.results.metrics import MapMetrics, Metrics, Provenance
 from slam.results.report.map_view import write_map_views
 from slam.results.report.page import DepthExample, write_report
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
-from slam.runtime.errors import RunError, SlamError
+from slam.runtime.errors import EmptyMapError, RunError, SlamError
 from slam.runtime.progress import Progress
-from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, PLACES
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
+from slam.runtime.storage.record import Missing
 from slam.sequences.continued import Continued
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,7 @@ def _run(job: Job, folder: RunFolder) -> None:
         stream.finish(estimate, folder.path)
     quality = DepthQuality(job.recording, estimate.scale.is_metric)
     result = replace(estimate, map=job.pipeline.fuse(estimate, quality.add, folder.path))
-    map_metrics = write_map(folder, result, job.recording, job.progress)
+    map_metrics = _write_map(folder, result, job)
     depth = quality.metrics(job.settings.depth.refine != "none")
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
     folder.write_metrics(metrics.changed(status="ok", reason=None, timing=timing, depth=depth, map=map_metrics))
@@ -155,6 +162,29 @@ def _places(result: Estimate, intrinsics: Intrinsics) -> Places:
     """The camera, and every view with its points at the poses of the optimised trajectory."""
     T_world_camera = result.optimised.T_world_camera[np.array([view.index for view in result.views], dtype=np.intp)]
     return Places(intrinsics, tuple(result.views), T_world_camera)
+
+
+def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
+    """Merge the submaps, write mesh and cloud, and give the metrics of the map; an empty map gives a reason.
+
+    Finished submaps stay where a file cannot be written.
+    """
+    if result.map is None:
+        return MapMetrics.missing("fusion is switched off (mapping.enabled)")
+    try:
+        with result.stopwatch.stage("mesh"):
+            surface = result.map.surface(job.progress)
+    except EmptyMapError as error:
+        logger.warning("no map: %s", error)
+        remove_submaps(folder.path / SUBMAPS)
+        return MapMetrics.missing(str(error))
+    with result.stopwatch.stage("mesh"):
+        surface.write_mesh(folder.path / MAP_MESH)
+        surface.write_cloud(folder.path / MAP_CLOUD)
+    share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
+    remove_submaps(folder.path / SUBMAPS)
+    errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
+    return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))
 
 
 def _leave_failure(job: Job, folder: RunFolder, log: RunLog, error: BaseException) -> None:

@@ -34,7 +34,7 @@ from slam.results.metrics import Provenance
 from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.runtime.errors import RunError
-from slam.runtime.imports import import_rerun
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import from_anywhere
 from slam.runtime.storage.record import MISSING, Missing
 from slam.sequences.catalogue import open_sequence
@@ -112,7 +112,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.output is not None:
         check_output(request.output)
     if request.rerun is not None:
-        import_rerun("--rerun")
+        import_extra("rerun")
     settings = _settings(request, resumes)
     recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")

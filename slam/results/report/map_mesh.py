@@ -10,13 +10,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.formats.ply import map_ply
+from slam.formats.ply import Ply, map_ply
 from slam.geometry.se3 import FloatArray
 from slam.runtime.imports import import_open3d
 
 _CHUNK = 500_000
-_COLOURS = ("red", "green", "blue")
-_GREY = 128
 _COARSER = 1.15  # vertices of one surface do not all meet in its cells
 _FINER = 3  # triangles that quadric errors choose from, as a multiple of those that stay
 _Kind = TypeVar("_Kind", bound=np.generic)
@@ -69,12 +67,13 @@ class MapMeshFile:
         share = len(some.triangles) / len(self._faces)
         cell = _cell(some, max(int(share * triangles), 1))
         corners = (piece["vertices"] for piece in _chunks(self._faces))
-        return _clustered(self._pieces, _colours(self._vertices), corners, cell)
+        colours = np.concatenate([piece.colours_or_grey for piece in self._pieces()])
+        return _clustered(lambda: (piece.points for piece in self._pieces()), colours, corners, cell)
 
     def near(self, centre: FloatArray, radius: float) -> MapMesh:
         """All triangles with their three corners within ``radius`` of a point ``(3,)``."""
         return self._part(
-            np.concatenate([((points - centre) ** 2).sum(axis=1) < radius**2 for points in self._pieces()])
+            np.concatenate([((piece.points - centre) ** 2).sum(axis=1) < radius**2 for piece in self._pieces()])
         )
 
     def _part(self, inside: NDArray[np.bool_]) -> MapMesh:
@@ -82,12 +81,11 @@ class MapMeshFile:
         faces = (piece["vertices"].astype(np.int64) for piece in _chunks(self._faces))
         kept = [renumbered[corners[inside[corners].all(axis=1)]] for corners in faces]
         triangles = np.concatenate(kept) if kept else np.empty((0, 3), np.int64)
-        vertices = self._vertices[inside]
-        return MapMesh(_points(vertices), _colours(vertices), triangles)
+        vertices = Ply(self._vertices[inside])
+        return MapMesh(vertices.points, vertices.colours_or_grey, triangles)
 
-    def _pieces(self) -> Iterator[FloatArray]:
-        for piece in _chunks(self._vertices):
-            yield _points(piece)
+    def _pieces(self) -> Iterator[Ply]:
+        return map(Ply, _chunks(self._vertices))
 
 
 def _clustered(
@@ -140,16 +138,6 @@ def _not_degenerate(triangles: NDArray[np.intp]) -> NDArray[np.int64]:
     a, b, c = triangles.T
     kept: NDArray[np.int64] = triangles[(a != b) & (b != c) & (a != c)].astype(np.int64)
     return kept
-
-
-def _points(vertices: NDArray[np.void]) -> FloatArray:
-    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-
-
-def _colours(vertices: NDArray[np.void]) -> NDArray[np.uint8]:
-    if not set(_COLOURS) <= set(vertices.dtype.names or ()):
-        return np.full((len(vertices), 3), _GREY, np.uint8)
-    return np.stack([vertices[name].astype(np.uint8) for name in _COLOURS], axis=1)
 
 
 def _chunks(whole: NDArray[_Kind]) -> Iterator[NDArray[_Kind]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from slam.results.report.map_view import MapViews
 from slam.results.report.plots import (
     depth_figure,
     length_unit,
+    png,
     trajectories_figure,
     trajectories_of,
 )
@@ -214,12 +214,10 @@ def _trajectories(folder: RunFolder) -> dict[str, Trajectory]:
 
 def _drawn(draw: Callable[[], Figure], title: str, caption: str) -> Picture:
     """A picture, or why it cannot be drawn (for example, trajectories without common stamps)."""
-    buffer = io.BytesIO()
     try:
-        draw().savefig(buffer, format="png", dpi=160, metadata={"Software": None})
+        return Picture(title, caption, _encoded(png(draw())))
     except SlamError as error:
         return Picture(title, caption, reason=str(error))
-    return Picture(title, caption, _encoded(buffer.getvalue()))
 
 
 def _encoded(content: bytes) -> str:

@@ -6,12 +6,15 @@ grey. Matplotlib is imported inside the functions, without changes of its global
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from erfsfm.common.figure_file import require_figure, save_figure
 from slam.evaluation.drift import aligned, estimates, segment_drifts
@@ -20,7 +23,6 @@ from slam.frames import DepthMap, Image
 from slam.geometry.se3 import path_distance
 from slam.results.folder import RunFolder
 from slam.results.metrics import METRES
-from slam.results.report.map_picture import AerialView
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import REFERENCE, TRAJECTORIES
 
@@ -175,6 +177,15 @@ def depth_figure(images: Sequence[Image], depths: Sequence[DepthMap], labels: Se
     return figure
 
 
+@dataclass(frozen=True)
+class AerialView:
+    """The map seen straight from above: ``image`` ``(H, W, 4)`` uint8 RGBA, z ahead is up, and its limits."""
+
+    image: NDArray[np.uint8]
+    x: tuple[float, float]
+    z: tuple[float, float]
+
+
 def map_figure(view: AerialView, trajectory: Trajectory | None = None, unit: str = "m") -> Figure:
     """The map from above in its colours, with the trajectory over it.
 
@@ -197,6 +208,13 @@ def map_figure(view: AerialView, trajectory: Trajectory | None = None, unit: str
         axes.set_aspect("equal")
         axes.set(xlim=view.x, ylim=view.z, xlabel=f"x, right ({unit})", ylabel=f"z, ahead ({unit})")
     return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=160, metadata={"Software": None})
+    return buffer.getvalue()
 
 
 def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> None:

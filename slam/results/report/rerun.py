@@ -13,7 +13,7 @@ from slam.frontend.drive import Keyframe
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.estimate import Estimate
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.imports import import_rerun
+from slam.runtime.imports import import_extra
 from slam.runtime.storage.files import write_atomically
 
 _COLOURS = {"reference": (120, 120, 120), "odometry": (240, 150, 40), "optimised": (40, 110, 240)}
@@ -35,7 +35,7 @@ def write_rerun(path: Path, result: Estimate, intrinsics: Intrinsics) -> None:
     Raises:
         SlamError: rerun is not installed, or the file cannot be written.
     """
-    rr = import_rerun("--rerun")
+    (rr,) = import_extra("rerun")
 
     def fill(partial: Path) -> None:
         stream = rr.RecordingStream("erfsfm-slam")

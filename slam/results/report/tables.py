@@ -22,7 +22,7 @@ from slam.results.error_columns import (
 )
 from slam.results.metrics import GpsErrors, LoopsFile, Metrics, Stretch
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import TRAJECTORIES
+from slam.runtime.run_files import METRICS, TRAJECTORIES
 from slam.runtime.storage.record import NOT_RECORDED, Missing, known
 
 
@@ -196,12 +196,10 @@ def loops(metrics: Metrics, loops_file: Path) -> dict[str, Any] | None:
     rows = [(str(loop.from_), str(loop.to), verdict, loop.reason) for verdict, group in groups for loop in group]
     left_out = known(details.rejected_left_out)
     where = loops_file.name + (f", without {left_out} rejected ones of fewest inliers" if left_out else "")
-    more = [f"{len(rows) - MOST_LOOPS} more in {where}."] if len(rows) > MOST_LOOPS else []
-    head = ("from frame", "to frame", "verdict", "reason")
     return {
         "counts": ", ".join(f"{number(value).text} {stage}" for stage, value in stages.items()),
         "reasons": notes_on(number(value).tooltip for value in stages.values()),
-        "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
+        "table": _first_of(("from frame", "to frame", "verdict", "reason"), rows, where),
     }
 
 
@@ -214,11 +212,9 @@ def tracking(metrics: Metrics) -> dict[str, Any] | None:
         ["" if value is None else str(value) for value in (event.frame, event.event, event.other, event.support)]
         for event in found.events
     ]
-    more = [f"{len(rows) - MOST_LOOPS} more in metrics.json."] if len(rows) > MOST_LOOPS else []
-    head = ("frame", "event", "at the place of frame", "points or loops")
     return {
         "counts": f"{number(found.keyframes).text} keyframes, {number(found.maps).text} maps",
-        "table": Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None,
+        "table": _first_of(("frame", "event", "at the place of frame", "points or loops"), rows, METRICS),
     }
 
 
@@ -284,6 +280,12 @@ def _missing_errors(metrics: Metrics) -> list[str]:
 
 def _texts(rows: Iterable[Sequence[str]]) -> list[list[Cell]]:
     return [[Cell(text) for text in row] for row in rows]
+
+
+def _first_of(head: Sequence[str], rows: Sequence[Sequence[str]], where: str) -> Table | None:
+    """The first rows, with a note on the file ``where`` all of them are; None without any."""
+    more = [f"{len(rows) - MOST_LOOPS} more in {where}."] if len(rows) > MOST_LOOPS else []
+    return Table(head, _texts(rows[:MOST_LOOPS]), "words", more) if rows else None
 
 
 def _bar(ratio: float) -> Cell:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.runtime.errors import SequenceError
-from slam.runtime.imports import import_rosbags
+from slam.runtime.imports import import_extra
 
 BAG_SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
@@ -38,7 +38,7 @@ class Bag:
         """
         self.path = path
         self._is_ros1 = path.suffix == ".bag"
-        rosbag1, rosbag2, typesys = import_rosbags()
+        rosbag1, rosbag2, typesys = import_extra("ros")
         with self._errors():
             self._reader: Any = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()

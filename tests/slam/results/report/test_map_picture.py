@@ -8,7 +8,7 @@ import pytest
 from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
 from slam.results.report.map_mesh import MapMesh
-from slam.results.report.map_picture import BACKGROUND, HEIGHT_PX, WIDTH_PX, MapScene
+from slam.results.report.map_view import BACKGROUND, HEIGHT_PX, WIDTH_PX, MapScene
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ from slam.formats.ply import Ply
 from slam.geometry.se3 import FloatArray
 from slam.results.folder import RunFolder
 from slam.results.report.map_mesh import MapMesh
-from slam.results.report.map_view import MapViews
-from slam.results.report.map_viewer import map_viewer
+from slam.results.report.map_view import MapViews, map_viewer
 from slam.results.report.page import write_report
 
 MakeRun = Callable[..., RunFolder]

@@ -30,7 +30,7 @@ def test_without_rerun_the_run_does_not_begin(
         return find(name, *rest)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(SlamError, match=r"^--rerun needs rerun .*pip install 'erfsfm-slam\[rerun\]'") as refused:
+    with pytest.raises(SlamError, match=r"^--rerun and --view need rerun .*'erfsfm-slam\[rerun\]'") as refused:
         run_slam(**quick, rerun=tmp_path / "run.rrd")
     assert "\n" not in str(refused.value) and list(tmp_path.iterdir()) == []
 
@@ -75,7 +75,7 @@ class Recorder:
 def test_everything_is_logged(quick: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder()
     for module in ("slam.commands.run.run", "slam.results.report.rerun"):
-        monkeypatch.setattr(f"{module}.import_rerun", lambda option: recorder)
+        monkeypatch.setattr(f"{module}.import_extra", lambda extra: (recorder,))
     run_slam(**quick, rerun=tmp_path / "deep" / "run.rrd")
     assert (tmp_path / "deep" / "run.rrd").read_bytes() == b"RRF2"
     static = {place for place, _, frame in recorder.logged if frame is None}

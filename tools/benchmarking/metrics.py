@@ -1,15 +1,21 @@
-"""The metrics of a run and its row in the CSV."""
+"""The metrics of a run, its row in the CSV, and Markdown tables whose rows are groups of runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean, median, stdev
 from typing import Any
 
 from benchmarking.plan import slug
 from benchmarking.work import JobResult
+from shared.command import markdown
 
+from slam.results.error_columns import DASH
 from slam.runtime.storage.record import Missing, known
+
+Label = Callable[[JobResult], str]
+Cell = Callable[[Sequence[JobResult]], str]
 
 
 @dataclass(frozen=True)
@@ -114,3 +120,75 @@ def rows(results: Sequence[JobResult]) -> list[dict[str, Any]]:
 def stages(results: Sequence[JobResult]) -> list[str]:
     """Every stage that some run went through, in order of appearance."""
     return list(dict.fromkeys(stage for o in results for stage in o.metrics.timing.stages))
+
+
+def table(rows: Mapping[str, Label], columns: Mapping[str, Cell], results: Sequence[JobResult]) -> str:
+    """Markdown: one row for each group of results that share their labels."""
+    groups = grouped(results, *rows.values()).items()
+    cells = [[*label, *(cell(group) for cell in columns.values())] for label, group in groups]
+    return markdown([*rows, *columns], cells, numbers=len(columns))
+
+
+def grouped(results: Sequence[JobResult], *labels: Label) -> dict[tuple[str, ...], list[JobResult]]:
+    """Results grouped by their labels, in order of appearance."""
+    groups: dict[tuple[str, ...], list[JobResult]] = {}
+    for o in results:
+        groups.setdefault(tuple(label(o) for label in labels), []).append(o)
+    return groups
+
+
+def over_seeds(definition: MetricDefinition) -> Cell:
+    """Mean and, where it is not zero, sample standard deviation."""
+
+    def cell(group: Sequence[JobResult]) -> str:
+        found = values(group, definition)
+        deviation = round(stdev(found), definition.decimals) if len(found) > 1 else 0.0
+        return mean(found, definition.decimals) + (f" ± {deviation:.{definition.decimals}f}" if deviation else "")
+
+    return cell
+
+
+def average(definition: MetricDefinition) -> Cell:
+    """Mean over a group."""
+    return lambda group: mean(values(group, definition), definition.decimals)
+
+
+def average_among(definition: MetricDefinition, among: Sequence[JobResult]) -> Cell:
+    """Mean over the results of a group that are also in another one."""
+    return lambda group: mean(values([o for o in group if o in among], definition), definition.decimals)
+
+
+def middle_and_extreme(definition: MetricDefinition, extreme: Callable[[Sequence[float]], float]) -> Cell:
+    """Median and the largest or smallest value of a group."""
+    return lambda group: spread(values(group, definition), definition.decimals, extreme)
+
+
+def spread(found: Sequence[float], decimals: int, extreme: Callable[[Sequence[float]], float]) -> str:
+    """Median and the largest or smallest of some numbers."""
+    return f"{median(found):.{decimals}f} ({extreme(found):.{decimals}f})" if found else DASH
+
+
+def values(results: Sequence[JobResult], definition: MetricDefinition) -> list[float]:
+    """The values of a metric, without the results that lack it."""
+    found = (definition.value(o) for o in results)
+    return [value for value in found if not isinstance(value, Missing)]
+
+
+def mean(found: Sequence[float], decimals: int) -> str:
+    """Mean of some numbers."""
+    return f"{fmean(found):.{decimals}f}" if found else DASH
+
+
+def drive(o: JobResult) -> str:
+    """Name of the recording."""
+    return o.job.drive.name
+
+
+def weights(o: JobResult) -> str:
+    """Name of the weights."""
+    return o.job.weights
+
+
+def configuration(o: JobResult) -> str:
+    """Name of the configuration."""
+    return o.job.configuration.name

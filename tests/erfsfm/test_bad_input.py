@@ -98,18 +98,6 @@ def test_brackets_in_a_name(
     assert "leak: these weights were trained on kitti_odometry/s[0][0:6]" in error
 
 
-def test_a_checkpoint_cut_in_half(refusal: Refusal, tmp_path: Path, write_root: WriteRoot) -> None:
-    root, run = write_root(tmp_path / "root", frames=5), tmp_path / "run"
-    (run / "checkpoints").mkdir(parents=True)
-    torch.save({"global_step": 1}, run / "checkpoints/last.ckpt")
-    path = run / "checkpoints/last.ckpt"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    config = load_experiment("tiny", [text for text in SMALL if "=" in text])
-    (run / "config.yaml").write_text(dump_yaml(config))
-    error = refusal(*TRAIN, *SMALL, "--dataset", root, "--output", run, "--resume")
-    assert "last.ckpt is damaged or no checkpoint of erfsfm: it cannot be resumed; start again" in error
-
-
 def test_initial_weights_of_another_architecture(
     refusal: Refusal, tmp_path: Path, write_root: WriteRoot, weights: Path
 ) -> None:

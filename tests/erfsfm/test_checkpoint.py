@@ -14,7 +14,6 @@ from safetensors.torch import load_file, save_file
 import erfsfm.model_record as model_record
 from erfsfm.checkpoint import Model, build_networks, load_model, save_model
 from erfsfm.common.errors import CheckpointError
-from erfsfm.common.files import write_atomically
 from erfsfm.config import NetworkConfig
 from erfsfm.model_record import ModelRecord, weights_sha256
 
@@ -143,19 +142,3 @@ def test_fingerprint_depends_on_what_makes_poses_of_the_same_weights(folder: Pat
     before, record = weights_sha256(folder), folder / "model.yaml"
     record.write_text(record.read_text().replace("alignment: none", "alignment: images"))
     assert weights_sha256(folder) != before
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "x"
-    path.write_text("old")
-
-    def fail(temporary: Path) -> None:
-        temporary.write_text("half")
-        raise RuntimeError("disk full")
-
-    with pytest.raises(RuntimeError, match="disk full"):
-        write_atomically(path, fail)
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-    write_atomically(path, lambda temporary: temporary.write_text("new"))
-    assert path.read_text() == "new"

@@ -494,13 +494,6 @@ def test_initial_weights_pass_on_their_leak_record(
         torch.testing.assert_close(trained, initial)
 
 
-def test_initial_weights_of_another_network(alone: Configure, tmp_path: Path) -> None:
-    first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
-    wider = alone(network={"pose_width": 0.375})
-    with pytest.raises(ConfigError, match="of another network"):
-        train(wider.model_copy(update={"initial_weights": str(first)}), tmp_path / "second", device="cpu")
-
-
 def test_initial_weights_without_alignment(alone: Configure, tmp_path: Path) -> None:
     first = train(alone(training={"steps": 1}), tmp_path / "first", device="cpu")
     aligned = alone(network={"alignment": "images"}, training={"steps": 1})
@@ -616,12 +609,6 @@ def cut(alone: Configure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tu
     config = alone()
     interrupted(monkeypatch, config, tmp_path / "run", 3)
     return config, tmp_path / "run"
-
-
-def test_a_run_is_not_overwritten(cut: tuple[ExperimentConfig, Path]) -> None:
-    config, output = cut
-    with pytest.raises(TrainingError, match="--resume or choose another --output"):
-        train(config, output, device="cpu")
 
 
 def test_weights_are_not_overwritten(alone: Configure, tmp_path: Path) -> None:
@@ -804,7 +791,7 @@ def test_half_precision_on_a_cpu_is_announced(
 @pytest.mark.slow
 @pytest.mark.parametrize(("spread", "workers"), [("devices", 1), ("nodes", 0)])
 def test_two_processes_are_one_with_twice_the_batch(
-    both: Configure, small: Small, tmp_path: Path, in_processes: Callable[..., None], spread: str, workers: int
+    both: Configure, tmp_path: Path, in_processes: Callable[..., None], spread: str, workers: int
 ) -> None:
     """Batches of 2 in each of two processes; of 4 in one."""
 

@@ -317,15 +317,6 @@ def test_export_of_a_part(call: Call, make_run: MakeRun) -> None:
     assert Path("raster/raster.yaml").is_file() and not Path("b.glb").exists()
 
 
-def test_export_with_z_up(call: Call, make_run: MakeRun) -> None:
-    """The mesh read by Open3D is rotated: y down becomes z up."""
-    assert call("export", make_run().path, "--what", "mesh", "--output", "up.ply", "--up", "z")[0] == 0
-    from slam.runtime.imports import import_open3d
-
-    vertices = np.asarray(import_open3d().io.read_triangle_mesh("up.ply").vertices)
-    np.testing.assert_allclose(vertices, [[0, 1, 0], [1, 1, 0], [0, 1, 2]], atol=1e-6)
-
-
 def test_localize_prints_a_row_an_image(call: Call, kitti_root: Path, tiny_weights: Path) -> None:
     run = ["run", "--dataset", kitti_root, "--weights", tiny_weights, "--output", "run", *QUICK]
     assert call(*run)[0] == 0

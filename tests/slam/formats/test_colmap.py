@@ -57,8 +57,3 @@ def test_a_model_reads_back(tmp_path: Path) -> None:
         ours = apply(invert(drive()[k]), POINTS) @ CAMERA.K.T
         # their pixel (0.5, 0.5) is our (0, 0)
         np.testing.assert_allclose(np.stack([u, v], axis=1) - 0.5, ours[:, :2] / ours[:, 2:], atol=1e-2)
-
-
-def test_without_points_the_model_is_whole(tmp_path: Path) -> None:
-    write_colmap(tmp_path, CAMERA, drive(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert rows(tmp_path / "points3D.txt") == [] and len(rows(tmp_path / "images.txt")) == 10

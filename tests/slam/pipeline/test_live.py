@@ -208,13 +208,6 @@ def test_a_trajectory_belongs_to_the_caller() -> None:
     assert np.isfinite(slam.trajectory().T_world_camera).all()
 
 
-def test_a_first_stamp_that_is_no_number_is_refused() -> None:
-    slam = started(load_config(None, SETTINGS))
-    with pytest.raises(ValueError, match="stamps must increase; got nan"):
-        slam.add_frame(drive().frame(0).image, np.nan)
-    assert len(slam) == 0
-
-
 class Failing(OraclePredictor):
     """An oracle that fails at one frame, at its depth or at the snippet that ends with it, each time."""
 

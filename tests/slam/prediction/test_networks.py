@@ -173,18 +173,3 @@ def test_a_new_image_in_the_memory_of_an_old_one_is_another_image(tmp_path: Path
         (frame,) = frames(seed, 1)
         np.testing.assert_array_equal(predictor.depth(frame), 1 / ((frame.image[..., 0].astype(np.float32) + 1) / 7))
         del frame
-
-
-def test_a_full_disk_ends_the_caching_and_not_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    networks = Counting()
-    predictor, _ = cached(networks, tmp_path)
-    monkeypatch.setattr(Path, "write_bytes", full)
-    for frame in frames(0):
-        predictor.depth(frame)
-    assert networks.asked == 5 and caplog.text.count("is not written any more") == 1
-    assert entries(tmp_path) == []

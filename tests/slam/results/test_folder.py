@@ -156,26 +156,6 @@ def test_output_with_other_things_is_refused_and_left_alone(make_run: MakeRun, t
     assert contents(output) == before and (output / place / "thesis.tex").read_text() == "years of work"
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path)
-    folder.write_text("run.log", "old")
-
-    def fail(path: Path) -> None:
-        path.write_text("half")
-        raise OSError("disk full")
-
-    with pytest.raises(RunError, match="disk full"):
-        folder.write("run.log", fail)
-    assert [path.name for path in tmp_path.iterdir()] == ["run.log"]
-    assert (tmp_path / "run.log").read_text() == "old"
-
-
-def test_damaged_metrics_are_one_clear_error(tmp_path: Path) -> None:
-    (tmp_path / "metrics.json").write_text('{"status": ')
-    with pytest.raises(RunError, match="is damaged"):
-        RunFolder.open(tmp_path).metrics().tree()
-
-
 def test_trajectories_survive_a_round_trip(make_run: MakeRun) -> None:
     folder = make_run()
     optimised = folder.trajectory("optimised")

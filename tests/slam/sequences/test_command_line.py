@@ -71,15 +71,6 @@ def test_a_folder_with_brackets_in_its_name(
         assert code == 0 and metrics(tmp_path / f"leak-{leak}")["provenance"]["leak"] is leak, err
 
 
-def test_half_a_jpeg_is_interpolated_and_named(tmp_path: Path, kitti_root: Path, run: Call) -> None:
-    image = write_folder(tmp_path / "drive", kitti_root, ".jpg") / "000006.jpg"
-    image.write_bytes(image.read_bytes()[: image.stat().st_size // 2])
-    code, err = run("--dataset", "drive", "--output", "out")
-    assert code == 0, err
-    (bridged,) = metrics(tmp_path / "out")["sequence"]["bridged"]
-    assert (bridged["first"], bridged["last"]) == (6, 6) and "000006.jpg is truncated" in bridged["reason"]
-
-
 def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kitti_root: Path, run: Call) -> None:
     root = write_kitti(tmp_path / "root", "00", kitti_root)
     for number in (6, 7):
@@ -90,25 +81,6 @@ def test_a_gap_in_the_numbering_has_rows_in_the_trajectories(tmp_path: Path, kit
     rows = np.loadtxt(tmp_path / "out/trajectory_optimised.tum.txt")
     assert rows[:, 0] == pytest.approx(0.1 * np.arange(14), abs=1e-6) and np.isfinite(rows).all()
     assert [(gap["first"], gap["last"]) for gap in metrics(tmp_path / "out")["sequence"]["bridged"]] == [(6, 7)]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("width:", "width: 208\nwidth:", "duplicate key 'width'"),
-        ("fx: ", "fx: 1 # ", "fx: 1 is no focal length in pixels of 208x64 images"),
-        ("width: 208", "width: 416", "are 208x64, but the camera file is for 416x64"),
-    ],
-)
-def test_cameras_that_cannot_be_right(
-    tmp_path: Path, kitti_root: Path, run: Call, old: str, new: str, message: str
-) -> None:
-    camera = write_folder(tmp_path / "drive", kitti_root) / "camera.yaml"
-    assert old in camera.read_text()
-    camera.write_text(camera.read_text().replace(old, new, 1))
-    code, err = run("--dataset", "drive", "--output", "out")
-    assert code == 1 and message in err
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_drive_goes_on_after_a_gap_and_not_with_another_one(tmp_path: Path, kitti_root: Path, run: Call) -> None:

@@ -92,13 +92,6 @@ def test_unlikely_stamps_and_pauses_are_warned_of(
     assert "camera_height_m is 100" in caplog.text
 
 
-def test_brackets_in_a_name(tmp_path: Path, images, camera_yaml: str) -> None:
-    folder = tmp_path / "br[ack]ets"
-    images(folder, ["0.png", "1.png"])
-    (folder / "camera.yaml").write_text(camera_yaml)
-    assert open_sequence(folder).provenance() == ("folder/br[ack]ets[0:2]",)
-
-
 def test_an_unreadable_image_is_an_error_of_the_sequence(tmp_path: Path, images, camera_yaml: str) -> None:
     images(tmp_path, ["0.png", "1.png", "2.png"])
     (tmp_path / "camera.yaml").write_text(camera_yaml)

@@ -53,21 +53,21 @@ def request_of(camera: Path | str, weights: Path, settings: Sequence[str], outpu
     return LiveRequest(str(camera), output=output, weights=str(weights), overrides=list(settings), **options)
 
 
-def fill(source: Path, target: Path, messages: list[dict[str, Any]]) -> Thread:
-    """Put an image into a folder each time the one before was answered."""
+def fill(source: Path, target: Path, messages: list[dict[str, Any]], vanishes: bool = True) -> None:
+    """Put an image into a folder each time the one before was answered; after the last, take the folder away."""
     names = sorted(path.name for path in source.iterdir())
 
     def run() -> None:
-        for number, name in enumerate(names):
-            while len(messages) < number:
-                time.sleep(0.01)
+        for answered, name in enumerate(names, start=1):
             partial = target / f".{name}.partial"
             shutil.copy(source / name, partial)
             partial.rename(target / name)
+            while len(messages) < answered:
+                time.sleep(0.01)
+        if vanishes:
+            target.rename(target.with_name("unplugged"))
 
-    thread = Thread(target=run, daemon=True)
-    thread.start()
-    return thread
+    Thread(target=run, daemon=True).start()
 
 
 def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     target.mkdir()
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
-    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=1.5)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     offline = run_slam(street, weights=tiny_weights, overrides=SETTINGS, output=tmp_path / "run")
     for name in ("trajectory_optimised.kitti.txt", "trajectory_odometry.tum.txt", "graph.g2o", "loops.json"):
@@ -89,7 +89,7 @@ def test_a_folder_being_filled_gives_the_bytes_of_a_run(street: Path, tiny_weigh
     assert all(message["state"] == "starting" or message["scale"] > 0 for message in poses)
     corrected = np.array(last["T_world_camera"])
     np.testing.assert_allclose(corrected, np.loadtxt(folder.path / "trajectory_optimised.kitti.txt"), atol=1e-6)
-    assert last["ended"] == "nothing came for 1.5 s" and last["dropped"] == 0
+    assert last["dropped"] == 0
     assert folder.metrics().tree()["status"] == "ok"
 
 
@@ -103,7 +103,7 @@ def test_without_a_road_there_are_no_metres_and_no_camera_heights(
     fill(street / "images", target, messages)
     at_the_horizon = ("road.enabled=false", "scale.road_top_ratio=0", "scale.road_bottom_ratio=0.001")
     settings = (*SETTINGS, *at_the_horizon, f"scale.mode={mode}")
-    request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=0.5)
+    request = request_of(target, tiny_weights, settings, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     recorded = folder.metrics().tree()["scale"]
     assert (recorded["unit"], recorded["value"]) == ("the networks' own unit", None)
@@ -136,7 +136,7 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
         target.rename(tmp_path / "unplugged")
 
     Thread(target=fill_and_vanish, daemon=True).start()
-    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=30)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     folder = run_live(request, messages.append)
     *poses, last = messages
     used = [0.1 * number for number in range(FRAMES) if number not in (5, 8)]
@@ -188,7 +188,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
         if len(messages) == 9:
             raise SlamError("nobody listens")
 
-    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=1.5)
+    request = request_of(target, tiny_weights, SETTINGS, tmp_path / "live", wait=600)
     with pytest.raises(SlamError, match="nobody listens" if frames == 9 else "usable frames"):
         run_live(request, listen)
     metrics = json.loads((tmp_path / "live" / "metrics.json").read_text())
@@ -309,7 +309,7 @@ def test_the_viewer_is_shown_the_drive(
     shutil.copy(street / "camera.yaml", tmp_path)
     fill(street / "images", target, messages)
     settings, output = SETTINGS[1:], tmp_path / "run"  # keyframes are kept for the map
-    request = request_of(target, tiny_weights, settings, output, wait=1.5, view=True)
+    request = request_of(target, tiny_weights, settings, output, wait=600, view=True)
     run_live(request, messages.append)
     content = shown.read_bytes()
     assert content[:3] == b"RRF"
@@ -387,8 +387,8 @@ def test_a_port_that_does_not_exist_is_refused() -> None:
 def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
     output, target, messages = tmp_path / "run", tmp_path / "images", []
     target.mkdir()
-    fill(street / "images", target, messages)
-    command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "60"]
+    fill(street / "images", target, messages, vanishes=False)
+    command = [sys.executable, "-m", "slam", "live", "--camera", str(target), "--output", str(output), "--wait", "600"]
     command += ["--calibration", str(street / "camera.yaml")]
     command += ["--weights", str(tiny_weights), *(word for s in SETTINGS for word in ("--set", s))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

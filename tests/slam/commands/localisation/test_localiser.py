@@ -96,22 +96,6 @@ def test_places_read_back(tmp_path: Path) -> None:
             assert getattr(view, name).dtype == getattr(other, name).dtype
 
 
-@pytest.mark.parametrize("damage", ["half", "text", "pickle", "other"])
-def test_damaged_places_are_one_error(tmp_path: Path, damage: str) -> None:
-    path = tmp_path / PLACES
-    places().write(path)
-    if damage == "half":
-        path.write_bytes(path.read_bytes()[:3000])
-    elif damage == "text":
-        path.write_text("places")
-    elif damage == "pickle":
-        np.savez(path, format=np.array([{}], dtype=object))
-    else:
-        np.savez(path, format=np.array(99))
-    with pytest.raises(RunError, match=r"places\.npz (is damaged|has format 99)"):
-        Places.read(path)
-
-
 @pytest.mark.parametrize("hazards", [(), ("exposure",), ("rain",)])
 def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple[str, ...]) -> None:
     localiser = Localiser(places(), CONFIG)

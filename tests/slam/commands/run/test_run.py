@@ -89,24 +89,6 @@ def test_the_snippets_of_the_network_are_its_direct_poses(run: RunFolder) -> Non
     assert numbers["network"]["snippet5"]["ate_mean"] > 0
 
 
-def test_weights_that_saw_the_sequence_are_stamped(reported: dict[str, Any], leaky_weights: Path) -> None:
-    folder = run_slam(**reported | {"weights": leaky_weights})
-    assert folder.metrics().tree()["provenance"]["leak"] is True
-    assert ">LEAK<" in (folder.path / "report.html").read_text()
-
-
-def test_runs_get_a_stamp_a_name_and_a_link(quick: dict[str, Any], tmp_path: Path) -> None:
-    first, second = run_slam(**quick), run_slam(**quick)
-    assert re.fullmatch(r"\d{8}-\d{6}(-\d+)?_sim", first.path.name) and first.path != second.path
-    assert (tmp_path / "results" / "latest").resolve() == second.path.resolve()
-
-
-def test_two_runs_with_one_seed_give_one_trajectory(quick: dict[str, Any]) -> None:
-    first, second = (run_slam(**quick | {"overrides": quick["overrides"][:1] + quick["overrides"][2:]}) for _ in "ab")
-    for name in ("trajectory_network.tum.txt", "trajectory_optimised.kitti.txt", "graph.g2o"):
-        assert (first.path / name).read_bytes() == (second.path / name).read_bytes()
-
-
 def test_output_is_used_again_and_only_its_own_files_go(quick: dict[str, Any], tmp_path: Path) -> None:
     output = tmp_path / "mine"
     run_slam(**quick, output=output)
@@ -231,25 +213,3 @@ def test_coverage_of_an_estimate_that_stands_still_is_null_with_a_reason(run: Ru
     Result.optimised.T_world_camera[:] = np.eye(4)
     graph = slam.results.estimate_metrics._graph(Result)  # type: ignore[arg-type]
     assert isinstance(graph.coverage, Missing) and "does not move" in graph.coverage.reason
-
-
-@pytest.mark.slow
-def test_a_run_from_the_cache_runs_no_network_and_leaves_the_same_bytes(
-    kitti_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def forbidden(*_: object, **__: object) -> None:
-        raise AssertionError("a network was run")
-
-    def run(name: str, *overrides: str, cache: Path | None = tmp_path / "cache") -> RunFolder:
-        given = [NO_REPORT, "depth.refine=none", *overrides]
-        return run_slam(kitti_root, "sim", weights="sim", overrides=given, output=tmp_path / name, cache=cache)
-
-    plain, cold = run("plain", cache=None), run("cold")
-    for name in ("disparity", "poses"):
-        monkeypatch.setattr(slam.commands.run.run.DepthPosePredictor, name, forbidden)
-    warm = run("warm")
-    names = sorted(path.name for path in plain.path.iterdir())
-    assert names == sorted(path.name for path in warm.path.iterdir())
-    for name in set(names) - {"metrics.json", "run.log", "drive.zip"}:  # these hold times
-        assert len({(run.path / name).read_bytes() for run in (plain, cold, warm)}) == 1, name
-    assert run("other", "visual_odometry.max_corners=150").metrics().tree()["status"] == "ok"

@@ -248,21 +248,6 @@ def test_a_run_that_was_killed_in_its_map_can_be_used_continued_and_replaced(
     assert RunFolder.open(output).metrics().tree()["status"] == "ok"
 
 
-def test_a_run_that_fails_after_its_folder_is_made_prints_one_line(
-    copy_of_kitti_root: CopyRoot, tiny_weights: Path, tmp_path: Path
-) -> None:
-    root, output = copy_of_kitti_root(), tmp_path / "run"
-    for image in sorted((root / "sequences" / "sim" / "image_2").glob("*.png"))[3:]:
-        image.write_bytes(b"no image")
-    arguments = ["run", "--dataset", root, "--weights", tiny_weights, "--output", output]
-    finished = subprocess.run(
-        [sys.executable, "-m", "slam", *map(str, arguments)], capture_output=True, text=True, check=False
-    )
-    assert (finished.returncode, finished.stdout, finished.stderr.count("\n")) == (1, "", 1)
-    assert finished.stderr.startswith("erfsfm-slam: no 5 usable frames") and "000003.png" in finished.stderr
-    assert {path.name for path in output.iterdir()} == {"config.yaml", "metrics.json", "report.html", "run.log"}
-
-
 def test_two_runs_into_one_folder(quick: dict[str, Any], tmp_path: Path) -> None:
     """Also of one that goes on in its own folder while it runs."""
     output, refused = tmp_path / "run", []

@@ -7,7 +7,6 @@ import numpy as np
 from slam.frontend.visual.depth_error import DepthError
 
 NOISE_PX = 0.2
-FOCAL_PX = 700.0
 
 
 def biased(depth: np.ndarray) -> np.ndarray:

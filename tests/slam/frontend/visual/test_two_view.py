@@ -10,7 +10,6 @@ import pytest
 
 from slam.config.sections import VisualOdometryConfig
 from slam.frames import Frame, Intrinsics
-from slam.frontend.visual import two_view
 from slam.frontend.visual.epipolar import UnitRelativePose, unit_pose_by_essential
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
@@ -138,28 +137,6 @@ def test_the_history_of_a_drive_chooses_between_motions():
             errors_deg.append(angle_deg(R, T_current_previous[:3, :3]))
     without, with_history = np.reshape(errors_deg, (20, 2)).T
     assert (with_history < 0.3).sum() > (without < 0.3).sum() and (with_history < 0.3).mean() > 0.9
-
-
-@pytest.mark.parametrize("method", ["unit_pose_by_essential", "unit_pose_by_pnp"])
-def test_two_seeds_give_other_ransac_draws_and_one_seed_the_same(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    matches, _ = corner_with_a_car(3)
-    drawn: list[bytes] = []
-    propose = getattr(two_view, method)
-
-    def watched(*arguments):
-        pose = propose(*arguments)
-        drawn.append(pose.R_current_previous.tobytes() + pose.direction.tobytes())
-        return pose
-
-    monkeypatch.setattr(two_view, method, watched)
-
-    def draws(seed: int) -> tuple[bytes, ...]:
-        drawn.clear()
-        assert TwoViewEstimator(CONFIG, FOCAL_PX, seed).estimate(matches, NO_HISTORY) is not None
-        return tuple(drawn)
-
-    assert draws(1) == draws(1) != ()
-    assert len({draws(seed) for seed in range(4)}) > 1
 
 
 def test_without_common_points_there_is_no_motion():

@@ -32,7 +32,7 @@ KEYS = {
     for key in getattr(field.annotation, "model_fields", {})
 }
 SECTIONS = "|".join(sorted({key.partition(".")[0] for key in KEYS}))
-KEY = re.compile(rf"(?<![\w./-])(?:{SECTIONS})\.(?!(?:json|md)\b)[a-z_]+\b(?!\.)")
+KEY = re.compile(rf"(?<![\w./-])(?:{SECTIONS})\.(?!(?:json|md|npz)\b)[a-z_]+\b(?!\.)")
 
 
 def _anchors(page: Path) -> set[str]:

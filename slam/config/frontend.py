@@ -89,7 +89,7 @@ class LengthConfig(Section):
 
 
 class KeyframesConfig(Section):
-    """Keyframes with bundle adjustment, see ``frontend/window/odometry.py``."""
+    """Keyframes with bundle adjustment, see ``frontend/keyframes/odometry.py``."""
 
     use: Literal["auto", "always", "never"] = Field(
         default="auto",

@@ -24,14 +24,14 @@ from slam.frames import (
     runs,
 )
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.segments import Segment
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.window.odometry import Segment as MapSegment
-from slam.frontend.window.relative_poses import WindowPoses
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 T = TypeVar("T")
@@ -132,7 +132,7 @@ class Drive:
     gap_steps: list[RelativePose] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
     maps: list[MapSegment] = field(default_factory=list)
-    map_poses: WindowPoses = field(default_factory=WindowPoses)
+    map_poses: KeyframePoses = field(default_factory=KeyframePoses)
     events: list[TrackingEvent] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -200,7 +200,7 @@ class Drive:
             repeated=[k - first for k in last(reversed(self.repeated), lambda k: k)],
         )
 
-    def with_maps(self, poses: WindowPoses, joins: Iterable[TrackingEvent]) -> Drive:
+    def with_maps(self, poses: KeyframePoses, joins: Iterable[TrackingEvent]) -> Drive:
         """The same with poses by joined maps, which also relate segments of the drive that lie in one map."""
         segments: list[Segment] = []
         for segment in self.segments:

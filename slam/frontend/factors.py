@@ -12,6 +12,8 @@ from slam.config.sections import PoseNetworkConfig, VisualOdometryConfig
 from slam.frames import Ends, RelativePose
 from slam.frontend.drive import Drive
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
+from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE, KeyframePoses
 from slam.frontend.network_factors import (
     NETWORK_SOURCE,
     STUDENT_T_DOF,
@@ -23,8 +25,6 @@ from slam.frontend.network_factors import (
 from slam.frontend.scale.metric_scale import Scale
 from slam.frontend.step_table import StepTable, links
 from slam.frontend.visual.step_noise import StepNoise, inflate_step_sigmas
-from slam.frontend.window.gaps import join_gap_ends
-from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses
 from slam.geometry.se3 import FloatArray, invert, nearest_rotation
 
 
@@ -53,17 +53,17 @@ def make_factors(
         networks = calibrated_factors(drive.trusted, unscaled, noise)
     if pose_network.use == "gaps" or (pose_network.use == "calibrated" and noise is None):
         networks = without_measured(networks, geometric)
-    window = drive.map_poses
+    maps = drive.map_poses
 
     def outside(poses: Sequence[RelativePose]) -> list[RelativePose]:
-        return [pose for pose in poses if not window.is_inside(pose)]
+        return [pose for pose in poses if not maps.is_inside(pose)]
 
     by_network, interpolated = (
         [pose.scaled(scale.unit_at(pose)) for pose in outside(poses)] for poses in (networks, drive.gap_steps)
     )
-    by_image, by_window = outside(geometric), scaled_poses(window.poses, window, scale)
-    interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_window, window.segments)
-    return [*by_network, *interpolated, *by_image, *by_window]
+    by_image, by_keyframes = outside(geometric), scaled_poses(maps.poses, maps, scale)
+    interpolated = join_gap_ends(interpolated, [*by_network, *by_image], by_keyframes, maps.segments)
+    return [*by_network, *interpolated, *by_image, *by_keyframes]
 
 
 def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePose]) -> list[RelativePose]:
@@ -73,16 +73,16 @@ def with_lidar(factors: Sequence[RelativePose], lidar_steps: Sequence[RelativePo
     return [*before, *lidar_steps, *(factor for factor in factors if factor.source not in less_certain)]
 
 
-def scaled_poses(poses: Sequence[RelativePose], window: WindowPoses, scale: Scale) -> list[RelativePose]:
+def scaled_poses(poses: Sequence[RelativePose], maps: KeyframePoses, scale: Scale) -> list[RelativePose]:
     """Poses by keyframes in the unit of the scale: one factor for each map, in which lengths are consistent."""
-    units = {number: window.learned_units[number] * unit for number, unit in depth_units(window, scale).items()}
-    return [pose.scaled(units[window.segments[pose.from_index]]) for pose in poses]
+    units = {number: maps.learned_units[number] * unit for number, unit in depth_units(maps, scale).items()}
+    return [pose.scaled(units[maps.segments[pose.from_index]]) for pose in poses]
 
 
-def depth_units(window: WindowPoses, scale: Scale) -> dict[int, float]:
+def depth_units(maps: KeyframePoses, scale: Scale) -> dict[int, float]:
     """The unit of the scale per learned depth in each map, by the map's number."""
-    numbers = set(window.segments.values())
-    return {number: float(np.median(scale.per_frame[window.frames_of(number)])) for number in numbers}
+    numbers = set(maps.segments.values())
+    return {number: float(np.median(scale.per_frame[maps.frames_of(number)])) for number in numbers}
 
 
 def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale: Scale) -> FloatArray:
@@ -113,7 +113,7 @@ def chain_odometry(factors: Sequence[RelativePose], T_network: FloatArray, scale
 
 
 def _precedence(factor: RelativePose) -> tuple[bool, int]:
-    return factor.source == WINDOW_SOURCE, factor.from_index
+    return factor.source == KEYFRAME_SOURCE, factor.from_index
 
 
 def _geometric(steps: StepTable, scale: Scale, config: VisualOdometryConfig) -> list[RelativePose]:

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from slam.frames import RelativePose, SnippetPoses, TrackingEvent, runs
 from slam.frontend.drive import Drive
+from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.rotation_smoothing import smooth_rotations
 from slam.frontend.segments import find_cuts, find_segments
 from slam.frontend.step_table import StepTable
 from slam.frontend.visual.motion import Motion
-from slam.frontend.window.odometry import Segment as MapSegment
-from slam.frontend.window.relative_poses import WindowPoses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 from slam.runtime.errors import SlamError
 
@@ -34,7 +34,7 @@ def complete_drive(
     drive: Drive,
     sources: int,
     maps: Sequence[MapSegment] = (),
-    map_poses: WindowPoses | None = None,
+    map_poses: KeyframePoses | None = None,
     events: Sequence[TrackingEvent] = (),
 ) -> Drive:
     """The drive with its gaps interpolated, its rotations smoothed, and its segments; more frames may follow.
@@ -49,7 +49,7 @@ def complete_drive(
     Raises:
         SlamError: no snippet was measured, so there is no motion to extrapolate.
     """
-    map_poses = map_poses or WindowPoses()
+    map_poses = map_poses or KeyframePoses()
     measured = {*drive.steps.motions, *map_poses.steps}
     cuts = find_cuts(drive.failures, measured, {*drive.unusable, *drive.repeated})
     filled = interpolate_gaps(drive, sources, cuts)

@@ -21,6 +21,9 @@ from slam.frames import Sequence as FrameSequence
 from slam.frontend.drive import Drive, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.image_gate import GateState
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.odometry import KeyframeOdometryState, MapSegment, TrackedFrame
+from slam.frontend.keyframes.relative_poses import KeyframePoses
 from slam.frontend.scale.road_homography import RoadStep
 from slam.frontend.scale.road_plane import GroundPlane
 from slam.frontend.visual.depth_error import DepthError
@@ -30,11 +33,8 @@ from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.odometry import OdometryState
 from slam.frontend.visual.relative_rotation import RelativeRotation
-from slam.frontend.visual.tracking import Corners, TrackerState
+from slam.frontend.visual.tracking import Corners, CornerTrackerState
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
-from slam.frontend.window.local_map import LocalMap, WindowKeyframe
-from slam.frontend.window.odometry import Segment, TrackedFrame, WindowState
-from slam.frontend.window.relative_poses import WindowPoses
 from slam.geometry.se3 import FloatArray
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.runtime.errors import RunError, SlamError
@@ -128,10 +128,10 @@ class SessionCheckpoint:
 
 
 SERIALISER = Serialiser(
-    *(SessionCheckpoint, FrontEndState, Drive, GateState, OdometryState, TrackerState, MotionHistory),
+    *(SessionCheckpoint, FrontEndState, Drive, GateState, OdometryState, CornerTrackerState, MotionHistory),
     *(Corners, DepthError, DynamicMask, Frame, RecentFrame, Intrinsics, Motion, UnitRelativePose, TriangulatedPoints),
     *(RelativePose, RelativeRotation, SnippetPoses, RoadStep, GroundPlane, MeasurementFailure, View),
-    *(WindowPoses, WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent),
+    *(KeyframePoses, KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent),
 )
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from slam.frames import DepthMap, Frame
 from slam.frontend.drive import Drive
 from slam.frontend.image_gate import GateState
+from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.visual.odometry import OdometryState
-from slam.frontend.window.odometry import WindowState
 from slam.geometry.se3 import FloatArray
 
 
@@ -28,8 +28,8 @@ class FrontEndState:
     drive: Drive
     gate: GateState
     odometry: OdometryState
-    keyframes: WindowState | None
+    keyframes: KeyframeOdometryState | None
     road_directions: tuple[FloatArray, ...]
-    window: tuple[Frame, ...]
+    snippet_frames: tuple[Frame, ...]
     recent: tuple[RecentFrame, ...]
     unread: int

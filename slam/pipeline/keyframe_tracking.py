@@ -11,11 +11,11 @@ import numpy as np
 from slam.config.sections import KeyframesConfig, LoopsConfig
 from slam.frames import DepthMap, Frame, Intrinsics, TrackingEvent, View
 from slam.frontend.drive import Drive
-from slam.frontend.window.descriptors import describe
-from slam.frontend.window.flow import new_corners
-from slam.frontend.window.local_map import LocalMap
-from slam.frontend.window.odometry import Segment, WindowOdometry, WindowState
-from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
+from slam.frontend.keyframes.descriptors import describe
+from slam.frontend.keyframes.flow import new_corners
+from slam.frontend.keyframes.local_map import LocalMap
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState, MapSegment
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
 from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
@@ -57,7 +57,7 @@ class KeyframeTracking:
         loops: LoopsConfig,
         intrinsics: Intrinsics,
         seed: int,
-        state: WindowState | None,
+        state: KeyframeOdometryState | None,
         camera_height_m: float | None = None,
     ) -> None:
         """Prepare for the first frame, or resume; a state of None is of a drive that is measured by steps alone."""
@@ -65,9 +65,9 @@ class KeyframeTracking:
         self._camera_height_m = camera_height_m
         self._places: Relocaliser | None = None
         self._front_end: FrontEnd = "steps" if state is None else "both"
-        self._odometry = None if state is None else WindowOdometry(config, intrinsics, seed, state)
+        self._odometry = None if state is None else KeyframeOdometry(config, intrinsics, seed, state)
 
-    def state(self) -> WindowState | None:
+    def state(self) -> KeyframeOdometryState | None:
         """The state to resume from."""
         return None if self._odometry is None else self._odometry.state()
 
@@ -91,7 +91,7 @@ class KeyframeTracking:
         if lost is not None and self._loops.enabled and frame.index % _RELOCALISED_FRAMES == 0:
             self._relocalise(self._odometry, lost.map, frame, depth)
 
-    def _relocalise(self, odometry: WindowOdometry, lost: LocalMap, frame: Frame, depth: DepthMap) -> None:
+    def _relocalise(self, odometry: KeyframeOdometry, lost: LocalMap, frame: Frame, depth: DepthMap) -> None:
         """Look for the camera among all keyframes of the map in which it was lost."""
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
@@ -145,7 +145,7 @@ class KeyframeTracking:
         T_before_frame[:3, 3] *= learned_unit(LocalMap(segment.map.keyframes[-_KEYFRAMES:], segment.map.points))
         return before, T_before_frame
 
-    def maps(self, drive: Drive) -> tuple[Segment, ...]:
+    def maps(self, drive: Drive) -> tuple[MapSegment, ...]:
         """All maps so far; none of a vehicle, nor before the choice."""
         self.choose(drive)
         if self._odometry is None or self._front_end == "both":
@@ -157,9 +157,9 @@ class KeyframeTracking:
         """What became of the maps so far."""
         return () if self._odometry is None else self._odometry.events
 
-    def poses(self, maps: Sequence[Segment]) -> WindowPoses:
+    def poses(self, maps: Sequence[MapSegment]) -> KeyframePoses:
         """Relative poses of all frames of some maps."""
-        return window_poses(maps, self._intrinsics, self._seed)
+        return keyframe_poses(maps, self._intrinsics, self._seed)
 
 
 def _is_on_vehicle(drive: Drive) -> bool | None:

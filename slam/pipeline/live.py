@@ -22,8 +22,8 @@ from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import choose
+from slam.pipeline.live_poses import LivePoses
 from slam.pipeline.observer import Observer
-from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.errors import SlamError
@@ -100,7 +100,7 @@ class Slam:
         self._pipeline.require_possible()
         self._observer = self._observe(None)
         self._is_closed = False
-        self._tracker = Tracker(predictor.sources, camera_height_m, config, noise, update=update_frames)
+        self._poses = LivePoses(predictor.sources, camera_height_m, config, noise, update=update_frames)
         self._sweep_frames = sweep_frames
 
     @classmethod
@@ -143,7 +143,7 @@ class Slam:
         None before the first snippet and, where metres are wanted, until a road is seen: lengths are the networks' own
         up to then.
         """
-        return self._tracker.unit_name
+        return self._poses.unit_name
 
     def __enter__(self) -> Self:
         return self
@@ -191,7 +191,7 @@ class Slam:
         finally:  # the error may be of the frame before
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
-        self._tracker.add(self._observer)
+        self._poses.add(self._observer)
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
             self.close_loops()
 
@@ -237,8 +237,8 @@ class Slam:
         if not len(self):
             raise SlamError("no trajectory before the first frame")
         self._observer.flush()
-        self._tracker.add(self._observer)
-        return Trajectory(self._sequence.stamps.copy(), self._tracker.T_world_camera)
+        self._poses.add(self._observer)
+        return Trajectory(self._sequence.stamps.copy(), self._poses.T_world_camera)
 
     @_in_turn
     def close_loops(self) -> LoopClosures:
@@ -252,7 +252,7 @@ class Slam:
             return LoopClosures(not_sought="there are too few usable frames")
         drive, closure = self._pipeline.close_maps(self._observer.complete_drive())
         estimate = self._pipeline.solve(drive, self._observer.state(), closure)
-        self._tracker.correct(estimate.optimised.T_world_camera, estimate.scale)
+        self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
         return estimate.loops
 
     def _observe(self, state: FrontEndState | None) -> Observer:

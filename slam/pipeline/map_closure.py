@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import connected_components
 from slam.config.sections import SlamConfig
 from slam.frames import Intrinsics, RelativeSimilarity, TrackingEvent, View
 from slam.frontend.factors import depth_units, scaled_poses
+from slam.frontend.keyframes.joining import SharedCorners, join
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.odometry import MapSegment
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses, learned_unit
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.window.joining import SharedCorners, join
-from slam.frontend.window.local_map import LocalMap, WindowKeyframe
-from slam.frontend.window.odometry import Segment
-from slam.frontend.window.relative_poses import WindowPoses, learned_unit, window_poses
 from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.graph.similarity_graph import optimise_similarities
 from slam.loops.closure import LoopClosures
@@ -45,7 +45,7 @@ class MapClosure:
     each keyframe, before maps were joined, by its frame.
     """
 
-    poses: WindowPoses
+    poses: KeyframePoses
     loops: tuple[MapLoop, ...] = ()
     rejected: tuple[RejectedLoop, ...] = ()
     learned_units: Mapping[int, float] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class MapClosure:
         return LoopClosures(self.candidates, self.measured, tuple(accepted), tuple(rejected))
 
 
-def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConfig, seed: int = 0) -> MapClosure:
+def close_maps(maps: Sequence[MapSegment], intrinsics: Intrinsics, config: SlamConfig, seed: int = 0) -> MapClosure:
     """Find loops among all keyframes, join maps that share a place, adjust all keyframes of maps with loops.
 
     Args:
@@ -77,7 +77,7 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
     maps = [segment for segment in maps if segment.started]
     rows = _Rows(maps)
     if not maps:
-        return MapClosure(WindowPoses())
+        return MapClosure(KeyframePoses())
     found = find_map_loops(rows.views(), rows.T_map_camera, rows.maps, rows.apart(), intrinsics, seed)
     loops, rejected = list(found.found), list(found.rejected)
     while True:
@@ -87,7 +87,7 @@ def close_maps(maps: Sequence[Segment], intrinsics: Intrinsics, config: SlamConf
         loops = [loop for loop in loops if loop not in wrong]
         rejected += [rows.refused(loop, "its corners are not the same points after the adjustment") for loop in wrong]
     ends = [(rows.keyframes[loop.rows[0]].index, rows.keyframes[loop.rows[1]].index) for loop in loops]
-    poses = window_poses(closed, intrinsics, seed, ends)
+    poses = keyframe_poses(closed, intrinsics, seed, ends)
     joins = rows.joins(loops)
     for joined in joins:
         logger.info("%s", joined)
@@ -107,9 +107,9 @@ def views_of(local: LocalMap) -> list[View]:
 class _Rows:
     """The keyframes of all maps, row by row."""
 
-    def __init__(self, maps: Sequence[Segment]) -> None:
+    def __init__(self, maps: Sequence[MapSegment]) -> None:
         self.segments = maps
-        self.keyframes: list[WindowKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
+        self.keyframes: list[TrackedKeyframe] = [keyframe for segment in maps for keyframe in segment.map.keyframes]
         counts = [len(segment.map.keyframes) for segment in maps]
         self.maps: NDArray[np.intp] = np.repeat(np.arange(len(maps)), counts)
         self.T_map_camera = invert(np.array([k.T_camera_world for k in self.keyframes]).reshape(-1, 4, 4))
@@ -175,7 +175,7 @@ class _Rows:
         return T, scales
 
 
-def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tuple[list[Segment], list[MapLoop]]:
+def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tuple[list[MapSegment], list[MapLoop]]:
     """The maps after these loops, and the loops that the adjustment contradicts."""
     count = len(rows.segments)
     ends = rows.maps[np.array([loop.rows for loop in loops], np.intp).reshape(-1, 2)]
@@ -196,7 +196,7 @@ def _closed(rows: _Rows, loops: Sequence[MapLoop], intrinsics: Intrinsics) -> tu
 
 def _joined(
     rows: _Rows, loops: Sequence[MapLoop], members: NDArray[np.intp], intrinsics: Intrinsics
-) -> tuple[Segment, list[float]]:
+) -> tuple[MapSegment, list[float]]:
     T, scales = rows.start(loops, members)
     chosen = np.flatnonzero(np.isin(rows.maps, members))
     place = np.full(len(rows.keyframes), -1)

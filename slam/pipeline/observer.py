@@ -17,12 +17,12 @@ from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.image_gate import ImageGate, Verdict
+from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
 from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
-from slam.frontend.window.odometry import WindowState
 from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
@@ -96,13 +96,13 @@ class Observer:
         self._odometry = VisualOdometry(
             config.visual_odometry, intrinsics, seed, None if state is None else state.odometry
         )
-        keyframes = WindowState() if state is None else state.keyframes
+        keyframes = KeyframeOdometryState() if state is None else state.keyframes
         self._keyframes = KeyframeTracking(config.keyframes, config.loops, intrinsics, seed, keyframes, camera_height_m)
         self._keyframes.choose(self._drive)
         self._road = RoadHomography(config.road, intrinsics, () if state is None else state.road_directions)
         self._plane = GroundPlaneFitter(config.scale, intrinsics, seed)
         self._features = FeatureExtractor(intrinsics)
-        self._window: tuple[Frame, ...] = () if state is None else state.window
+        self._snippet_frames: tuple[Frame, ...] = () if state is None else state.snippet_frames
         self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
         self._unread = 0 if state is None else state.unread
         self._spill_file = SpillFile()
@@ -160,7 +160,7 @@ class Observer:
         """A snapshot from which another observer continues as without an interruption."""
         self.flush()
         parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        return FrontEndState(self._drive.copy(), *parts, self._window, self._recent, self._unread)
+        return FrontEndState(self._drive.copy(), *parts, self._snippet_frames, self._recent, self._unread)
 
     @property
     def frames(self) -> int:
@@ -201,17 +201,17 @@ class Observer:
         finally:  # the error is of the frame before
             self._drive.unusable[index] = reason
             self._drive.roads.append(MeasurementFailure(reason))
-            self._window = ()
+            self._snippet_frames = ()
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
         sources, index = self._predictor.sources, frame.index
-        self._window = (*self._window, frame)[-sources - 1 :]
+        self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         is_sparse = self._keyframes.measures(self._drive, index - 2)  # finished, whatever else is
         depth = snippet = None
         if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
-        if len(self._window) > sources and (not is_sparse or index % sources == 0):
-            snippet = self._networks.submit(self._predictor.snippet, list(self._window))
+        if len(self._snippet_frames) > sources and (not is_sparse or index % sources == 0):
+            snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return PendingFrame(frame, depth, snippet)
 
     def _process_pending(self) -> None:

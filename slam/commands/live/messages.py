@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from slam.formats.trajectory import Trajectory
-from slam.pipeline.tracker import Tracked
+from slam.pipeline.live_poses import LivePose
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_extra
 
@@ -18,11 +18,11 @@ _LAST_PORT = 65535
 Emit = Callable[[dict[str, Any]], None]
 
 
-def pose_message(index: int, stamp: float, tracked: Tracked, unit: str | None) -> dict[str, Any]:
+def pose_message(index: int, stamp: float, newest: LivePose, unit: str | None) -> dict[str, Any]:
     """One frame: its pose ``(4, 4)`` as 12 numbers, row by row as in KITTI's files."""
-    pose = [float(x) for x in tracked.T_world_camera[:3].ravel()]
-    scale = {"unit": unit, "scale": tracked.unit}
-    return {"type": "pose", "frame": index, "stamp": stamp, "state": tracked.state, **scale, "T_world_camera": pose}
+    pose = [float(x) for x in newest.T_world_camera[:3].ravel()]
+    scale = {"unit": unit, "scale": newest.unit}
+    return {"type": "pose", "frame": index, "stamp": stamp, "state": newest.state, **scale, "T_world_camera": pose}
 
 
 def corrected_message(trajectory: Trajectory, loops: int, unit: str | None, run: str) -> dict[str, Any]:

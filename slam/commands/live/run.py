@@ -28,8 +28,8 @@ from slam.formats.trajectory import Trajectory
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.estimate import Estimate
 from slam.pipeline.input_checks import require_possible
+from slam.pipeline.live_poses import LivePoses
 from slam.pipeline.observer import Observer
-from slam.pipeline.tracker import Tracker
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.results.folder import RunFolder
@@ -82,8 +82,8 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     require_possible(growing, settings, predictor.sources + 1)
     sequence = StreamedSequence(name, source, camera, request.wait)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
-    tracker = Tracker(predictor.sources, sequence.camera_height_m, settings, networks.noise)
-    session = _Session(sequence, tracker, emit, Viewer(intrinsics) if request.view else None)
+    poses = LivePoses(predictor.sources, sequence.camera_height_m, settings, networks.noise)
+    session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
         dataset=Path(request.camera),
         camera=request.calibration,
@@ -104,26 +104,26 @@ _DROPPED = "; {} images were dropped, for they came faster than they were measur
 class _Session:
     """Says where the camera is while frames come, and how it ended."""
 
-    def __init__(self, sequence: StreamedSequence, tracker: Tracker, emit: Emit, viewer: Viewer | None) -> None:
-        self._sequence, self._tracker, self._emit, self._viewer = sequence, tracker, emit, viewer
+    def __init__(self, sequence: StreamedSequence, poses: LivePoses, emit: Emit, viewer: Viewer | None) -> None:
+        self._sequence, self._poses, self._emit, self._viewer = sequence, poses, emit, viewer
         self._said = 0
 
     def watch(self, observer: Observer) -> None:
         """Say the poses of frames that were finished since the last call."""
         if not self._sequence.reader.is_waiting:
             observer.flush()
-        for tracked in self._tracker.add(observer):
+        for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
             arrival = self._sequence.arrivals.get(index)
-            message = pose_message(index, float(self._sequence.stamps[index]), tracked, self._tracker.unit_name)
+            message = pose_message(index, float(self._sequence.stamps[index]), newest, self._poses.unit_name)
             late = None if arrival is None else round(1e3 * (time.monotonic() - arrival.at_s), 1)
             self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
             if self._viewer is not None:
-                self._viewer.show(index, observer.drive, tracked)
+                self._viewer.show(index, observer.drive, newest)
 
     def tracked(self) -> Trajectory:
         """The poses that were said so far."""
-        T_world_camera = self._tracker.T_world_camera
+        T_world_camera = self._poses.T_world_camera
         return Trajectory(self._sequence.stamps[: len(T_world_camera)], T_world_camera)
 
     def finish(self, result: Estimate, folder: Path) -> None:

@@ -9,7 +9,7 @@ from slam.frames import Intrinsics
 from slam.frontend.drive import Drive
 from slam.geometry import se3
 from slam.geometry.se3 import FloatArray
-from slam.pipeline.tracker import Tracked
+from slam.pipeline.live_poses import LivePose
 from slam.runtime.imports import import_extra
 
 _EVERY = 6  # pixel of the depth map, and frame, whose points are shown
@@ -28,17 +28,17 @@ class Viewer:
         self._stream.spawn()
         self._stream.log("world", self._rr.ViewCoordinates.RDF, static=True)
 
-    def show(self, index: int, drive: Drive, tracked: Tracked) -> None:
+    def show(self, index: int, drive: Drive, newest: LivePose) -> None:
         """A frame at its pose; its image and depth where it is a keyframe."""
-        rr, stream, T = self._rr, self._stream, tracked.T_world_camera
+        rr, stream, T = self._rr, self._stream, newest.T_world_camera
         stream.set_time("frame", sequence=index)
         self._positions.append(T[:3, 3])
         stream.log("world/path", rr.LineStrips3D([np.array(self._positions[-2000:])], colors=[_PATH]))
         stream.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
         keyframe = drive.keyframes[-1] if drive.keyframes else None
-        if keyframe is None or index - keyframe.index > 1 or tracked.unit is None:
+        if keyframe is None or index - keyframe.index > 1 or newest.unit is None:
             return
-        image, depth = keyframe.image, tracked.unit * keyframe.depth_unscaled
+        image, depth = keyframe.image, newest.unit * keyframe.depth_unscaled
         height, width = depth.shape
         camera = self._intrinsics.resized(width, height)
         pinhole = rr.Pinhole(image_from_camera=camera.K, width=width, height=height)

@@ -29,7 +29,7 @@ from slam.frontend.visual.motion_history import MotionHistory
 from slam.frontend.visual.predicted_flow import PredictedFlow
 from slam.frontend.visual.relative_rotation import RelativeRotation
 from slam.frontend.visual.step_check import Step, most_credible
-from slam.frontend.visual.tracking import CornerTracker, TrackerState, Tracks
+from slam.frontend.visual.tracking import CornerTracker, CornerTrackerState, Tracks
 from slam.frontend.visual.triangulated_points import TriangulatedPoints
 from slam.frontend.visual.two_view import (
     CORNER_CORRELATION,
@@ -72,7 +72,7 @@ class OdometryState:
     Where corners alone gave its rotation and direction, ``points`` are those that it triangulated.
     """
 
-    tracker: TrackerState
+    tracker: CornerTrackerState
     dynamic_mask: DynamicMask
     history: MotionHistory
     depth_error: DepthError

@@ -54,7 +54,7 @@ class Corners:
 
 
 @dataclass(frozen=True)
-class TrackerState:
+class CornerTrackerState:
     """Corners of the last frames by frame index, and the next free track identifier."""
 
     corners: dict[int, Corners]
@@ -64,12 +64,12 @@ class TrackerState:
 class CornerTracker:
     """Tracks corners through one sequence and detects new ones where tracks were lost."""
 
-    def __init__(self, config: VisualOdometryConfig, state: TrackerState | None = None) -> None:
+    def __init__(self, config: VisualOdometryConfig, state: CornerTrackerState | None = None) -> None:
         self._config = config
-        self._state = state or TrackerState({})
+        self._state = state or CornerTrackerState({})
         self._frames_kept = config.rotation_baseline_steps + 2
 
-    def state(self) -> TrackerState:
+    def state(self) -> CornerTrackerState:
         """The state to resume from."""
         return self._state
 
@@ -133,13 +133,13 @@ class CornerTracker:
 
     def _flow(
         self, first: Grey, second: Grey, points: Pixels, side: int, predicted_flow: PredictedFlow | None
-    ) -> _Tracked:
+    ) -> _TrackedPoints:
         """Points ``(M, 2)`` tracked directly or through the predicted flow, and which are reliable."""
         plain = _Target(second, side, _PYRAMID_LEVELS)
         targets = [plain] if predicted_flow is None else [_warped(second, side, predicted_flow), plain]
         return self._first_flow(first, second, points, targets)
 
-    def _first_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _Tracked:
+    def _first_flow(self, first: Grey, second: Grey, points: Pixels, targets: Sequence[_Target]) -> _TrackedPoints:
         """Points ``(M, 2)`` by the first target in which they pass the forward-backward check."""
         pixels, kept = points.copy(), np.zeros(len(points), dtype=bool)
         for target in targets:
@@ -155,7 +155,7 @@ class CornerTracker:
             error = np.abs(backward - points[tried]).max(axis=1)
             returned = found_back & (error < _FORWARD_BACKWARD_PX)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True
-        return _Tracked(pixels, kept & are_inside(pixels, second.shape))
+        return _TrackedPoints(pixels, kept & are_inside(pixels, second.shape))
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _warped(second: Grey, side: int, predicted_flow: PredictedFlow) -> _Target:
 
 
 @dataclass(frozen=True)
-class _Tracked:
+class _TrackedPoints:
     """Tracked points ``(M, 2)``, and which of them are reliable ``(M,)``."""
 
     pixels: Pixels

@@ -18,7 +18,7 @@ from slam.pipeline.observer import Observer
 from slam.prediction.oracle import OraclePredictor
 from slam.runtime.timing import Stopwatch
 
-_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
+_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "keyframes" / "room.py")
 assert _SPEC is not None
 assert _SPEC.loader is not None
 room = importlib.util.module_from_spec(_SPEC)

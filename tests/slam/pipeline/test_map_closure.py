@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from slam.config.sections import KeyframesConfig, SlamConfig
 from slam.frames import RelativeSimilarity, View
 from slam.frontend.failure import MeasurementFailure
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState
+from slam.frontend.keyframes.relative_poses import KeyframePoses, keyframe_poses
 from slam.frontend.scale.metric_scale import Scale
-from slam.frontend.window.odometry import WindowOdometry, WindowState
-from slam.frontend.window.relative_poses import WindowPoses, window_poses
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert, rotation_angle, umeyama
 from slam.loops import maps
 from slam.loops.maps import MapLoop, MapLoops, find_map_loops
@@ -22,7 +22,7 @@ from slam.pipeline.keyframe_tracking import KeyframeTracking
 from slam.pipeline.map_closure import MapClosure, close_maps
 from slam.sequences.catalogue import open_sequence
 
-_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "window" / "room.py")
+_SPEC = importlib.util.spec_from_file_location("room", Path(__file__).parents[1] / "frontend" / "keyframes" / "room.py")
 assert _SPEC is not None
 assert _SPEC.loader is not None
 room = importlib.util.module_from_spec(_SPEC)
@@ -40,8 +40,8 @@ def there_and_back(frames: int, roll: float = 0.0, closer: float = 0.0) -> Float
     return from_rotation_vector(turns, centres)
 
 
-def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
-    odometry = WindowOdometry(CONFIG.keyframes, room.INTRINSICS)
+def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometryState:
+    odometry = KeyframeOdometry(CONFIG.keyframes, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
         frame = room.frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(frame)
@@ -49,11 +49,11 @@ def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> Windo
     return odometry.state()
 
 
-def closed(state: WindowState) -> MapClosure:
+def closed(state: KeyframeOdometryState) -> MapClosure:
     return close_maps(state.segments, room.INTRINSICS, CONFIG)
 
 
-def errors(found: WindowPoses, truth: FloatArray) -> tuple[float, float]:
+def errors(found: KeyframePoses, truth: FloatArray) -> tuple[float, float]:
     """Of the last map: root mean square of aligned positions, largest of rotations since its first frame in degrees."""
     last = max(found.segments.values())
     poses = [pose for pose in found.poses if found.segments[pose.to_index] == last]
@@ -115,7 +115,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
     truth = np.concatenate([walked[:60], walked[82:]])
     seeds = [0] * 60 + [9] * 6 + [0] * 22
     tracking = KeyframeTracking(
-        KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, WindowState()
+        KeyframesConfig(max_corners=400, use="always"), CONFIG.loops, room.INTRINSICS, 0, KeyframeOdometryState()
     )
     for k, T in enumerate(truth):
         frame = room.frame(k, T, seeds[k])
@@ -150,7 +150,9 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
     """As by a session that is resumed after every frame, and remembers no earlier map."""
     truth = there_and_back(110, roll=0.4, closer=0.3)[places]
     config = KeyframesConfig(max_corners=400, use="always")
-    going_on, resumed = (KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, WindowState()) for _ in range(2))
+    going_on, resumed = (
+        KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, KeyframeOdometryState()) for _ in range(2)
+    )
     for k, T in enumerate(truth):
         frame, depth = room.frame(k, T, 9 if k in unseen else 0), room.depth_map(T)
         for tracking in (going_on, resumed):
@@ -199,11 +201,11 @@ def test_a_real_hand_held_recording_and_its_loops(data_root: Path) -> None:
     sequence = open_sequence(recording / "images")
     indices = range(0, 320, 4)
     truth = np.loadtxt(recording / "poses.kitti.txt").reshape(-1, 3, 4)
-    odometry = WindowOdometry(KeyframesConfig(), sequence.intrinsics)
+    odometry = KeyframeOdometry(KeyframesConfig(), sequence.intrinsics)
     for k in indices:
         odometry.follow(replace(sequence.frame(k), index=k // 4))
     maps = odometry.state().segments
-    before = window_poses(maps, sequence.intrinsics)
+    before = keyframe_poses(maps, sequence.intrinsics)
     after = close_maps(maps, sequence.intrinsics, SlamConfig())
     T_world_camera = np.tile(np.eye(4), (len(truth), 1, 1))
     T_world_camera[:, :3] = truth

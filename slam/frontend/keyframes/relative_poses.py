@@ -1,4 +1,4 @@
-"""Relative poses from the maps of the window: keyframe to keyframe, and keyframe to the frames after it."""
+"""Relative poses from the maps of keyframes: keyframe to keyframe, and keyframe to the frames after it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 
 from slam.frames import LOOP_SOURCE, Ends, Intrinsics, RelativePose
+from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.odometry import MapSegment
 from slam.frontend.visual.two_view import CORNER_CORRELATION
-from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
-from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
-from slam.frontend.window.odometry import Segment
 from slam.geometry.se3 import FloatArray, apply, invert
 
-WINDOW_SOURCE = "window"
+KEYFRAME_SOURCE = "window"  # in metrics.json
 _LEAST_DEPTHS = 20
 _LEAST_LENGTH = 1e-6
 _RELATIVE_SIGMA = 0.02  # least translation sigma of a factor over the length of its step
@@ -23,7 +23,7 @@ _ROTATION_SIGMA_DEG = 0.1  # least rotation sigma of a factor, degrees
 
 
 @dataclass(frozen=True)
-class WindowPoses:
+class KeyframePoses:
     """Relative ``poses`` and ``loops`` in the units of their maps.
 
     ``segments`` is the number of the map of every frame that has a pose in one, ``learned_units`` the unit of learned
@@ -56,9 +56,9 @@ class WindowPoses:
         return [frame for frame, number in self.segments.items() if number == segment]
 
 
-def window_poses(
-    maps: Sequence[Segment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
-) -> WindowPoses:
+def keyframe_poses(
+    maps: Sequence[MapSegment], intrinsics: Intrinsics, seed: int = 0, loops: Sequence[Ends] = ()
+) -> KeyframePoses:
     """All relative poses of some maps.
 
     Args:
@@ -77,10 +77,10 @@ def window_poses(
         segments |= dict.fromkeys((frame for pose in found for frame in pose.ends), number)
         units[number] = learned_unit(segment.map)
         closing |= _loop_poses(segment.map, loops, intrinsics, seed)
-    return WindowPoses(poses, segments, [closing[ends] for ends in loops], units)
+    return KeyframePoses(poses, segments, [closing[ends] for ends in loops], units)
 
 
-def _segment_poses(segment: Segment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
+def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> list[RelativePose]:
     local, keyframes = segment.map, segment.map.keyframes
     place = {keyframe.index: k for k, keyframe in enumerate(keyframes)}
     found: list[RelativePose] = []
@@ -150,11 +150,11 @@ def _seen_from(
 
 
 def _relative(
-    keyframe: WindowKeyframe, index: int, T_camera_world: FloatArray, sigmas: FloatArray | None
+    keyframe: TrackedKeyframe, index: int, T_camera_world: FloatArray, sigmas: FloatArray | None
 ) -> RelativePose:
     """From a keyframe to a later camera; with few points of its own, a keyframe has the least certain sigmas."""
     T_from_to = keyframe.T_camera_world @ invert(T_camera_world)
     length = float(np.linalg.norm(T_from_to[:3, 3]))
     floors = np.repeat([np.deg2rad(_ROTATION_SIGMA_DEG), _RELATIVE_SIGMA * max(length, _LEAST_LENGTH)], 3)
     own = 10.0 * floors if sigmas is None else sigmas
-    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), WINDOW_SOURCE)
+    return RelativePose(keyframe.index, index, T_from_to, np.hypot(own, floors), KEYFRAME_SOURCE)

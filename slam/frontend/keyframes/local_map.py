@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.keyframes.descriptors import Descriptors
+from slam.frontend.keyframes.flow import flow
 from slam.frontend.sparse_flow import Pixels
-from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
-from slam.frontend.window.descriptors import Descriptors
-from slam.frontend.window.flow import flow
 from slam.geometry.se3 import FloatArray, apply, invert
 from slam.geometry.triangulation import triangulate
 
@@ -40,7 +40,7 @@ _ADJUSTED = 10  # number of the last keyframes that are adjusted
 
 
 @dataclass(frozen=True)
-class WindowKeyframe:
+class TrackedKeyframe:
     """A frame whose corners are sightings: ``track_ids`` ``(M,)`` in order and their ``pixels`` ``(M, 2)``.
 
     ``learned_depth`` ``(M,)`` is NaN where unknown, ``descriptors`` are ``(M, 32)``; ``grey`` is None once the image is
@@ -55,15 +55,15 @@ class WindowKeyframe:
     descriptors: Descriptors
     grey: Grey | None
 
-    def with_depth(self, depth: DepthMap) -> WindowKeyframe:
+    def with_depth(self, depth: DepthMap) -> TrackedKeyframe:
         """The same with learned depth ``(H, W)`` at its corners."""
         return replace(self, learned_depth=nearest_depth(depth, self.pixels))
 
-    def without(self, gone: TrackIds) -> WindowKeyframe:
+    def without(self, gone: TrackIds) -> TrackedKeyframe:
         """The same without some tracks."""
         return self.with_corners(np.flatnonzero(~np.isin(self.track_ids, gone)), self.track_ids)
 
-    def with_corners(self, rows: NDArray[np.intp], track_ids: TrackIds) -> WindowKeyframe:
+    def with_corners(self, rows: NDArray[np.intp], track_ids: TrackIds) -> TrackedKeyframe:
         """The same with some of its corners, whose tracks are rows of other ``track_ids`` ``(M,)``, in their order."""
         return replace(
             self,
@@ -78,7 +78,7 @@ class WindowKeyframe:
 class LocalMap:
     """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated."""
 
-    keyframes: list[WindowKeyframe] = field(default_factory=list)
+    keyframes: list[TrackedKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def copy(self) -> LocalMap:
@@ -95,7 +95,7 @@ class LocalMap:
         self.points = np.vstack([self.points, np.full((count, 3), np.nan)])
         return np.arange(first, first + count)
 
-    def add(self, keyframe: WindowKeyframe) -> None:
+    def add(self, keyframe: TrackedKeyframe) -> None:
         """Add the newest keyframe; images of old ones are not kept."""
         self.keyframes.append(keyframe)
         if len(self.keyframes) > _IMAGES_KEPT:
@@ -226,7 +226,7 @@ class LocalMap:
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
         return np.concatenate(tracks), np.concatenate(places)
 
-    def _near(self, T_camera_world: FloatArray, track_ids: TrackIds) -> list[WindowKeyframe]:
+    def _near(self, T_camera_world: FloatArray, track_ids: TrackIds) -> list[TrackedKeyframe]:
         """Keyframes with images whose cameras are near and look the same way, the nearest first."""
         known = track_ids[self.known(track_ids)]
         kept = [keyframe for keyframe in self.keyframes if keyframe.grey is not None]
@@ -243,7 +243,7 @@ class LocalMap:
 
 
 def _matched(
-    keyframe: WindowKeyframe,
+    keyframe: TrackedKeyframe,
     rows: NDArray[np.intp],
     grey: Grey,
     T_camera_world: FloatArray,

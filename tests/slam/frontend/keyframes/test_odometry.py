@@ -6,9 +6,9 @@ import pytest
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import TrackingEvent
-from slam.frontend.window.local_map import LocalMap, WindowKeyframe
-from slam.frontend.window.odometry import Segment, TrackedFrame, WindowOdometry, WindowState
-from slam.frontend.window.relative_poses import WINDOW_SOURCE, WindowPoses, window_poses
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe
+from slam.frontend.keyframes.odometry import KeyframeOdometry, KeyframeOdometryState, MapSegment, TrackedFrame
+from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE, KeyframePoses, keyframe_poses
 from slam.geometry.se3 import FloatArray, rotation_angle, umeyama
 from slam.runtime.storage.serialisation import Serialiser
 
@@ -21,8 +21,8 @@ _SPEC.loader.exec_module(room)
 CONFIG = KeyframesConfig(max_corners=200)
 
 
-def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> WindowState:
-    odometry = WindowOdometry(CONFIG, room.INTRINSICS)
+def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> KeyframeOdometryState:
+    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS)
     for k, T in enumerate(T_world_camera):
         frame = room.frame(k, T, 0 if seeds is None else seeds[k])
         odometry.follow(frame)
@@ -30,11 +30,11 @@ def tracked(T_world_camera: FloatArray, seeds: list[int] | None = None) -> Windo
     return odometry.state()
 
 
-def poses(state: WindowState) -> WindowPoses:
-    return window_poses(state.segments, room.INTRINSICS)
+def poses(state: KeyframeOdometryState) -> KeyframePoses:
+    return keyframe_poses(state.segments, room.INTRINSICS)
 
 
-def chained(found: WindowPoses) -> dict[int, FloatArray]:
+def chained(found: KeyframePoses) -> dict[int, FloatArray]:
     T = {found.poses[0].from_index: np.eye(4)}
     for pose in found.poses:
         T[pose.to_index] = T[pose.from_index] @ pose.T_from_to
@@ -47,7 +47,7 @@ def test_a_hand_held_camera_is_followed() -> None:
     found = poses(state)
     T = chained(found)
     assert sorted(T) == list(range(70))
-    assert {pose.source for pose in found.poses} == {WINDOW_SOURCE}
+    assert {pose.source for pose in found.poses} == {KEYFRAME_SOURCE}
     assert 4 <= len(state.segments[0].map.keyframes) <= 30
     estimate = np.stack([T[k] for k in range(70)])
     similarity = umeyama(truth[:, :3, 3], estimate[:, :3, 3], with_scale=True)
@@ -64,7 +64,7 @@ def test_a_hand_held_camera_is_followed() -> None:
 def test_a_map_begins_on_a_plane(seed: int) -> None:
     """A wall faced squarely fits many essential matrices: with seed 5 theirs turned the camera by 90 degrees."""
     truth = room.walk(50)
-    odometry = WindowOdometry(CONFIG, room.INTRINSICS, seed)
+    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, seed)
     for k, T_world_camera in enumerate(truth):
         odometry.follow(room.frame(k, T_world_camera, near=False))
         odometry.learn(room.frame(k, T_world_camera, near=False), room.depth_map(T_world_camera))
@@ -111,9 +111,9 @@ def test_another_scene_begins_another_map() -> None:
 def test_resumed_from_a_file_it_gives_the_same(tmp_path: Path) -> None:
     truth = room.walk(40)
     whole = poses(tracked(truth))
-    serialiser = Serialiser(WindowState, Segment, TrackedFrame, LocalMap, WindowKeyframe, TrackingEvent)
+    serialiser = Serialiser(KeyframeOdometryState, MapSegment, TrackedFrame, LocalMap, TrackedKeyframe, TrackingEvent)
     serialiser.write(tmp_path / "state", tracked(truth[:25]))
-    odometry = WindowOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
+    odometry = KeyframeOdometry(CONFIG, room.INTRINSICS, 0, serialiser.read(tmp_path / "state"))
     for k in range(25, 40):
         frame = room.frame(k, truth[k])
         odometry.follow(frame)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
+from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
+from slam.frontend.keyframes.descriptors import describe
+from slam.frontend.keyframes.flow import flow, new_corners
+from slam.frontend.keyframes.initialisation import View, first_points
+from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import parallax_px, rotation_between
-from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
-from slam.frontend.window.descriptors import describe
-from slam.frontend.window.flow import flow, new_corners
-from slam.frontend.window.initialisation import View, first_points
-from slam.frontend.window.local_map import LocalMap, TrackIds, WindowKeyframe
 from slam.geometry.se3 import FloatArray, invert
 
 logger = logging.getLogger(__name__)
@@ -52,23 +52,23 @@ class TrackedFrame:
 
 
 @dataclass
-class Segment:
+class MapSegment:
     """One map, from its first keyframe to a loss: ``frames`` in time order; ``started`` once it has points."""
 
     map: LocalMap = field(default_factory=LocalMap)
     frames: list[TrackedFrame] = field(default_factory=list)
     started: bool = False
 
-    def copy(self) -> Segment:
+    def copy(self) -> MapSegment:
         """A snapshot, which stays while this map grows."""
         return replace(self, map=self.map.copy(), frames=self.frames.copy())
 
 
 @dataclass
-class WindowState:
+class KeyframeOdometryState:
     """Maps of a drive so far; of the last one, what continues: places of the keyframe's corners ``(M, 2)``, poses."""
 
-    segments: list[Segment] = field(default_factory=list)
+    segments: list[MapSegment] = field(default_factory=list)
     places: Pixels = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     slipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
@@ -76,31 +76,31 @@ class WindowState:
     lost: int = 0
     events: list[TrackingEvent] = field(default_factory=list)
 
-    def copy(self) -> WindowState:
+    def copy(self) -> KeyframeOdometryState:
         """A snapshot, which stays while frames follow."""
         segments = [segment.copy() for segment in self.segments]
         places, slipped, events = self.places.copy(), self.slipped.copy(), self.events.copy()
         return replace(self, segments=segments, places=places, slipped=slipped, events=events)
 
 
-class WindowOdometry:
+class KeyframeOdometry:
     """Poses of the frames of one sequence in the unit of each segment's map."""
 
     def __init__(
-        self, config: KeyframesConfig, intrinsics: Intrinsics, seed: int = 0, state: WindowState | None = None
+        self, config: KeyframesConfig, intrinsics: Intrinsics, seed: int = 0, state: KeyframeOdometryState | None = None
     ) -> None:
         """Prepare for the first frame, or resume from a ``state``; ``seed`` is that of RANSAC."""
         self._config = config
         self._intrinsics = intrinsics
         self._seed = seed
-        self._state = WindowState() if state is None else state.copy()
+        self._state = KeyframeOdometryState() if state is None else state.copy()
 
-    def state(self) -> WindowState:
+    def state(self) -> KeyframeOdometryState:
         """A snapshot to resume from."""
         return self._state.copy()
 
     @property
-    def segments(self) -> Sequence[Segment]:
+    def segments(self) -> Sequence[MapSegment]:
         """The maps so far, which grow with the frames."""
         return self._state.segments
 
@@ -109,7 +109,7 @@ class WindowOdometry:
         """The events of the maps so far."""
         return self._state.events
 
-    def lost_map(self) -> Segment | None:
+    def lost_map(self) -> MapSegment | None:
         """The map in which the camera was lost, until it is found again or another map has points."""
         started = [segment for segment in self._state.segments if segment.started]
         is_lost = bool(started) and (self._state.lost > 0 or not self._state.segments[-1].started)
@@ -183,11 +183,11 @@ class WindowOdometry:
             state.segments.pop()
         elif state.segments:
             self._note(state.segments[-1].frames[-state.lost].index, "lost")
-        state.segments.append(Segment())
+        state.segments.append(MapSegment())
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 
-    def _track(self, segment: Segment, frame: Frame) -> tuple[TrackIds, Pixels]:
+    def _track(self, segment: MapSegment, frame: Frame) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places."""
         state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
@@ -205,7 +205,7 @@ class WindowOdometry:
         state.places[rows] = np.where(kept[:, None], found, guesses + shift)
         return keyframe.track_ids[rows[kept]], found[kept]
 
-    def _start(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _start(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """The first points, once the parallax to the first keyframe gives them."""
         first, intrinsics = segment.map.keyframes[0], self._intrinsics
         if len(track_ids) < _LEAST_START_TRACKS:
@@ -230,7 +230,7 @@ class WindowOdometry:
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
 
-    def _locate(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
         pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
@@ -250,7 +250,7 @@ class WindowOdometry:
             self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
 
-    def _resected(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
+    def _resected(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> CameraPose | None:
         """From the last pose and from the predicted one; None with too few inliers."""
         if len(track_ids) < MIN_POINTS:
             return None
@@ -260,7 +260,7 @@ class WindowOdometry:
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
-    def _wants_keyframe(self, segment: Segment, track_ids: TrackIds, pixels: Pixels) -> bool:
+    def _wants_keyframe(self, segment: MapSegment, track_ids: TrackIds, pixels: Pixels) -> bool:
         keyframe = segment.map.keyframes[-1]
         if len(track_ids) < max(_KEYFRAME_TRACKS_RATIO * len(keyframe.track_ids), MIN_POINTS):
             return True
@@ -272,7 +272,7 @@ class WindowOdometry:
         parallax = float(np.median(parallax_px(rays_before, rays, R, self._intrinsics)))
         return parallax > limit or moved > _MOST_FLOW * limit
 
-    def _add_keyframe(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+    def _add_keyframe(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Old corners aligned and found again, new ones between them, then triangulation and bundle adjustment."""
         state, config, intrinsics, local = self._state, self._config, self._intrinsics, segment.map
         T = state.T_camera_world
@@ -288,7 +288,7 @@ class WindowOdometry:
         unknown = np.full(len(track_ids), np.nan)
         if segment.started and len(local.keyframes) == 1:
             self._add_first_keyframes(segment)
-        local.add(WindowKeyframe(frame.index, T, track_ids, places, unknown, describe(frame.grey, places), frame.grey))
+        local.add(TrackedKeyframe(frame.index, T, track_ids, places, unknown, describe(frame.grey, places), frame.grey))
         if segment.started:
             local.triangulate(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
@@ -296,7 +296,7 @@ class WindowOdometry:
         state.places = local.keyframes[-1].pixels.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
 
-    def _add_first_keyframes(self, segment: Segment) -> None:
+    def _add_first_keyframes(self, segment: MapSegment) -> None:
         """Some of the frames between the first two keyframes: more views of the first points."""
         for frame in _spread(segment.frames[:-1]):
             known = segment.map.known(frame.track_ids)
@@ -308,7 +308,7 @@ class WindowOdometry:
             places = frame.pixels.astype(np.float64)
             first = segment.map.keyframes[0]
             same = first.descriptors[np.searchsorted(first.track_ids, frame.track_ids)]
-            keyframe = WindowKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, same, None)
+            keyframe = TrackedKeyframe(frame.index, pose.T_camera_world, frame.track_ids, places, unknown, same, None)
             segment.map.add(keyframe)
 
     def _note(self, frame: int, event: Event, other: int | None = None, support: int | None = None) -> None:
@@ -316,7 +316,7 @@ class WindowOdometry:
         self._state.events.append(TrackingEvent(frame, event, other, support))
         logger.info("%s", self._state.events[-1])
 
-    def _tracked(self, segment: Segment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
+    def _tracked(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> TrackedFrame:
         last = len(segment.map.keyframes) - 1
         return TrackedFrame(frame.index, track_ids, pixels, self._state.T_camera_world, last)
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
-from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise
-from slam.frontend.window.local_map import OUTLIER_PX, LocalMap, TrackIds, WindowKeyframe
-from slam.frontend.window.odometry import Segment, TrackedFrame
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise
+from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
+from slam.frontend.keyframes.odometry import MapSegment, TrackedFrame
 from slam.geometry.se3 import FloatArray, apply, invert
 
 logger = logging.getLogger(__name__)
@@ -33,12 +33,12 @@ class SharedCorners:
 
 
 def join(
-    segments: Sequence[Segment],
+    segments: Sequence[MapSegment],
     T_world_camera: FloatArray,
     scales: FloatArray,
     shared: Sequence[SharedCorners],
     intrinsics: Intrinsics,
-) -> tuple[Segment, list[float]]:
+) -> tuple[MapSegment, list[float]]:
     """One map of several, or of one with loops; the segments stay as they are.
 
     Args:
@@ -60,8 +60,8 @@ def join(
 
 
 def _parts(
-    segments: Sequence[Segment], T_world_camera: FloatArray, scales: FloatArray
-) -> list[tuple[Segment, FloatArray, FloatArray]]:
+    segments: Sequence[MapSegment], T_world_camera: FloatArray, scales: FloatArray
+) -> list[tuple[MapSegment, FloatArray, FloatArray]]:
     ends = np.cumsum([0, *(len(segment.map.keyframes) for segment in segments)])
     return [
         (segment, T_world_camera[first:last], scales[first:last])
@@ -69,7 +69,7 @@ def _parts(
     ]
 
 
-def _moved(segment: Segment, T_world_camera: FloatArray, scales: FloatArray) -> Segment:
+def _moved(segment: MapSegment, T_world_camera: FloatArray, scales: FloatArray) -> MapSegment:
     """Points follow the first keyframe that sees them, frames the last keyframe before them."""
     before = segment.map
     points = np.full_like(before.points, np.nan)
@@ -83,7 +83,7 @@ def _moved(segment: Segment, T_world_camera: FloatArray, scales: FloatArray) -> 
     for frame in segment.frames:
         row = max(int(np.searchsorted(indices, frame.index, side="right")) - 1, 0)
         frames.append(_followed(frame, before.keyframes[row].T_camera_world, T_camera_world[row], scales[row]))
-    return Segment(LocalMap(keyframes, points), frames, segment.started)
+    return MapSegment(LocalMap(keyframes, points), frames, segment.started)
 
 
 def _followed(
@@ -96,9 +96,9 @@ def _followed(
     return replace(frame, T_camera_world=T_frame_keyframe @ T_keyframe_world)
 
 
-def _united(segments: Sequence[Segment]) -> Segment:
+def _united(segments: Sequence[MapSegment]) -> MapSegment:
     """The maps in one, with tracks numbered one map after the other."""
-    keyframes: list[WindowKeyframe] = []
+    keyframes: list[TrackedKeyframe] = []
     frames: list[TrackedFrame] = []
     first = 0
     for segment in segments:
@@ -106,10 +106,10 @@ def _united(segments: Sequence[Segment]) -> Segment:
         frames += [replace(frame, track_ids=frame.track_ids + first) for frame in segment.frames]
         first += len(segment.map.points)
     points = np.concatenate([segment.map.points for segment in segments])
-    return Segment(LocalMap(keyframes, points), frames, started=True)
+    return MapSegment(LocalMap(keyframes, points), frames, started=True)
 
 
-def _merged_tracks(keyframes: Sequence[WindowKeyframe], count: int, shared: Sequence[SharedCorners]) -> TrackIds:
+def _merged_tracks(keyframes: Sequence[TrackedKeyframe], count: int, shared: Sequence[SharedCorners]) -> TrackIds:
     """For each track the first one of the same point ``(count,)``; a keyframe never sees a point twice."""
     first = np.arange(count)
     members: dict[int, list[int]] = {}
@@ -130,7 +130,7 @@ def _merged_tracks(keyframes: Sequence[WindowKeyframe], count: int, shared: Sequ
     return first
 
 
-def _renumbered(segment: Segment, tracks: TrackIds) -> Segment:
+def _renumbered(segment: MapSegment, tracks: TrackIds) -> MapSegment:
     keyframes = []
     for keyframe in segment.map.keyframes:
         merged = tracks[keyframe.track_ids]
@@ -139,7 +139,7 @@ def _renumbered(segment: Segment, tracks: TrackIds) -> Segment:
     lonely = np.flatnonzero(np.isnan(points[tracks, 0]) & np.isfinite(points[:, 0]))
     points[tracks[lonely]] = points[lonely]
     frames = [replace(frame, track_ids=tracks[frame.track_ids]) for frame in segment.frames]
-    return Segment(LocalMap(keyframes, points), frames, started=True)
+    return MapSegment(LocalMap(keyframes, points), frames, started=True)
 
 
 def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
@@ -162,7 +162,7 @@ def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
 
 
 def _kept_ratio(
-    shared: SharedCorners, before: Sequence[WindowKeyframe], after: Sequence[WindowKeyframe], tracks: TrackIds
+    shared: SharedCorners, before: Sequence[TrackedKeyframe], after: Sequence[TrackedKeyframe], tracks: TrackIds
 ) -> float:
     seen = [
         np.isin(tracks[before[row].track_ids[corners]], after[row].track_ids)

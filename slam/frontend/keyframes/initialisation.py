@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
+from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import (
     UnitRelativePose,
@@ -23,7 +24,6 @@ from slam.frontend.visual.epipolar import (
     unit_pose_by_essential,
     unit_poses_by_homography,
 )
-from slam.frontend.window.camera_pose import INLIER_PX, MIN_POINTS, resect
 from slam.geometry.se3 import FloatArray, make, rotation_angle
 
 _LEAST_POINTS = 40

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slam.frames import Intrinsics
-from slam.frontend.window.reduced_system import Part, solve_sum
+from slam.frontend.keyframes.reduced_system import Part, solve_sum
 from slam.geometry.projection import LEAST_DEPTH as _LEAST_DEPTH
 from slam.geometry.projection import pixel_jacobian
 from slam.geometry.se3 import FloatArray, apply, make

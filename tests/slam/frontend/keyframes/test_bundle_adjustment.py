@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from slam.frames import Intrinsics
-from slam.frontend.window.bundle_adjustment import BundleAdjustment, Noise, Sightings
+from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, invert
 
 INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=520.0, cx=320.0, cy=240.0)

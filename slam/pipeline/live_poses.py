@@ -21,7 +21,7 @@ State = Literal["starting", "tracking", "bridged", "relocalised"]
 
 
 @dataclass(frozen=True)
-class Tracked:
+class LivePose:
     """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown."""
 
     T_world_camera: FloatArray
@@ -29,7 +29,7 @@ class Tracked:
     unit: float | None
 
 
-class Tracker:
+class LivePoses:
     """Poses from the measurements of the last ``window`` frames; older poses stay as they are.
 
     Lengths of all steps in the window are solved again every ``update`` frames, in between the newest step is scaled as
@@ -74,7 +74,7 @@ class Tracker:
             T_world_camera[:, :3, 3] = 0.0
         return T_world_camera
 
-    def add(self, observer: Observer) -> list[Tracked]:
+    def add(self, observer: Observer) -> list[LivePose]:
         """The frames that the observer has finished since the last call."""
         drive = observer.drive
         first, count = len(self._T_world_camera), len(drive)
@@ -83,7 +83,7 @@ class Tracker:
         if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        return [Tracked(self._T_world_camera[k], self._state(k in drive.unusable), unit) for k in range(first, count)]
+        return [LivePose(self._T_world_camera[k], self._state(k in drive.unusable), unit) for k in range(first, count)]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""

@@ -5,8 +5,8 @@ import numpy as np
 from slam.config.sections import PoseGraphConfig
 from slam.frames import RelativePose
 from slam.frontend.gap_interpolation import INTERPOLATED_SOURCE
-from slam.frontend.window.gaps import join_gap_ends
-from slam.frontend.window.relative_poses import WINDOW_SOURCE
+from slam.frontend.keyframes.gaps import join_gap_ends
+from slam.frontend.keyframes.relative_poses import KEYFRAME_SOURCE
 from slam.geometry.se3 import FloatArray, from_rotation_vector, invert
 from slam.graph.pose_graph import PoseGraph
 
@@ -24,7 +24,7 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
     truth = from_rotation_vector(np.outer(np.arange(count) >= before, [0.3, 0.8, 0.1]), centres)
     step = from_rotation_vector(np.zeros(3), np.array([0.01, 0.0, 0.0]))
     mapped = [*range(before), *range(after + 1, count)]
-    by_map = [relative(truth, a, b, 0.01, WINDOW_SOURCE) for a, b in pairwise(mapped)]
+    by_map = [relative(truth, a, b, 0.01, KEYFRAME_SOURCE) for a, b in pairwise(mapped)]
     guesses = [RelativePose(k, k + 1, step, np.full(6, 0.005), INTERPOLATED_SOURCE) for k in range(before - 1, after)]
     measured = [relative(truth, after, after + 1, 0.01, "essential")]
     found = join_gap_ends(guesses, measured, by_map, dict.fromkeys(mapped, 0))
@@ -40,6 +40,6 @@ def test_a_long_gap_ends_where_the_map_says() -> None:
 def test_a_gap_between_two_maps_stays_a_guess() -> None:
     guess = RelativePose(1, 2, np.eye(4), np.ones(6), INTERPOLATED_SOURCE)
     truth = from_rotation_vector(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
-    by_map = [relative(truth, 0, 1, 0.01, WINDOW_SOURCE), relative(truth, 2, 3, 0.01, WINDOW_SOURCE)]
+    by_map = [relative(truth, 0, 1, 0.01, KEYFRAME_SOURCE), relative(truth, 2, 3, 0.01, KEYFRAME_SOURCE)]
     (found,) = join_gap_ends([guess], [], by_map, {0: 0, 1: 0, 2: 1, 3: 1})
     assert found is guess

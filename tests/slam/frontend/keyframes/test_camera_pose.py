@@ -1,7 +1,7 @@
 import numpy as np
 
 from slam.frames import Intrinsics
-from slam.frontend.window.camera_pose import resect
+from slam.frontend.keyframes.camera_pose import resect
 from slam.geometry.projection import pixel_jacobian
 from slam.geometry.se3 import FloatArray, apply, from_rotation_vector, rotation_angle
 

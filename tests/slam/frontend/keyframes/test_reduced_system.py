@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.frontend.window.reduced_system import Part, solve_sum
+from slam.frontend.keyframes.reduced_system import Part, solve_sum
 
 
 def chain(cameras: int) -> list[Part]:

@@ -117,7 +117,9 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     here, data = tmp_path / "here", tmp_path / "data"
     shutil.copytree(tiny_weights, here / "mine")
     shutil.copytree(kitti_root, data / "root")
-    quick = "mapping: {enabled: false}\ngeometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+    quick = (
+        "mapping: {enabled: false}\nvisual_odometry: {enabled: false}\noutput: {report: false}\nscale: {mode: none}\n"
+    )
     (here / "mine.yaml").write_text(quick + "loops: {frame_stride: 3}\n")
     (data / "mine.yaml").write_text(quick + "loops: {frame_stride: 7}\n")
     words = ["batch", "../data/root", "--weights", "mine", "--config", "mine.yaml", "--frames", "0:6"]

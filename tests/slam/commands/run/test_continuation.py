@@ -189,7 +189,7 @@ def test_what_does_not_fit_is_refused(
         run_slam(kitti_root, "sim", weights=tiny_weights, frames="13:14", continues=output)
     with pytest.raises(RunError, match="run with other weights"):
         run_slam(weights="sim", continues=output)
-    with pytest.raises(ConfigError, match="geometry cannot be changed"):
+    with pytest.raises(ConfigError, match="visual_odometry cannot be changed"):
         run_slam(overrides=["visual_odometry.enabled=false"], continues=output)
     (output / DRIVE).write_bytes(b"PK")
     with pytest.raises(RunError, match=r"drive\.zip is damaged"):

@@ -60,7 +60,7 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    While keyframes alone measure the camera, depth is predicted for them and the middle frames of snippets, which touch.
+    While keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which touch.
     """
 
     def __init__(

@@ -31,14 +31,12 @@ DPI = 90
 COLOURS = 48  # a third of the bytes of a full palette, without a visible difference
 PAGE = """# Benchmarks
 
-Written by `tools/benchmark.py`, which says with `--help` how. Each section names the commit and the seeds that it was
-measured with. A seed is `--seed` of the run, which seeds its RANSAC draws and nothing else: images, worlds and weights
-are the same for every seed, and a standard deviation over seeds is that of the draws alone, neither of training nor of
-data. Position errors (ATE RMSE) are in metres, mean ± standard deviation over seeds where they differ; *scale* is the
-factor that the optimised trajectory still needs.
+`tools/benchmark.py` writes this page; `--help` says how. Every section gives its command, its commit and its seeds.
 
-An experiment beside these runs, kiss-icp on the point clouds of learned depth, is described in
-[design/tried-without-success](design/tried-without-success.md).
+- A seed is `--seed` of the run. It seeds the draws of RANSAC and nothing else: images, worlds and weights are the same
+  for every seed. A standard deviation over seeds is therefore the spread of these draws, not of training or data.
+- Position errors (ATE RMSE) are in metres: mean, and ± standard deviation if there are several seeds.
+- *scale* is the factor by which the optimised trajectory must be multiplied to fit the truth best.
 """
 
 

@@ -81,5 +81,5 @@ def check_g2o(path: Path) -> None:
         edges = np.array(ends, dtype=np.int64).reshape(-1, 2)
         if edges.size and not 0 <= edges.min() <= edges.max() < vertices:
             raise ValueError("an edge has a vertex that does not exist")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         raise RunError(f"{path} is no pose graph that can be read ({error}): run the sequence again") from error

@@ -102,10 +102,12 @@ class RecordedSequence:
             SequenceError: the images have another size than the camera, or its lens cannot be undistorted; a gap in
                 their numbers is too long; the stamps cannot be seconds; the LiDAR's calibration is not rigid.
         """
+        where = self.name
         if isinstance(self.images, ImageFiles):
             require_short_gaps(self.images.files, self.stamps)
+            where = f"{self.name} in {self.images.files.paths[0].parent}"
         if isinstance(camera, CameraFile):
-            self.images, self.intrinsics = calibrated(self.images, camera, self.name)
+            self.images, self.intrinsics = calibrated(self.images, camera, where)
             self.camera_height_m = camera.height_or(usual_height_m)
             self.depth_maps = None if camera.is_distorted else self.depth_maps
         else:

@@ -58,6 +58,9 @@ class DepthConfig(Section):
     source: str = Field(
         default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
     )
+    frame_stride: int = Field(
+        default=2, ge=1, description="depth is predicted at every n-th frame at least, and carried to those between"
+    )
     kind: Literal["auto", "depth", "disparity"] = Field(
         default="auto",
         description="content of the source; auto: depth in folders, disparity in ONNX files of erfsfm export",
@@ -104,7 +107,7 @@ class LoopsConfig(Section):
     """Loop closure, see ``loops/closure.py``."""
 
     enabled: bool = Field(default=True, description="detect and close loops")
-    frame_stride: int = Field(default=2, ge=1, description="every n-th frame is described and compared")
+    frame_stride: int = Field(default=4, ge=1, description="frames between those that are described and compared")
     min_inliers: int = Field(default=20, ge=6, description="least number of inliers of a loop")
     agreement_deg: float = Field(
         default=2.0, gt=0, description="largest difference of the rotations measured in both directions, degrees"

@@ -33,3 +33,4 @@ class FrontEndState:
     snippet_frames: tuple[Frame, ...]
     recent: tuple[RecentFrame, ...]
     unread: int
+    depth_index: int

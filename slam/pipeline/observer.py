@@ -33,6 +33,8 @@ from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
+_MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
+_LAST_ROADS = 8  # looked back for the camera's height, frames
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,9 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    While keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which touch.
+    Depth is predicted where the camera has moved on, at least at every second frame, and carried to the next one by the
+    measured motion. Snippets touch. Both are predicted for every frame that image geometry does not measure. While
+    keyframes alone measure the camera, depth is predicted for them and the targets of snippets.
     """
 
     def __init__(
@@ -104,6 +108,7 @@ class Observer:
         self._snippet_frames: tuple[Frame, ...] = () if state is None else state.snippet_frames
         self._recent: tuple[RecentFrame, ...] = () if state is None else state.recent
         self._unread = 0 if state is None else state.unread
+        self._depth_index = -1 if state is None else state.depth_index
         self._spill_file = SpillFile()
         self._networks = predictor.executor()
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="beside")
@@ -159,7 +164,7 @@ class Observer:
         """A snapshot from which another observer continues as without an interruption."""
         self.flush()
         parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        return FrontEndState(self._drive.copy(), *parts, self._snippet_frames, self._recent, self._unread)
+        return FrontEndState(self._drive.copy(), *parts, self._snippet_frames, self._recent, self._unread, self._depth_index)
 
     @property
     def frames(self) -> int:
@@ -204,14 +209,35 @@ class Observer:
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
         sources, index = self._predictor.sources, frame.index
+        is_first = len(self._snippet_frames) == sources  # since a gap
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
-        is_sparse = self._keyframes.measures(self._drive, index - 2)  # finished, whatever else is
+        # what was measured two frames ago is finished, whatever else is
+        by_keyframes, step = self._keyframes.measures(self._drive, index - 2), self._last_step(index - 2)
+        is_measured = by_keyframes or step is not None
         depth = snippet = None
-        if not is_sparse or (index + sources // 2) % sources == 0 or index in self._examples:
+        if by_keyframes:
+            is_seen = (index + sources // 2) % sources == 0
+        else:
+            is_seen = step is None or self._has_moved_on(index, step)
+        if is_seen or index in self._examples:
+            self._depth_index = index
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
-        if len(self._snippet_frames) > sources and (not is_sparse or index % sources == 0):
+        if len(self._snippet_frames) > sources and (is_first or not is_measured or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return PendingFrame(frame, depth, snippet)
+
+    def _last_step(self, index: int) -> Motion | None:
+        """The step to a frame, where image geometry measured it as the last."""
+        last = self._drive.motions[-1] if self._drive.motions else None
+        return last if last is not None and last.ends[1] == index else None
+
+    def _has_moved_on(self, index: int, step: Motion) -> bool:
+        """Whether the camera moves on from what the last predicted depth shows before the frame after this one."""
+        if index % self._config.depth.frame_stride == 0:
+            return True
+        heights = [road.height_unscaled for road in self._drive.roads[-_LAST_ROADS:] if isinstance(road, GroundPlane)]
+        far = _MOVED_ON_HEIGHTS * heights[-1] if heights else np.inf
+        return (index + 1 - self._depth_index) * step.length_unscaled > far
 
     def _process_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
@@ -264,17 +290,31 @@ class Observer:
             self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state().depth_error)
         self._keyframes.learn(frame, depth)
         height = self._remember(frame, depth, road)
-        if self._config.loops.enabled and frame.index % self._config.loops.frame_stride == 0:
+        views, loops = self._drive.views, self._config.loops
+        if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
-                self._drive.views.append(self._features.view(frame, depth, height))
+                views.append(self._features.view(frame, depth, height))
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
         """Depth and camera height, predicted late where nobody asked for them before."""
         if recent.depth is not None:
             return recent.depth, recent.height
+        carried = self._carried(recent)
+        if carried is not None:
+            self._recent = tuple(carried if r.frame is recent.frame else r for r in self._recent)
+            return carried.depth, carried.height
         depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
         return depth, self._remember(recent.frame, depth, self._plane.fit(depth, self._odometry.state().depth_error))
+
+    def _carried(self, recent: RecentFrame) -> RecentFrame | None:
+        """A recent frame with the depth of the one before it, moved; None where that or the motion is unknown."""
+        step = self._last_step(recent.frame.index)
+        before = next((r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None)
+        if step is None or before is None or before.depth is None:
+            return None
+        depth = self._odometry.carried(before.depth, step)
+        return None if depth is None else replace(recent, depth=depth, height=before.height)
 
     def _remember(self, frame: Frame, depth: DepthMap, road: GroundPlane | MeasurementFailure) -> float | None:
         """Keep the depth of a recent frame, and the camera height that is returned."""

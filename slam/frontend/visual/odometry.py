@@ -142,6 +142,18 @@ class VisualOdometry:
         self._state = replace(self._state, last=measured if isinstance(measured, Motion) else None)
         return measured
 
+    def carried(self, depth_previous_unscaled: DepthMap, motion: Motion) -> DepthMap | None:
+        """Depth ``(h, w)`` at the later frame of a measured motion, NaN where unknown; None where nothing moved.
+
+        Args:
+            depth_previous_unscaled: z-depth ``(H, W)`` of the earlier frame.
+            motion: from it.
+        """
+        known = _unit_pose_and_length(motion.relative_pose.T_from_to)
+        if known is None:
+            return None
+        return PredictedFlow(*known, self._working.depth(depth_previous_unscaled), self._intrinsics).depth_current()
+
     def relative_rotation(
         self, first: Frame, last: Frame, depth_first_unscaled: DepthMap, T_first_last: FloatArray
     ) -> Callable[[], RelativeRotation | None]:

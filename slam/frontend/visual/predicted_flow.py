@@ -1,4 +1,4 @@
-"""Optical flow predicted by learned depth and the constant-velocity model, a start for tracking corners.
+"""Optical flow of a static scene by learned depth and a motion: a start for tracking corners, and depth carried along.
 
 From a moving car a window on the road is stretched by a fifth from frame to frame, one on a near wall by a tenth.
 Lucas-Kanade shifts windows without stretching them. It then locks onto whatever part of a window has most texture:
@@ -20,6 +20,7 @@ from slam.frontend.sparse_flow import Pixels
 from slam.frontend.visual.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
+_INVERSIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +47,32 @@ class PredictedFlow:
         moved = cv2.remap(self._current, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(moved, dtype=np.float32).reshape(-1, 2)
 
+    def depth_current(self) -> DepthMap:
+        """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown."""
+        v, u = (np.arange(side, dtype=np.float32) for side in self.depth_previous.shape)
+        grid = cv2.merge([np.broadcast_to(u, self.depth_previous.shape), np.repeat(v[:, None], len(u), axis=1)])
+        flow = self._current - grid
+        before = grid - flow
+        for _ in range(_INVERSIONS - 1):  # fixed point: a pixel less the flow that ends there
+            before = grid - cv2.remap(flow, before, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        turned, moved = self._projection
+        x, y = before[..., 0], before[..., 1]
+        depth = cv2.remap(self.depth_previous, before, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        later = depth * (turned[2, 0] * x + turned[2, 1] * y + turned[2, 2]) + moved[2]
+        return np.where((depth > 0) & (later > 0), later, np.float32(np.nan))
+
+    @cached_property
+    def _projection(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """``K R K^-1`` ``(3, 3)`` and ``K t`` ``(3,)``."""
+        K = self.intrinsics.K
+        turned = K @ self.unit_pose.R_current_previous @ np.linalg.inv(K)
+        return turned.astype(np.float32), (self.length * K @ self.unit_pose.direction).astype(np.float32)
+
     @cached_property
     def _current(self) -> NDArray[np.float32]:
         """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
-        K, depth = self.intrinsics.K, self.depth_previous
-        turned = (K @ self.unit_pose.R_current_previous @ np.linalg.inv(K)).astype(np.float32)
-        moved = self.length * K @ self.unit_pose.direction
+        depth = self.depth_previous
+        turned, moved = self._projection
         v, u = (np.arange(side, dtype=np.float32) for side in depth.shape)
         near = cv2.divide(1.0, depth)
         near[~(depth > 0)] = 0.0

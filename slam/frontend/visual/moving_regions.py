@@ -9,6 +9,8 @@ not hold the majority of the image's parallax.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -50,20 +52,18 @@ def moving_corners(
     region = labels[tuple(cells.T)]
     motion = 1.0 - seen_px[contradicting] / np.maximum(expected_px[contradicting], 1e-3)
     parallax = np.where(agreeing | contradicting, np.abs(seen_px), 0.0)
-    for n in range(1, count):
-        inside = np.zeros_like(moving)
-        inside[contradicting] = region == n
-        if not _has_majority(inside & on_road, parallax, on_road) and _agree(motion[region == n]):
-            moving |= inside
-    return np.zeros_like(moving) if _has_majority(moving, parallax, parallax > 0) else moving
+    on_road_px = np.bincount(region, (parallax * on_road)[contradicting], count)
+    is_most_of_road = on_road_px > _LARGEST_SHARE * parallax[on_road].sum()
+    middle = _medians(motion, region, count)
+    scatter = _medians(np.abs(motion - middle[region]), region, count)
+    moving[contradicting] = (~is_most_of_road & (scatter < _CONSISTENCY * np.abs(middle)))[region]
+    is_most = parallax[moving].sum() > _LARGEST_SHARE * parallax.sum()
+    return np.zeros_like(moving) if is_most else moving
 
 
-def _has_majority(part: NDArray[np.bool_], parallax: FloatArray, whole: NDArray[np.bool_]) -> bool:
-    """Whether a part of the corners ``(M,)`` holds more than half of the parallax ``(M,)`` of the whole."""
-    return bool(parallax[part].sum() > _LARGEST_SHARE * parallax[whole].sum())
-
-
-def _agree(motions: FloatArray) -> bool:
-    """Whether the corners of a region have one motion along their lines, as a share of the expected shift."""
-    middle = float(np.median(motions))
-    return float(np.median(np.abs(motions - middle))) < _CONSISTENCY * abs(middle)
+def _medians(values: FloatArray, groups: NDArray[np.integer[Any]], count: int) -> FloatArray:
+    """The median of the values ``(K,)`` of each group, ``(count,)``; 0 of an empty one."""
+    order, sizes = np.lexsort((values, groups)), np.bincount(groups, minlength=count)
+    first, last = np.cumsum(sizes) - sizes, len(values) - 1
+    below, above = (np.minimum(first + np.maximum(half, 0), last) for half in ((sizes - 1) // 2, sizes // 2))
+    return np.where(sizes > 0, 0.5 * (values[order[below]] + values[order[above]]), 0.0)

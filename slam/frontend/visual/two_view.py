@@ -103,14 +103,18 @@ class TwoViewEstimator:
         reliable = matches.weights >= _LEAST_PROPOSING_WEIGHT
         first, second = matches.rays_previous[reliable], matches.rays_current[reliable]
         depth = matches.depth_previous[reliable]
+        prior, least = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG))), _EARLY_EXIT_INLIER_RATIO
+        usual = self._refined(matches, history.last, prior)
+        if usual is not None and usual.agreeing.mean() >= least:
+            return usual
         by_points = cache(lambda: self._by_pnp(first, second, depth))
         proposed = self._by_essential(first, second)
         if history.last is None and proposed is not None:
             matches = self._with_first_sigma(matches, [proposed, by_points()])
-        prior = history.prior(float(np.deg2rad(_DIRECTION_PRIOR_SIGMA_DEG)))
-        candidates = [self._refined(matches, proposed, prior)]
-        if candidates[0] is None or candidates[0].agreeing.mean() < _EARLY_EXIT_INLIER_RATIO:
-            candidates += [self._refined(matches, other, prior) for other in (by_points(), history.last)]
+        best = self._refined(matches, proposed, prior)
+        candidates = [usual, best]
+        if best is None or best.agreeing.mean() < least:
+            candidates.append(self._refined(matches, by_points(), prior))
         found = [candidate for candidate in candidates if candidate is not None]
         if not found:
             return None

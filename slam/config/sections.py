@@ -133,7 +133,7 @@ class MappingConfig(Section):
 
     enabled: bool = Field(default=True, description="fuse depth maps into a mesh and a point cloud")
     frame_stride: int = Field(default=1, ge=1, description="every n-th frame may become a keyframe of the map")
-    keyframe_distance_m: float = Field(default=0.3, ge=0, description="distance between keyframes, metres")
+    keyframe_distance_m: float = Field(default=1.5, ge=0, description="distance between keyframes, metres")
     width_px: int = Field(default=416, ge=32, description="approximate width of the fused depth maps, pixels")
     voxel_size_m: float = Field(default=0.2, ge=1e-3, le=100, description="side of a voxel, metres")
     truncation_voxels: float = Field(
@@ -172,11 +172,11 @@ class MappingConfig(Section):
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
     max_depth_difference: float = Field(
-        default=0.12, gt=0, description="largest relative difference to the depth of the previous keyframe"
+        default=0.12, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
     )
     max_relative_sigma: float = Field(default=0.2, gt=0, description="largest sigma of fused depth, over the depth")
     min_weight: float = Field(
-        default=2.0, ge=0, description="least number of observations of a voxel that becomes surface"
+        default=1.0, ge=0, description="least number of observations of a voxel that becomes surface"
     )
     min_component_triangles: int = Field(
         default=300, ge=0, description="least number of triangles of a connected piece of the mesh"

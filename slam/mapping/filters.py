@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,8 +59,8 @@ class DepthFilters:
         """The share of the pixels that each filter removed, over the pixels that reached it."""
         return dict(zip(FILTERS, (self._taken / max(self._frames, 1)).tolist(), strict=True))
 
-    def kept(self, view: KeyframeDepth, other: KeyframeDepth | None) -> DepthMap:
-        """The depth to fuse ``(H, W)``, 0 elsewhere; ``other`` sees the same place from another position."""
+    def kept(self, view: KeyframeDepth, others: Sequence[KeyframeDepth]) -> DepthMap:
+        """The depth to fuse ``(H, W)``, 0 elsewhere; ``others`` see the same place from other positions."""
         config, depth = self._config, view.depth
         everything = np.ones(depth.shape, dtype=bool)
         sigma = np.full_like(depth, np.nan) if view.relative_sigma is None else view.relative_sigma
@@ -74,7 +75,7 @@ class DepthFilters:
             (depth >= config.depth_min_m) & (depth < farthest),
             everything if view.relative_sigma is None else sigma <= config.max_relative_sigma,
             ~_at_edges(self.trusted(view), config.max_depth_step) | is_exact,
-            everything if other is None else self._agrees(view, other),
+            np.any([self._agrees(view, other) for other in others], axis=0) if others else everything,
         )
         left = everything
         for number, mask in enumerate(masks):

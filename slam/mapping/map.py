@@ -24,7 +24,7 @@ from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
 _BLOCK_MB = BLOCK_VOXELS * 8 / 2**20
-_KEYFRAME_ROTATION_DEG = 3.0  # rotation after which a frame is fused, degrees
+_KEYFRAME_ROTATION_DEG = 8.0  # rotation after which a frame is fused, degrees
 
 
 @dataclass(frozen=True)
@@ -102,14 +102,14 @@ class TsdfMap:
         self._folder = Path(self._temporary.name if self._temporary is not None else str(folder)) / SUBMAPS
         remove_submaps(self._folder)  # of a run that was killed here
         self._previous: KeyframeDepth | None = None
-        self._first_is_fused = False
+        self._waiting: KeyframeDepth | None = None
         self._stretch: _Stretch | None = None
         self._views_of_submaps: list[NDArray[np.int64]] = []
         self._fused = 0
         self._surface: MapSurface | None = None
 
     def integrate(self, keyframe: KeyframeDepth) -> None:
-        """Filter a depth map, also by the previous keyframe, and fuse it.
+        """Take a depth map, and fuse the one before it, filtered by its neighbours.
 
         Raises:
             RunError: a submap cannot be written.
@@ -120,15 +120,8 @@ class TsdfMap:
         known = np.isfinite(depth) & (depth > 0)
         known_depth = np.where(known, depth, np.float32(0)).astype(np.float32)
         view = replace(keyframe, depth=known_depth, network_depth=None)
-        previous = self._previous
-        if previous is None:
-            self._previous = view
-            return
-        if not self._first_is_fused:
-            self._fuse(previous, view)
-            self._first_is_fused = True
-        self._fuse(view, previous)
-        self._previous = view
+        self._fuse_waiting(view)
+        self._waiting = view
 
     def select(self, frames: Sequence[int], T_world_camera: FloatArray) -> list[int]:
         """The frames to integrate, before each of which the camera has moved, as positions in ``frames``.
@@ -151,9 +144,7 @@ class TsdfMap:
             SlamError: a submap cannot be written, or the disk is full.
         """
         if self._surface is None:
-            if self._previous is not None and not self._first_is_fused:
-                self._fuse(self._previous, None)  # the only keyframe: there is no second view to compare it with
-                self._first_is_fused = True
+            self._fuse_waiting(None)
             self._finish_submap()
             self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
         return self._surface
@@ -192,9 +183,17 @@ class TsdfMap:
         config = self._config
         return moved >= config.keyframe_distance_m or turned >= np.deg2rad(_KEYFRAME_ROTATION_DEG)
 
-    def _fuse(self, view: KeyframeDepth, other: KeyframeDepth | None) -> None:
+    def _fuse_waiting(self, following: KeyframeDepth | None) -> None:
+        """Fuse the view that waits for the one after it."""
+        if self._waiting is None:
+            return
+        view, self._waiting = self._waiting, None
+        self._fuse(view, [other for other in (self._previous, following) if other is not None])
+        self._previous = view
+
+    def _fuse(self, view: KeyframeDepth, others: Sequence[KeyframeDepth]) -> None:
         """Filter and fuse a view, and begin a new submap where this one is long or large enough."""
-        kept = self._filters.kept(view, other)
+        kept = self._filters.kept(view, others)
         config = self._config
         if self._stretch is None:
             limits = config.truncation_voxels, config.reach_m

@@ -91,7 +91,7 @@ def test_each_filter_counts_what_it_took():
     image[12:18, 60:70] = 250  # a window: in one piece with nothing at the upper border, whose last row is 10
     config = MappingConfig(border=0.1, hood_crop=0.2, max_relative_sigma=0.2)
     filters = DepthFilters(config, camera)
-    kept = filters.kept(KeyframeDepth(0, depth, sigma, image, np.eye(4)), None)
+    kept = filters.kept(KeyframeDepth(0, depth, sigma, image, np.eye(4)), ())
     shares = filters.shares()
     assert tuple(shares) == FILTERS
     assert shares["unknown"] == pytest.approx(0.1)
@@ -105,7 +105,7 @@ def test_each_filter_counts_what_it_took():
 def test_a_camera_that_looks_down_sees_no_sky():
     filters = DepthFilters(MappingConfig(), Intrinsics(100, 50, 80.0, 80.0, 49.5, 0.5))
     bright = np.full((50, 100, 3), 250, np.uint8)
-    filters.kept(KeyframeDepth(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), None)
+    filters.kept(KeyframeDepth(0, np.full((50, 100), 10.0, np.float32), None, bright, np.eye(4)), ())
     assert filters.shares()["sky"] == 0
 
 
@@ -117,7 +117,7 @@ def test_how_far_depth_is_fused_depends_on_its_sigma():
 
     def farthest(relative_sigma: np.ndarray | None) -> float:
         view = KeyframeDepth(0, depth, relative_sigma, image, np.eye(4))
-        return float(DepthFilters(config, camera).kept(view, None).max())
+        return float(DepthFilters(config, camera).kept(view, ()).max())
 
     assert 19 < farthest(None) < 20 and 19 < farthest(np.full_like(depth, 0.1)) < 20
     assert 23 < farthest(np.full_like(depth, 0.05)) <= 24  # 0.05 of 24 m is 1.2 m
@@ -130,8 +130,8 @@ def test_border_sky_and_edges_are_no_doubt_of_exact_depth():
     depth[:, 60:] = 15.0
     image = np.full((50, 100, 3), 250, np.uint8)
     filters = DepthFilters(MappingConfig(border=0.1), camera)
-    exact = filters.kept(KeyframeDepth(0, depth, np.zeros_like(depth), image, np.eye(4)), None)
+    exact = filters.kept(KeyframeDepth(0, depth, np.zeros_like(depth), image, np.eye(4)), ())
     np.testing.assert_array_equal(exact, depth)
-    learned = filters.kept(KeyframeDepth(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), None)
+    learned = filters.kept(KeyframeDepth(0, depth, np.full_like(depth, 0.05), image, np.eye(4)), ())
     assert (learned[24:, 10:59] > 0).all() and (learned[24:, 61:90] > 0).all()
     assert np.count_nonzero(learned) == 26 * 78  # rows below the horizon

@@ -53,13 +53,13 @@ def test_brightness_steps_become_small_gains():
 
 
 def test_a_hole_of_the_road_is_closed_and_marked(street_map):
-    whole = street_map(hidden=True, close_holes_m=4.0)
+    whole = street_map(hidden=True, close_holes_m=4.0, min_weight=2.0)
     mesh = whole.mesh()
     assert mesh.filled.sum() == 1
     np.testing.assert_allclose(mesh.vertices_world[mesh.filled][0], [0, 1.65, 20], atol=0.7)
     assert mesh.normals_world[mesh.filled][0][1] < -0.99
     assert len(whole.cloud().points_world) == len(mesh.vertices_world) - 1
-    assert not street_map(hidden=True, close_holes_m=1.5).mesh().filled.any()
+    assert not street_map(hidden=True, close_holes_m=1.5, min_weight=2.0).mesh().filled.any()
 
 
 @pytest.mark.parametrize(("up", "closed"), [((0.0, 0.0, 1.0), 1), ((0.0, 0.0, -1.0), 0), ((1.0, 0.0, 0.0), 0)])

@@ -50,13 +50,14 @@ class Keyframe:
 
     @classmethod
     def of(cls, frame: Frame, depth_unscaled: DepthMap, spill_file: SpillFile, config: MappingConfig) -> Keyframe:
-        """Thin a frame and its depth ``(H, W)`` to about ``width_px`` and spill both."""
-        height, width = depth_unscaled.shape
+        """Thin a frame and its depth, of any size, to about ``width_px`` and spill both."""
+        height, width = frame.image.shape[:2]
         ratio = min(config.width_px / width, 1.0)
+        size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
         image, depth = frame.image, depth_unscaled
-        if ratio < 1.0:
-            size = (max(round(width * ratio), 1), max(round(height * ratio), 1))
+        if depth.shape[::-1] != size:
             depth = resized_depth(depth, *size)
+        if ratio < 1.0:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         return cls(frame.index, spill_file.put(image), spill_file.put(depth))
 

@@ -303,6 +303,7 @@ class Observer:
         carried = self._carried(recent)
         if carried is not None:
             self._recent = tuple(carried if r.frame is recent.frame else r for r in self._recent)
+            self._keep_for_map(carried.frame, carried.depth)
             return carried.depth, carried.height
         depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
         return depth, self._remember(recent.frame, depth, self._plane.fit(depth, self._odometry.state().depth_error))
@@ -368,10 +369,13 @@ class Observer:
                 task.keep(task.result.result())
 
     def _keep(self, frame: Frame, depth: DepthMap) -> None:
-        """Keep thinned frames for the map, and a few whole ones for the report."""
-        mapping = self._config.mapping
+        """Keep a thinned frame for the map, and a few whole ones for the report."""
         if frame.index in self._examples:
             self._examples.keep(frame, depth, self._drive.examples)
+        self._keep_for_map(frame, depth)
+
+    def _keep_for_map(self, frame: Frame, depth: DepthMap) -> None:
+        mapping = self._config.mapping
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
             self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))

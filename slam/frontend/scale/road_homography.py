@@ -28,6 +28,7 @@ _LEVEL = np.array([0.0, 1.0, 0.0])
 _LENGTHS_HEIGHTS = np.geomspace(0.02, 2.5, 32, dtype=np.float32)  # searched; refinement converges between them
 _CLIPPED_GREY = 8.0
 _ITERATIONS = 6
+_CONVERGED = 1e-3  # of the length, whose sigma is fifty times as large
 _STEPS_KEPT = 100
 
 _Layer = NDArray[np.float32]
@@ -190,7 +191,7 @@ class RoadHomography:
             information = (weighted * slope) @ strip.rays.T + prior + 1e-9 * np.eye(3)
             step = -np.linalg.solve(information, weighted @ residual + prior @ plane)
             plane = plane + step
-            if np.abs(step).max() < 1e-4 * np.linalg.norm(plane):
+            if np.abs(step).max() < _CONVERGED * np.linalg.norm(plane):
                 break
         return plane, _correlation(strip.local(grey), strip.local(seen))
 

@@ -32,7 +32,7 @@ from slam.geometry.se3 import FloatArray
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
 _OVERSTEP = 1.4
-_CONVERGED = 1e-5
+_CONVERGED = 3e-5  # radians: the least sigma of a rotation
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0

@@ -172,7 +172,7 @@ class MappingConfig(Section):
         default=0.12, gt=0, description="relative depth step between neighbouring pixels that marks an edge"
     )
     max_depth_difference: float = Field(
-        default=0.12, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
+        default=0.1, gt=0, description="largest relative difference to the depth of a neighbouring keyframe"
     )
     max_relative_sigma: float = Field(default=0.2, gt=0, description="largest sigma of fused depth, over the depth")
     min_weight: float = Field(

@@ -335,9 +335,9 @@ class Observer:
         return measured if measured.is_triangulated else None
 
     def _relative_rotation(self, current: Frame) -> Callable[[], Any] | None:
-        """Prepare to measure the rotation across steps that touch the last ones, if all of them were triangulated."""
+        """Prepare to measure the rotation across the last steps, if all of them were triangulated."""
         baseline = self._config.visual_odometry.rotation_baseline_steps
-        if baseline < 2 or len(self._recent) < baseline or current.index % baseline:
+        if baseline < 2 or len(self._recent) < baseline:
             return None
         first = self._recent[-baseline]
         motions = {m.ends: m for m in self._drive.motions[-2 * baseline :] if m.is_triangulated}

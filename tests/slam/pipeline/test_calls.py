@@ -1,0 +1,64 @@
+"""How often the costly calls are made for a frame: a budget that does not depend on the machine."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.config.sections import load_config
+from slam.loops.descriptors import FeatureExtractor
+from slam.mapping.depth_refinement import DepthRefiner
+from slam.mapping.fusion import Fusion
+from slam.pipeline.batch import SlamPipeline
+from slam.prediction.oracle import OracleNoise, OraclePredictor
+from slam.sequences.simulated import SimulatedSequence
+from slam.simulation.street import SimulationOptions
+
+FRAMES = 60
+# calls over frames: a step measured by geometry, whose tracks all pass the first search at best
+MOST = {
+    "depth": 0.6,
+    "snippet": 0.3,
+    "calcOpticalFlowPyrLK": 6.0,
+    "findEssentialMat": 0.5,
+    "goodFeaturesToTrack": 1.1,
+    "view": 0.3,
+    "refine": 0.7,
+    "integrate": 0.7,
+}
+
+
+def counted(calls: Counter[str], name: str, of: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        calls[name] += 1
+        return of(*args, **kwargs)
+
+    return call
+
+
+def test_calls_a_frame(monkeypatch: pytest.MonkeyPatch):
+    sequence, calls = SimulatedSequence(SimulationOptions("grid", FRAMES, 610, 416, 128)), Counter[str]()
+
+    def depth_of(index: int) -> np.ndarray:
+        depth = sequence.street.render(index).depth.astype(np.float64)
+        return np.where(depth > 0, depth, 200.0)
+
+    oracle = OraclePredictor(sequence.reference, depth_of, OracleNoise(), 0.2)
+    for owner, name in (
+        *((cv2, name) for name in ("calcOpticalFlowPyrLK", "findEssentialMat", "goodFeaturesToTrack")),
+        (oracle, "depth"),
+        (oracle, "snippet"),
+        (FeatureExtractor, "view"),
+        (DepthRefiner, "refine"),
+        (Fusion, "integrate"),
+    ):
+        monkeypatch.setattr(owner, name, counted(calls, name, getattr(owner, name)))
+    SlamPipeline(sequence, oracle, load_config(None, [])).run()
+    a_frame = {name: calls[name] / FRAMES for name in MOST}
+    assert all(a_frame.values())
+    assert {name: calls for name, calls in a_frame.items() if calls > MOST[name]} == {}

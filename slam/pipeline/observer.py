@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self
 
 import numpy as np
 
 from slam.config.sections import SlamConfig
-from slam.frames import DepthMap, Frame, Intrinsics, Predictor, SnippetPoses
+from slam.frames import DepthMap, Frame, Intrinsics, Predictor
 from slam.frontend.drive import Drive, Examples, Keyframe
 from slam.frontend.failure import MeasurementFailure
 from slam.frontend.gap_interpolation import complete_drive
 from slam.frontend.image_gate import ImageGate, Verdict
 from slam.frontend.keyframes.odometry import KeyframeOdometryState
 from slam.frontend.scale.road_homography import RoadHomography, RoadStep
-from slam.frontend.scale.road_plane import GroundPlane, GroundPlaneFitter
+from slam.frontend.scale.road_plane import GroundPlaneFitter
 from slam.frontend.step_table import path_between, shortest_by_start
 from slam.frontend.visual.motion import Motion
 from slam.frontend.visual.odometry import VisualOdometry
@@ -27,32 +27,13 @@ from slam.geometry.se3 import FloatArray, chain
 from slam.loops.descriptors import FeatureExtractor
 from slam.pipeline.front_end_state import FrontEndState, RecentFrame
 from slam.pipeline.keyframe_tracking import KeyframeTracking
-from slam.runtime.errors import MissingFrameError, SequenceError, SlamError
+from slam.pipeline.pending import PendingFrame, PendingTask, has_moved_on, height_of, last_step, predicted_depth
+from slam.runtime.errors import MissingFrameError, SequenceError
 from slam.runtime.memory import return_freed_memory
 from slam.runtime.storage.spill import SpillFile
 from slam.runtime.timing import Stopwatch
 
 logger = logging.getLogger(__name__)
-_MOVED_ON_HEIGHTS = 1.5  # way of the camera after which depth is predicted again, camera heights
-_LAST_ROADS = 8  # looked back for the camera's height, frames
-
-
-@dataclass(frozen=True)
-class PendingFrame:
-    """A frame submitted to the networks, whose other measurements are pending; None is not asked for."""
-
-    frame: Frame
-    depth: Future[DepthMap] | None
-    snippet: Future[SnippetPoses] | None
-
-
-@dataclass(frozen=True)
-class PendingTask:
-    """A task of another thread, the stage that waits for it, and what to do with its ``result``."""
-
-    stage: str
-    result: Future[Any]
-    keep: Callable[[Any], None]
 
 
 class Observer:
@@ -62,9 +43,8 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    Depth is predicted where the camera has moved on, at least at every second frame, and carried to the next one by the
-    measured motion. Snippets touch. Both are predicted for every frame that image geometry does not measure. While
-    keyframes alone measure the camera, depth is predicted for them and the targets of snippets.
+    With ``depth.frame_stride`` depth is carried to the frames between by the measured motion, and snippets touch. While
+    keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which touch.
     """
 
     def __init__(
@@ -164,7 +144,8 @@ class Observer:
         """A snapshot from which another observer continues as without an interruption."""
         self.flush()
         parts = self._gate.state(), self._odometry.state(), self._keyframes.state(), self._road.state()
-        return FrontEndState(self._drive.copy(), *parts, self._snippet_frames, self._recent, self._unread, self._depth_index)
+        last = self._snippet_frames, self._recent, self._unread, self._depth_index
+        return FrontEndState(self._drive.copy(), *parts, *last)
 
     @property
     def frames(self) -> int:
@@ -208,36 +189,25 @@ class Observer:
             self._snippet_frames = ()
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
-        sources, index = self._predictor.sources, frame.index
+        sources, index, stride = self._predictor.sources, frame.index, self._config.depth.frame_stride
         is_first = len(self._snippet_frames) == sources  # since a gap
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         # what was measured two frames ago is finished, whatever else is
-        by_keyframes, step = self._keyframes.measures(self._drive, index - 2), self._last_step(index - 2)
-        is_measured = by_keyframes or step is not None
+        by_keyframes, step = self._keyframes.measures(self._drive, index - 2), last_step(self._drive, index - 2)
+        is_dense = not by_keyframes and (step is None or stride == 1)
         depth = snippet = None
         if by_keyframes:
             is_seen = (index + sources // 2) % sources == 0
         else:
-            is_seen = step is None or self._has_moved_on(index, step)
+            is_seen = (
+                step is None or index % stride == 0 or has_moved_on(self._drive, step, index + 1 - self._depth_index)
+            )
         if is_seen or index in self._examples:
             self._depth_index = index
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
-        if len(self._snippet_frames) > sources and (is_first or not is_measured or index % sources == 0):
+        if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
             snippet = self._networks.submit(self._predictor.snippet, list(self._snippet_frames))
         return PendingFrame(frame, depth, snippet)
-
-    def _last_step(self, index: int) -> Motion | None:
-        """The step to a frame, where image geometry measured it as the last."""
-        last = self._drive.motions[-1] if self._drive.motions else None
-        return last if last is not None and last.ends[1] == index else None
-
-    def _has_moved_on(self, index: int, step: Motion) -> bool:
-        """Whether the camera moves on from what the last predicted depth shows before the frame after this one."""
-        if index % self._config.depth.frame_stride == 0:
-            return True
-        heights = [road.height_unscaled for road in self._drive.roads[-_LAST_ROADS:] if isinstance(road, GroundPlane)]
-        far = _MOVED_ON_HEIGHTS * heights[-1] if heights else np.inf
-        return (index + 1 - self._depth_index) * step.length_unscaled > far
 
     def _process_pending(self) -> None:
         """All measurements but the networks' of the pending frame."""
@@ -289,7 +259,7 @@ class Observer:
         with self._stopwatch.stage("road"):
             self._drive.roads[frame.index] = road = self._plane.fit(depth, self._odometry.state().depth_error)
         self._keyframes.learn(frame, depth)
-        height = self._remember(frame, depth, road)
+        height = self._remember(frame, depth, height_of(road))
         views, loops = self._drive.views, self._config.loops
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
@@ -302,24 +272,25 @@ class Observer:
             return recent.depth, recent.height
         carried = self._carried(recent)
         if carried is not None:
-            self._recent = tuple(carried if r.frame is recent.frame else r for r in self._recent)
-            self._keep_for_map(carried.frame, carried.depth)
-            return carried.depth, carried.height
+            return carried
         depth = self._networks.submit(predicted_depth, self._predictor, recent.frame).result()
-        return depth, self._remember(recent.frame, depth, self._plane.fit(depth, self._odometry.state().depth_error))
+        road = self._plane.fit(depth, self._odometry.state().depth_error)
+        return depth, self._remember(recent.frame, depth, height_of(road))
 
-    def _carried(self, recent: RecentFrame) -> RecentFrame | None:
-        """A recent frame with the depth of the one before it, moved; None where that or the motion is unknown."""
-        step = self._last_step(recent.frame.index)
+    def _carried(self, recent: RecentFrame) -> tuple[DepthMap, float | None] | None:
+        """Depth of the frame before a recent one, moved with the camera, and its height; None where one is unknown."""
+        step = last_step(self._drive, recent.frame.index)
         before = next((r for r in self._recent if step is not None and r.frame.index == step.ends[0]), None)
         if step is None or before is None or before.depth is None:
             return None
         depth = self._odometry.carried(before.depth, step)
-        return None if depth is None else replace(recent, depth=depth, height=before.height)
+        if depth is None:
+            return None
+        self._keep_for_map(recent.frame, depth)
+        return depth, self._remember(recent.frame, depth, before.height)
 
-    def _remember(self, frame: Frame, depth: DepthMap, road: GroundPlane | MeasurementFailure) -> float | None:
-        """Keep the depth of a recent frame, and the camera height that is returned."""
-        height = road.height_unscaled if isinstance(road, GroundPlane) else None
+    def _remember(self, frame: Frame, depth: DepthMap, height: float | None) -> float | None:
+        """Keep the depth of a recent frame and its camera height, which is returned."""
         self._recent = tuple(replace(r, depth=depth, height=height) if r.frame is frame else r for r in self._recent)
         return height
 
@@ -379,16 +350,3 @@ class Observer:
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)
             self._tasks.append(PendingTask("map", keyframe, self._drive.keyframes.append))
-
-
-def predicted_depth(predictor: Predictor, frame: Frame) -> DepthMap:
-    """Depth ``(H, W)`` of a frame.
-
-    Raises:
-        SlamError: a user's predictor gives something else.
-    """
-    depth = predictor.depth(frame)
-    wanted, shape, kind = frame.image.shape[:2], np.shape(depth), getattr(depth, "dtype", type(depth).__name__)
-    if shape != wanted or kind != np.float32:
-        raise SlamError(f"the predictor's depth of frame {frame.index} must be {wanted} float32; got {shape} {kind}")
-    return depth

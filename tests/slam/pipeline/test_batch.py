@@ -322,7 +322,7 @@ def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
 def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     calls: list[tuple[str, int, int]] = []
     result = drive_street(street, lambda *words: calls.append(words))
-    assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 25) for k in range(1, 26)]
+    assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 13) for k in range(1, 14)]
     seen = result.drive
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     measured = {first for first, _ in seen.steps.motions}

@@ -195,13 +195,9 @@ class Observer:
         # what was measured two frames ago is finished, whatever else is
         by_keyframes, step = self._keyframes.measures(self._drive, index - 2), last_step(self._drive, index - 2)
         is_dense = not by_keyframes and (step is None or stride == 1)
+        far = step is not None and has_moved_on(self._drive, step, index + 1 - self._depth_index)
+        is_seen = (index + sources // 2) % sources == 0 if by_keyframes else step is None or far or index % stride == 0
         depth = snippet = None
-        if by_keyframes:
-            is_seen = (index + sources // 2) % sources == 0
-        else:
-            is_seen = (
-                step is None or index % stride == 0 or has_moved_on(self._drive, step, index + 1 - self._depth_index)
-            )
         if is_seen or index in self._examples:
             self._depth_index = index
             depth = self._networks.submit(predicted_depth, self._predictor, frame)

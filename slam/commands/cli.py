@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,12 +16,12 @@ from erfsfm.common import command_line
 from slam.commands.batch.cli import verbs as batch_verbs
 from slam.commands.calibration.cli import verbs as calibration_verbs
 from slam.commands.downloads.cli import verbs as download_verbs
+from slam.commands.evaluation import verbs as evaluation_verbs
 from slam.commands.exports.cli import verbs as export_verbs
 from slam.commands.live.cli import verbs as live_verbs
 from slam.commands.localisation.cli import verbs as localisation_verbs
-from slam.commands.options import Json, Seed, UnusedDevice, UnusedSeed, options_of
+from slam.commands.options import Json, Seed, UnusedDevice, options_of
 from slam.commands.run.request import RunRequest
-from slam.runtime.errors import SlamError
 from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 
@@ -70,34 +69,7 @@ def run(request: RunRequest, as_json: Json = False) -> None:
     _print_run(folder.path, metrics)
 
 
-@app.command()
-def evaluate(
-    paths: Annotated[list[Path], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders")],
-    format: Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the two files")] = "auto",
-    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
-    as_json: Json = False,
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Errors of trajectories or of whole runs.
-
-    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side.
-
-    Example: erfsfm-slam evaluate results/latest/trajectory_optimised.kitti.txt poses/09.txt
-    """
-    if all(path.is_dir() for path in paths):
-        if fail_over:
-            raise typer.BadParameter(
-                "a limit applies to two trajectory files, not to run folders", param_hint="--fail-over"
-            )
-        _evaluate_runs(paths, as_json)
-    elif len(paths) == 2:
-        _evaluate_files(paths[0], paths[1], format, fail_over or [], as_json)
-    else:
-        what = ", ".join(map(str, paths))
-        raise typer.BadParameter(f"give two trajectory files, or run folders that exist; got {what}")
-
-
+app.add_typer(evaluation_verbs)
 app.add_typer(export_verbs)
 app.add_typer(batch_verbs)
 app.add_typer(live_verbs)
@@ -132,25 +104,6 @@ def simulate(
 
 
 @app.command()
-def plot(
-    runs: Annotated[list[Path], typer.Argument(help="run folders")],
-    what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
-    output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
-    seed: UnusedSeed = 0,
-    device: UnusedDevice = "auto",
-) -> None:
-    """Figures of runs for a paper.
-
-    Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
-    """
-    from slam.results.folder import RunFolder
-    from slam.results.report.plots import plot_runs
-
-    plot_runs([RunFolder.open(path) for path in runs], what.split(","), output)
-    typer.echo(f"figure in {output}")
-
-
-@app.command()
 def config() -> None:
     """The full default configuration as YAML.
 
@@ -174,35 +127,6 @@ def doctor(
 
     for line in examine(dataset, camera):
         typer.echo(line)
-
-
-def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
-    from slam.results.folder import RunFolder
-    from slam.results.terminal_tables import comparison_json, comparison_table
-
-    runs = [RunFolder.open(path) for path in paths]
-    if as_json:
-        typer.echo(json.dumps(comparison_json(runs), indent=2))
-    else:
-        print_table(comparison_table(runs))
-
-
-def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
-    from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
-    from slam.formats.trajectory import associate, read_trajectory
-    from slam.results.terminal_tables import metrics_table
-
-    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
-    metrics = trajectory_metrics(*pair)
-    if as_json:
-        typer.echo(metrics.to_json())
-    else:
-        print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
-        for line in evo_commands(estimate, reference, format):
-            typer.echo(line)
-    broken = exceeded(metrics, limits)
-    if broken:
-        raise SlamError("; ".join(broken))
 
 
 def _print_run(path: Path, metrics: Metrics) -> None:

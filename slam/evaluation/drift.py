@@ -7,7 +7,7 @@ run's trajectories for figures.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,15 +52,13 @@ def aligned(trajectories: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
         for name, trajectory in estimates(drawn):
             estimate, truth = associate(trajectory, drawn[REFERENCE])
             fit = se3.umeyama(truth.positions, estimate.positions, with_scale=True)
-            moved = fit.apply_to_poses(trajectory.T_world_camera)
-            drawn[name] = Trajectory(trajectory.stamps, moved, trajectory.timed)
+            drawn[name] = replace(trajectory, T_world_camera=fit.apply_to_poses(trajectory.T_world_camera))
     elif "network" in drawn and "optimised" in drawn:
         raw, optimised = associate(drawn["network"], drawn["optimised"])
         energy = float((raw.positions**2).sum())
         scale = float((raw.positions * optimised.positions).sum()) / energy if energy > 0 else 1.0
         fit = se3.Similarity(scale, np.eye(3), np.zeros(3))
-        moved = fit.apply_to_poses(drawn["network"].T_world_camera)
-        drawn["network"] = Trajectory(drawn["network"].stamps, moved, drawn["network"].timed)
+        drawn["network"] = replace(drawn["network"], T_world_camera=fit.apply_to_poses(drawn["network"].T_world_camera))
     return drawn
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,10 @@ from slam.runtime.storage.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
-_COLUMNS = {"kitti": 12, "tum": 8}
+# columns of a row by format; the second form of each is with a frame number, and without a stamp
+_COLUMNS = {"kitti": (12, 13), "tum": (8, 7)}
+# a TartanAir camera looks along x, with y to the right and z down
+_T_TARTAN_CAMERA = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 # Largest |R R^T - I| or | |q| - 1 | that counts as rounding in a file and is repaired.
 _ROTATION_TOLERANCE = 1e-3
 _FARTHEST = 1e12  # metres: to Saturn
@@ -33,12 +36,14 @@ class Trajectory:
     """Camera poses in time order.
 
     ``stamps`` ``(N,)`` in seconds, ``T_world_camera`` ``(N, 4, 4)``, metres or the trajectory's own unit.
-    ``timed`` is False where the stamps are row numbers, as in a KITTI file.
+    ``timed`` is False where the stamps are row numbers, as in a KITTI file; ``numbered`` is True where they are frame
+    numbers that the file gives.
     """
 
     stamps: FloatArray
     T_world_camera: FloatArray
     timed: bool = True
+    numbered: bool = False
 
     def __post_init__(self) -> None:
         """Refuse shapes that do not fit, and stamps that are no times.
@@ -71,18 +76,19 @@ class Trajectory:
     def rebased(self) -> Trajectory:
         """The same motion with the first camera as the world: the first pose is the identity."""
         T_first_world = se3.invert(self.T_world_camera[0])
-        return Trajectory(self.stamps, T_first_world @ self.T_world_camera, self.timed)
+        return replace(self, T_world_camera=T_first_world @ self.T_world_camera)
 
     def select(self, rows: NDArray[np.intp]) -> Trajectory:
         """The poses of some rows, in the order given."""
-        return Trajectory(self.stamps[rows], self.T_world_camera[rows], self.timed)
+        return replace(self, stamps=self.stamps[rows], T_world_camera=self.T_world_camera[rows])
 
 
 def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
-    """Read a KITTI file (12 numbers a row) or a TUM file (8); ``auto`` decides by the first row.
+    """Read a KITTI file (12 numbers a row, or 13 with the frame number first) or a TUM file (8); ``auto`` decides.
 
-    Blank lines and lines that start with ``#`` are skipped. Rotations that are not orthonormal by rounding
-    are replaced by the nearest rotation.
+    Rows of 7 numbers are TartanVO's: position and quaternion of a camera that looks along x, with z down. Blank lines
+    and lines that start with ``#`` are skipped. Rotations that are not orthonormal by rounding are replaced by the
+    nearest rotation.
 
     Raises:
         TrajectoryError: if the file cannot be read as such; the message names file and line.
@@ -90,14 +96,19 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     path = Path(path)
     if format not in ("auto", *_COLUMNS):
         raise TrajectoryError(f"unknown trajectory format '{format}'; use auto, kitti or tum")
-    lines, numbers = _read_numbers(path, _COLUMNS.get(format, 0))
-    if numbers.shape[1] == _COLUMNS["kitti"]:
-        T_world_camera, stamps = _kitti_poses(numbers), np.arange(len(numbers), dtype=np.float64)
+    lines, numbers = _read_numbers(path, _COLUMNS.get(format, _COLUMNS["kitti"] + _COLUMNS["tum"]))
+    columns = numbers.shape[1]
+    if columns in _COLUMNS["kitti"]:
+        T_world_camera = _kitti_poses(numbers[:, -12:])
     else:
-        T_world_camera, stamps = _tum_poses(path, lines, numbers), numbers[:, 0]
-        backwards = np.flatnonzero(np.diff(stamps) <= 0)
-        if backwards.size:
-            raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: time stamps must increase")
+        T_world_camera = _tum_poses(path, lines, numbers[:, -7:])
+    if columns == 7:
+        T_world_camera = _T_TARTAN_CAMERA.T @ T_world_camera @ _T_TARTAN_CAMERA
+    stamps = numbers[:, 0] if columns in (8, 13) else np.arange(len(numbers), dtype=np.float64)
+    backwards = np.flatnonzero(np.diff(stamps) <= 0)
+    if backwards.size:
+        what = "time stamps" if columns == 8 else "frame numbers"
+        raise TrajectoryError(f"{path}, line {lines[backwards[0] + 1]}: {what} must increase")
     R = T_world_camera[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # an overflow becomes NaN, which fails the check below
         deviation = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -105,7 +116,7 @@ def read_trajectory(path: Path | str, format: str = "auto") -> Trajectory:
     if wrong.size:
         raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the 3x3 part is not a rotation matrix")
     T_world_camera[:, :3, :3] = se3.nearest_rotation(R)
-    return Trajectory(stamps, T_world_camera, timed=numbers.shape[1] == _COLUMNS["tum"])
+    return Trajectory(stamps, T_world_camera, timed=columns == 8, numbered=columns == 13)
 
 
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
@@ -131,22 +142,28 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     _write(Path(path), ["# timestamp tx ty tz qx qy qz qw", *rows])
 
 
-def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
+def associate(
+    estimate: Trajectory, reference: Trajectory, frames: tuple[int, int] | None = None
+) -> tuple[Trajectory, Trajectory]:
     """The rows of both that belong to the same frames, equally many.
 
-    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. If one of
-    them is not timed, row k belongs to row k and the lengths must agree.
+    Two timed trajectories are matched one to one by nearest stamps, up to `matching_tolerance_s`. Otherwise rows are
+    matched by their frame numbers where one of the two has them, and else row k belongs to row k.
+
+    Args:
+        estimate: to be compared.
+        reference: the truth.
+        frames: only these rows [start, stop) of the reference; an estimate of as many rows is of these frames.
 
     Raises:
-        TrajectoryError: if the lengths differ and stamps are missing, or no stamps match.
+        TrajectoryError: if the lengths differ and stamps or frame numbers are missing, or none match.
     """
     if not (estimate.timed and reference.timed):
-        if len(estimate) != len(reference):
-            raise TrajectoryError(
-                f"the estimate has {len(estimate)} poses and the reference {len(reference)}; files without "
-                "time stamps are compared row by row: give each frame a row, or use TUM files for both"
-            )
-        return estimate, reference
+        if frames is not None:
+            estimate, reference = _of_frames(estimate, *frames), _of_frames(reference, *frames)
+        return _same_frames(estimate, reference)
+    if frames is not None:
+        reference = reference.select(np.arange(*frames))
     # Slack, because the tolerance itself is a difference of rounded stamps.
     within_s = matching_tolerance_s(estimate, reference) * (1.0 + 1e-6)
     rows_estimate, rows_reference = nearest_pairs(estimate.stamps, reference.stamps, within_s)
@@ -159,6 +176,33 @@ def associate(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, 
     expected = min(len(estimate), len(reference))
     if rows_estimate.size < 0.9 * expected:
         logger.warning("only %d of %d poses have a matching time stamp", rows_estimate.size, expected)
+    return estimate.select(rows_estimate), reference.select(rows_reference)
+
+
+def _of_frames(trajectory: Trajectory, start: int, stop: int) -> Trajectory:
+    """The frames [start, stop) with their numbers."""
+    numbers = trajectory.stamps if trajectory.numbered else np.arange(len(trajectory), dtype=np.float64)
+    if not trajectory.numbered and len(trajectory) == stop - start:
+        numbers += start
+    chosen = (numbers >= start) & (numbers < stop)
+    if not chosen.any():
+        raise TrajectoryError(f"there are no poses of frames {start}:{stop}, only {numbers[0]:g} to {numbers[-1]:g}")
+    return Trajectory(numbers[chosen], trajectory.T_world_camera[chosen], timed=False, numbered=True)
+
+
+def _same_frames(estimate: Trajectory, reference: Trajectory) -> tuple[Trajectory, Trajectory]:
+    if not (estimate.numbered or reference.numbered):
+        if len(estimate) != len(reference):
+            raise TrajectoryError(
+                f"the estimate has {len(estimate)} poses and the reference {len(reference)}; files without "
+                "time stamps are compared row by row: give the frames of the estimate with --frames A:B and "
+                "--reference, or a row for each frame, or TUM files for both"
+            )
+        return estimate, reference
+    ours, theirs = (each.stamps if each.numbered else np.arange(len(each)) for each in (estimate, reference))
+    _, rows_estimate, rows_reference = np.intersect1d(ours, theirs, return_indices=True)
+    if not rows_estimate.size:
+        raise TrajectoryError("no frame numbers of the estimate are rows of the reference: give both from frame 0")
     return estimate.select(rows_estimate), reference.select(rows_reference)
 
 
@@ -190,13 +234,13 @@ def _time_span(trajectory: Trajectory) -> str:
     return f"{trajectory.stamps[0]:.3f} to {trajectory.stamps[-1]:.3f} s"
 
 
-def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
-    """Line numbers and the table ``(N, 12)`` or ``(N, 8)`` of a file; with 0 columns, those of the first row."""
+def _read_numbers(path: Path, forms: tuple[int, ...]) -> tuple[list[int], FloatArray]:
+    """Line numbers and the table ``(N, columns)`` of a file, whose first row has one of these numbers of columns."""
     lines: list[int] = []
     rows: list[list[float]] = []
     for line, words in _read_words(path):
-        columns = columns or len(words)
-        _check_columns(f"{path}, line {line}", len(words), columns)
+        _check_columns(f"{path}, line {line}", len(words), forms)
+        forms = (len(words),)
         try:
             rows.append([_number(word) for word in words])
         except ValueError as error:
@@ -208,7 +252,8 @@ def _read_numbers(path: Path, columns: int) -> tuple[list[int], FloatArray]:
     bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
     if bad.size:
         raise TrajectoryError(f"{path}, line {lines[bad[0]]}: a number is not finite")
-    positions = numbers[:, 3::4] if columns == _COLUMNS["kitti"] else numbers[:, 1:4]
+    kitti = numbers.shape[1] in _COLUMNS["kitti"]
+    positions = numbers[:, -12:][:, 3::4] if kitti else numbers[:, -7:-4]
     far = np.flatnonzero((np.abs(positions) > _FARTHEST).any(axis=1))
     if far.size:
         raise TrajectoryError(f"{path}, line {lines[far[0]]}: a position is farther than {_FARTHEST:g}")
@@ -244,14 +289,14 @@ def _read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield line, words
 
 
-def _check_columns(where: str, found: int, wanted: int) -> None:
-    if wanted not in _COLUMNS.values():
-        raise TrajectoryError(f"{where}: {wanted} columns; a KITTI row has 12, a TUM row 8")
-    if found == wanted:
+def _check_columns(where: str, found: int, wanted: tuple[int, ...]) -> None:
+    if found in wanted:
         return
-    name = "KITTI" if wanted == _COLUMNS["kitti"] else "TUM"
+    if len(wanted) > 2:
+        raise TrajectoryError(f"{where}: {found} columns; a KITTI row has 12, a TUM row 8")
+    name = "KITTI" if wanted[0] in _COLUMNS["kitti"] else "TUM"
     other = {12: "; this looks like a KITTI row", 8: "; this looks like a TUM row"}.get(found, "")
-    raise TrajectoryError(f"{where}: {found} columns where {name} has {wanted}{other}")
+    raise TrajectoryError(f"{where}: {found} columns where {name} has {wanted[0]}{other}")
 
 
 def _reason(error: ValueError) -> str:
@@ -266,12 +311,12 @@ def _kitti_poses(numbers: FloatArray) -> FloatArray:
 
 
 def _tum_poses(path: Path, lines: list[int], numbers: FloatArray) -> FloatArray:
-    quaternions_xyzw = numbers[:, 4:]
+    quaternions_xyzw = numbers[:, 3:]
     deviation = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0)
     wrong = np.flatnonzero(deviation >= _ROTATION_TOLERANCE)
     if wrong.size:
         raise TrajectoryError(f"{path}, line {lines[wrong[0]]}: the quaternion does not have length 1")
-    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, 1:4])
+    return se3.make(Rotation.from_quat(quaternions_xyzw).as_matrix(), numbers[:, :3])
 
 
 def _row(values: Iterable[float]) -> str:

@@ -31,9 +31,9 @@ class ErrorColumn:
 
 
 SNIPPET_ATE = ErrorColumn(
-    lambda e: e.snippet5.ate_mean, "snippet ATE, m", "snip.\nATE", 4, lambda e: e.snippet5.ate_std
+    lambda e: e.snippet5.ate_mean, "snippet ATE, m", "snippet\nATE", 4, lambda e: e.snippet5.ate_std
 )
-SNIPPET_RE = ErrorColumn(lambda e: e.snippet5.re_mean, "snippet RE, rad", "snip.\nRE", 4, lambda e: e.snippet5.re_std)
+SNIPPET_RE = ErrorColumn(lambda e: e.snippet5.re_mean, "snippet RE, rad", "snippet\nRE", 4, lambda e: e.snippet5.re_std)
 ALIGNED_ATE = (
     ErrorColumn(lambda e: e.align.none.ate_rmse_m, "ATE RMSE, as written", "ATE\nnone", 3),
     ErrorColumn(lambda e: e.align.first.ate_rmse_m, "ATE RMSE, first pose", "ATE\nfirst", 3),
@@ -41,10 +41,12 @@ ALIGNED_ATE = (
     ErrorColumn(lambda e: e.align.dof6.ate_rmse_m, "ATE RMSE, 6 dof", "ATE\n6dof", 3),
     ErrorColumn(lambda e: e.align.dof7.ate_rmse_m, "ATE RMSE, 7 dof", "ATE\n7dof", 3),
 )
-T_REL = ErrorColumn(lambda e: e.align.dof7.t_rel_percent, "t_rel, % (7 dof)", "t_rel\n%", 2)
-R_REL = ErrorColumn(lambda e: e.align.dof7.r_rel_deg_per_100m, "r_rel, deg / 100 m", "r_rel\n°/100m", 3)
+T_REL = ErrorColumn(lambda e: e.align.dof7.t_rel_percent, "t_rel, %, 7 dof", "t_rel %\n7dof", 2)
+R_REL = ErrorColumn(lambda e: e.align.dof7.r_rel_deg_per_100m, "r_rel, deg / 100 m, 7 dof", "r_rel\n7dof", 3)
+RPE_M = ErrorColumn(lambda e: e.align.dof7.rpe_trans_m, "RPE, m, 7 dof", "RPE m\n7dof", 4)
+RPE_DEG = ErrorColumn(lambda e: e.align.dof7.rpe_rot_deg, "RPE, deg, 7 dof", "RPE deg\n7dof", 3)
 EVO_DIFFERENCE = ErrorColumn(lambda e: e.evo.difference, "largest difference to evo", "to\nevo", 1)
-COLUMNS = (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, EVO_DIFFERENCE)
+COLUMNS = (SNIPPET_ATE, SNIPPET_RE, *ALIGNED_ATE, T_REL, R_REL, RPE_M, RPE_DEG, EVO_DIFFERENCE)
 
 
 def written(value: Any, decimals: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from slam.results.error_columns import (
     COLUMNS,
@@ -20,72 +20,58 @@ from slam.results.metrics import Metrics
 from slam.runtime.errors import RunError
 from slam.runtime.run_files import TRAJECTORIES
 from slam.runtime.storage.record import Missing, known
+from slam.runtime.terminal import TerminalTable
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-_EVO_APE = ErrorColumn(lambda e: e.evo.ape_rmse_m_7dof, "APE RMSE by evo, 7 dof", "evo\nAPE", 3)
+UNITS = "Snippet ATE (norm / 5), ATE RMSE and RPE (mean) in metres; snippet RE in radians; r_rel in degrees per 100 m."
+_EVO_APE = ErrorColumn(lambda e: e.evo.ape_rmse_m_7dof, "APE RMSE by evo, 7 dof", "evo APE\n7dof", 3)
 _ONE_RUN = (*COLUMNS[:-1], _EVO_APE, EVO_DIFFERENCE)
 
 
-def metrics_table(trajectories: Mapping[str, Errors], title: str) -> Table:
+def metrics_table(trajectories: Mapping[str, Errors], title: str) -> TerminalTable:
     """One row a trajectory, in the order given; below, the reasons of missing numbers.
 
     Args:
         trajectories: errors by the name of the trajectory.
         title: what was compared, with the scale mode, which decides the unit of lengths.
     """
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(title), title_justify="left", caption_justify="left", pad_edge=False, box=SIMPLE_HEAD)
-    table.add_column("trajectory", overflow="fold", min_width=10)
-    _add_columns(table, _ONE_RUN)
-    for name, errors in trajectories.items():
-        cells = (c.text(errors) if c is SNIPPET_ATE else written(c.value(errors), c.decimals) for c in _ONE_RUN)
-        table.add_row(Text(name), *cells)
+    rows = [
+        [name, *(c.text(errors) if c is SNIPPET_ATE else written(c.value(errors), c.decimals) for c in _ONE_RUN)]
+        for name, errors in trajectories.items()
+    ]
     reasons = missing_by_reason(trajectories, _ONE_RUN)
     notes = [f"{DASH} {', '.join(names)}: {reason}." for reason, names in reasons.items()]
-    units = "Snippet ATE (mean ± deviation of norm / 5) and ATE RMSE in metres, snippet RE in radians."
-    table.caption = Text("\n".join([units, *notes]))
-    return table
+    return TerminalTable(["trajectory", *(c.short for c in _ONE_RUN)], rows, title, [UNITS, *notes])
 
 
-def comparison_table(runs: Sequence[RunFolder]) -> Table:
+def comparison_table(runs: Sequence[RunFolder]) -> TerminalTable:
     """One row for each run and trajectory; runs that failed or were killed with the reason.
 
     Raises:
         RunError: no run was given, or its ``metrics.json`` is damaged.
     """
-    from rich.table import Table
-    from rich.text import Text
-
-    contents = _contents(runs)
-    table = Table(title="Errors against the reference", title_justify="left", caption_justify="left")
-    table.add_column("run", overflow="fold", min_width=10)
-    table.add_column("trajectory", no_wrap=True)
-    _add_columns(table, COLUMNS)
-    notes: dict[str, None] = {}
-    for name, metrics in zip(_names(runs), contents):
-        leak = metrics.provenance.leak is True
-        title = Text.assemble(name, ("\nLEAK", "bold red") if leak else "")
-        if metrics.failure:
-            ended = "failed" if metrics.status == "failed" else "did not end"
-            notes[f"{name} {ended}: {metrics.failure}."] = None
-            title.append(f"\n{ended}", "bold red")
+    rows: list[list[str]] = []
+    notes: dict[str, None] = {UNITS: None}
+    for name, metrics in zip(_names(runs), _contents(runs)):
         all_errors: dict[str, Errors] = {each: getattr(metrics.trajectories, each) for each in TRAJECTORIES}
         errors = {each: found for each, found in all_errors.items() if not isinstance(found, Missing)}
-        columns = ["\n".join(written(c.value(e), c.decimals) for e in errors.values()) for c in COLUMNS]
-        table.add_row(title, "\n".join(errors), *columns, end_section=True)
+        title = name
+        if metrics.failure:
+            ended = "failed" if metrics.status == "failed" else "did not end"
+            title += f", {ended}"
+            notes[f"{name} {ended}: {metrics.failure}."] = None
+        if metrics.provenance.leak is True:
+            title += ", LEAK"
+            notes["LEAK: the weights were trained on the sequence; the numbers are no test."] = None
+        for each, found in errors.items():
+            rows.append([title, each, *(written(c.value(found), c.decimals) for c in COLUMNS)])
         if errors:
             for why, where in missing_by_reason(all_errors, COLUMNS).items():
                 notes[f"{DASH} {name}, {' and '.join(where)}: {why}."] = None
-        if leak:
-            notes["LEAK: the weights were trained on the sequence; the numbers are no test."] = None
+        else:
+            rows.append([title, "", *[DASH] * len(COLUMNS)])
         notes.update({f"{name}: {note}": None for note in metrics.unit_notes()})
-    table.caption = Text("\n".join(["ATE and snippet ATE in metres, snippet RE in radians.", *notes]))
-    return table
+    head = ["run", "trajectory", *(c.short for c in COLUMNS)]
+    return TerminalTable(head, rows, "Errors against the reference", list(notes), names=2)
 
 
 def comparison_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
@@ -103,11 +89,6 @@ def comparison_json(runs: Sequence[RunFolder]) -> list[dict[str, Any]]:
         entry["leak"] = known(metrics.provenance.leak)
         objects.append(entry | {key: tree.get(key) for key in ("sequence", "scale", "trajectories")})
     return objects
-
-
-def _add_columns(table: Table, columns: Sequence[ErrorColumn]) -> None:
-    for column in columns:
-        table.add_column(column.short, justify="right", min_width=column.decimals + 2, no_wrap=True)
 
 
 def _names(runs: Sequence[RunFolder]) -> list[str]:

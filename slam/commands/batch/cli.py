@@ -44,7 +44,7 @@ def batch(
     from slam.commands.batch.cluster import workers as dask_workers
     from slam.commands.batch.execution import Limits, run_drives
     from slam.commands.batch.manifest import drives_of
-    from slam.commands.batch.summary import CSV, PAGE, check_output, failure_table, summary_table, write_summary
+    from slam.commands.batch.summary import CSV, PAGE, check_output, summary_table, write_summary
 
     if memory and not Path("/proc/self/statm").exists():
         raise SlamError("--memory needs Linux: leave it out here")
@@ -67,7 +67,6 @@ def batch(
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     typer.echo(f"{len(outcomes)} drives, {kept} of them whole before, {failed} failed: {output / PAGE}, {output / CSV}")
     if failed:
-        print_table(failure_table(outcomes))
         first = next(outcome for outcome in outcomes if outcome.status == "failed")
         rest = "; the others are whole" if failed < len(outcomes) else ""
         raise RunError(f"{failed} of {len(outcomes)} drives failed{rest}; {first.drive.name}: {first.reason}")

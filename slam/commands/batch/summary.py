@@ -6,7 +6,7 @@ import csv
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -19,9 +19,7 @@ from slam.runtime.errors import RunError
 from slam.runtime.run_files import REPORT
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import Missing, known
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from slam.runtime.terminal import TerminalTable
 
 CSV = "drives.csv"
 PAGE = "index.html"
@@ -82,29 +80,18 @@ def write_summary(output: Path, outcomes: Sequence[Outcome]) -> None:
     write_atomically(output / PAGE, lambda path: path.write_text(page, encoding="utf-8"), RunError)
 
 
-def summary_table(outcomes: Sequence[Outcome]) -> Table:
-    """The main numbers of the runs that are whole, for a terminal."""
-    from rich.table import Table
-
+def summary_table(outcomes: Sequence[Outcome]) -> TerminalTable:
+    """The main numbers of the runs that are whole, and why others failed, for a terminal."""
     shown = ("frames", "length_m", "unit", "ate_6dof_m", "ate_7dof_m", "t_rel_percent", "seconds")
-    table = Table("drive", "status", *shown)
+    rows = []
     for outcome in outcomes:
         if outcome.status != "failed":
             row = _row(outcome)
-            cells = [written(row[name], decimals) for name, _, decimals in _COLUMNS if name in shown]
-            table.add_row(outcome.drive.name, outcome.status, *cells)
-    return table
-
-
-def failure_table(outcomes: Sequence[Outcome]) -> Table:
-    """The drives that failed, and why."""
-    from rich.table import Table
-
-    table = Table("failed", "reason")
-    for outcome in outcomes:
-        if outcome.status == "failed":
-            table.add_row(outcome.drive.name, outcome.reason)
-    return table
+            cells = (written(row[name], decimals) for name, _, decimals in _COLUMNS if name in shown)
+            rows.append([outcome.drive.name, outcome.status, *cells])
+    head = ["drive", "status", "frames", "length\nm", "unit", "ATE m\n6dof", "ATE m\n7dof", "t_rel %\n7dof", "seconds"]
+    notes = [f"{outcome.drive.name} failed: {outcome.reason}" for outcome in outcomes if outcome.status == "failed"]
+    return TerminalTable(head, rows, notes=notes)
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:

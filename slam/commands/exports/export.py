@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -191,5 +192,5 @@ def _trajectory(folder: RunFolder, up: str) -> Trajectory:
         raise RunError(f"{folder.path}: {ESTIMATE} is damaged: it has {len(trajectory)} rows for {frames} frames")
     if up != "y-down":
         T_up_world = se3.make(R_UP_WORLDS[up], np.zeros(3))
-        trajectory = Trajectory(trajectory.stamps, T_up_world @ trajectory.T_world_camera, trajectory.timed)
+        trajectory = replace(trajectory, T_world_camera=T_up_world @ trajectory.T_world_camera)
     return trajectory

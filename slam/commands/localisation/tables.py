@@ -5,41 +5,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from slam.commands.localisation.accuracy import PoseError, summary
 from slam.commands.localisation.localiser import Localisation
 from slam.formats.trajectory import Trajectory, write_tum
+from slam.results.error_columns import DASH
 from slam.runtime.errors import RunError
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from slam.runtime.terminal import TerminalTable
 
 
-def localisation_table(found: Sequence[Localisation], errors: Sequence[PoseError | None] | None = None) -> Table:
-    """One row an image: position in the map, nearest frame of the run, inliers, errors if known, or why not found."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-    from rich.text import Text
-
+def localisation_table(
+    found: Sequence[Localisation], errors: Sequence[PoseError | None] | None = None
+) -> TerminalTable:
+    """One row an image: position in the map, nearest frame of the run, inliers, errors; below, why one is not found."""
     located = sum(each.T_world_camera is not None for each in found)
-    title = Text(f"{located} of {len(found)} images found")
-    table = Table(title=title, title_justify="left", pad_edge=False, box=SIMPLE_HEAD)
-    table.add_column("image", overflow="fold")
-    of_error = ("error, m", "error, deg") if errors is not None else ()
-    for name in ("x", "y", "z", "nearest frame", "inliers", *of_error):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("", overflow="fold")
+    of_error = () if errors is None else ("error\nm", "error\ndeg")
+    rows = []
     for each, error in zip(found, errors or [None] * len(found), strict=True):
-        sizes = [""] * len(of_error) if error is None else [f"{error.error_m:.3f}", f"{error.error_deg:.3f}"]
-        if each.T_world_camera is None:
-            table.add_row(Text(each.image), "", "", "", "", "", *sizes, Text(f"not found: {each.reason}"))
-        else:
-            position = [f"{value:.2f}" for value in each.T_world_camera[:3, 3]]
-            table.add_row(Text(each.image), *position, str(each.nearest_frame), str(each.inliers), *sizes, "")
-    return table
+        row = [each.image, *[DASH] * (5 + len(of_error))]
+        if each.T_world_camera is not None:
+            position = (f"{value:.2f}" for value in each.T_world_camera[:3, 3])
+            row[1:6] = [*position, str(each.nearest_frame), str(each.inliers)]
+        if error is not None:
+            row[6:] = [f"{error.error_m:.3f}", f"{error.error_deg:.3f}"]
+        rows.append(row)
+    notes = [f"{each.image} not found: {each.reason}" for each in found if each.T_world_camera is None]
+    head = ["image", "x", "y", "z", "nearest\nframe", "inliers", *of_error]
+    return TerminalTable(head, rows, f"{located} of {len(found)} images found", notes)
 
 
 def localisation_json(

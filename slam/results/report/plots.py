@@ -7,7 +7,7 @@ grey. Matplotlib is imported inside the functions, without changes of its global
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +54,8 @@ _LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
     "optimised": ("Optimised", {"color": "#0072b2", "linestyle": "-", "linewidth": 2.0}),
     "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
 }
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # of systems
+_STROKES = ("-", (0, (6, 1.5)), (0, (1, 1)))
 
 
 def trajectories_figure(what: str, trajectories: Mapping[str, Trajectory], title: str = "", unit: str = "m") -> Figure:
@@ -82,8 +84,9 @@ def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory]
     """Draw the top view on a figure or a part of one."""
     axes = canvas.subplots()
     has_reference = REFERENCE in trajectories
+    looks = _looks(trajectories)
     for name, trajectory in aligned(trajectories).items():
-        label, look = _LOOKS[name]
+        label, look = looks[name]
         if not has_reference and name == "network" and "optimised" in trajectories:
             label += " (scaled)"
         axes.plot(trajectory.positions[:, 0], trajectory.positions[:, 2], label=label, **look)
@@ -101,11 +104,11 @@ def draw_trajectories(canvas: FigureBase, trajectories: Mapping[str, Trajectory]
 def draw_errors(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit: str) -> list[Axes]:
     """Draw the position error on a figure or a part of one."""
     reference = _reference(trajectories)
-    axes = canvas.subplots()
+    axes, looks = canvas.subplots(), _looks(trajectories)
     for name, trajectory in estimates(aligned(trajectories)):
         estimate, truth = associate(trajectory, reference)
         error = np.linalg.norm(estimate.positions - truth.positions, axis=1)
-        label, look = _LOOKS[name]
+        label, look = looks[name]
         axes.plot(path_distance(truth.T_world_camera), error, label=label, **look)
     axes.set(xlabel="distance travelled (m)", ylabel="position error (m), 7 dof")
     axes.set_xlim(left=0)
@@ -118,12 +121,12 @@ def draw_drift(canvas: FigureBase, trajectories: Mapping[str, Trajectory], unit:
     """Draw translation and rotation drift on a figure or a part of one."""
     reference = _reference(trajectories)
     left, right = canvas.subplots(1, 2)
-    lengths: set[float] = set()
+    looks, lengths = _looks(trajectories), set[float]()
     for name, trajectory in estimates(aligned(trajectories)):
         drifts = segment_drifts(*associate(trajectory, reference))
         length = [drift.length_m for drift in drifts]
         lengths.update(length)
-        label, look = _LOOKS[name]
+        label, look = looks[name]
         look = look | {"marker": "o", "markersize": 3.5}
         left.plot(length, [100.0 * drift.translation for drift in drifts], label=label, **look)
         right.plot(length, [np.rad2deg(100.0 * drift.rotation) for drift in drifts], label=label, **look)
@@ -217,6 +220,28 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def plot_systems(trajectories: Mapping[str, Trajectory], what: Sequence[str], output: Path) -> None:
+    """Write one figure of trajectories over each other, a row for each of ``what``.
+
+    Args:
+        trajectories: by the name of their system; ``reference`` is the truth.
+        what: of `PANELS`.
+        output: the file to write.
+
+    Raises:
+        RunError: an unknown ``what``, or one that needs a reference where there is none.
+        ConfigError: as `require_figure`.
+    """
+    rows = _panels(what)
+    require_figure(output)
+    with figure_style() as new_figure:
+        figure = new_figure(figsize=(7.4, sum(map(_height, rows))), layout="constrained")
+        grid = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=[*map(_height, rows)])
+        for name, part in zip(rows, grid[:, 0]):
+            PANELS[name](part, trajectories, "as in the file")
+        _save(figure, output)
+
+
 def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> None:
     """Write one figure: a column for each run, a row for each of ``what``.
 
@@ -224,14 +249,10 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
         RunError: an unknown ``what``, or a run without what the figure needs.
         ConfigError: as `require_figure`.
     """
-    what = [name.strip() for name in what]
-    unknown = [name for name in what if name not in PANELS]
-    if unknown or not what or not runs:
-        wanted = f"--what {unknown[0]!r} is unknown" if unknown else "nothing to plot"
-        raise RunError(f"{wanted}: give at least one run and some of {', '.join(PANELS)}")
+    what = _panels(what)
     require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
-    heights = [4.6 if name == "trajectory" else 3.2 for name in what]
+    heights = [*map(_height, what)]
     with figure_style() as new_figure:
         figure = new_figure(figsize=(7.4 * len(runs), sum(heights)), layout="constrained")
         grid = figure.subfigures(len(what), len(runs), squeeze=False, height_ratios=heights)
@@ -241,10 +262,7 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
                 _share_heights(drawn)
         for part, run in zip(grid[0], runs):
             part.suptitle(run.path.resolve().name, fontsize=12)
-        try:
-            save_figure(figure, output, dpi=200)
-        except OSError as error:
-            raise RunError(str(error)) from error
+        _save(figure, output)
 
 
 def trajectories_of(run: RunFolder, needs_reference: bool = False) -> dict[str, Trajectory]:
@@ -279,6 +297,36 @@ def figure_style() -> Iterator[Callable[..., Figure]]:
 
     with rc_context(_STYLE):
         yield Figure
+
+
+def _panels(what: Sequence[str]) -> list[str]:
+    names = [name.strip() for name in what]
+    unknown = [name for name in names if name not in PANELS]
+    if unknown:
+        raise RunError(f"--what {unknown[0]!r} is unknown: give some of {', '.join(PANELS)}")
+    return names
+
+
+def _height(panel: str) -> float:
+    return 4.6 if panel == "trajectory" else 3.2
+
+
+def _save(figure: Figure, output: Path) -> None:
+    try:
+        save_figure(figure, output, dpi=200)
+    except OSError as error:
+        raise RunError(str(error)) from error
+
+
+def _looks(names: Iterable[str]) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Label and style of every trajectory; those of other systems in the order given."""
+    names = list(names)
+    others = [name for name in names if name not in _LOOKS]
+    looks = {}
+    for k, name in enumerate(others):
+        stroke = _STROKES[k // len(_COLOURS) % len(_STROKES)]
+        looks[name] = (name, {"color": _COLOURS[k % len(_COLOURS)], "linestyle": stroke, "linewidth": 1.5})
+    return {name: looks.get(name) or _LOOKS[name] for name in names}
 
 
 def _beside() -> dict[str, Any]:

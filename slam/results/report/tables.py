@@ -13,6 +13,8 @@ from slam.results.error_columns import (
     DASH,
     EVO_DIFFERENCE,
     R_REL,
+    RPE_DEG,
+    RPE_M,
     SNIPPET_ATE,
     SNIPPET_RE,
     T_REL,
@@ -163,6 +165,8 @@ def errors(metrics: Metrics) -> Table | None:
         *(row(column) for column in ALIGNED_ATE),
         "KITTI segments of 100 to 800 m",
         *(row(column) for column in (T_REL, R_REL)),
+        "From frame to frame",
+        *(row(column) for column in (RPE_M, RPE_DEG)),
         "Cross-check",
         row(EVO_DIFFERENCE),
     ]

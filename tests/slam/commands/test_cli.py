@@ -123,6 +123,7 @@ def test_an_error_of_several_lines_is_printed_as_one(call: Call, monkeypatch: py
         ["evaluate", "a.txt", "b.txt", "c.txt"],
         ["evaluate", "a.txt", "b.txt", "--format", "euroc"],
         ["evaluate", ".", "--fail-over", "ate_rmse_m=1"],
+        ["evaluate", ".", "--csv", "a.csv"],
         ["export", "."],
         ["simulate", "world", "--frames", "many"],
     ],
@@ -262,6 +263,47 @@ def test_evaluate_runs_side_by_side(call: Call, make_run: MakeRun) -> None:
     code, out, _ = call("evaluate", *runs)
     assert code == 0 and "morning" in out and "evening" in out and "optimised" in out
     assert [entry["run"] for entry in json.loads(call("evaluate", *runs, "--json")[1])] == list(map(str, runs))
+
+
+def test_evaluate_systems_against_one_reference(call: Call, make_run: MakeRun) -> None:
+    """Files and runs in one table; several of one name as mean and deviation; frames, CSV, LaTeX and a plot."""
+    run = make_run("ours")
+    for k in range(3):
+        text = (run.path / "trajectory_optimised.kitti.txt").read_text().splitlines(keepends=True)
+        Path(f"orb_{k}.txt").write_text("".join(text[: len(text) // 2 if k == 2 else None]))
+    truth = run.path / "reference.kitti.txt"
+    rows = len(truth.read_text().splitlines())
+    outputs = ("--csv", "a.csv", "--latex", "a.tex", "--plot", "a.png")
+    code, out, err = call("evaluate", run.path, "orb=orb_[01].txt", "--reference", truth, *outputs)
+    assert (code, err) == (0, "") and "orb (2 runs)" in out and " ± 0.000" in out
+    lines = Path("a.csv").read_text().splitlines()
+    assert len(lines) == 4 and lines[0].startswith("system,path,poses,") and "align.6dof.t_rel_percent" in lines[0]
+    table = Path("a.tex").read_text()
+    assert table.startswith(r"\begin{tabular}{lr") and "orb (2 runs) & " in table
+    assert cv2.imread("a.png").std() > 5
+    code, _, err = call("evaluate", "orb_2.txt", "--reference", truth)
+    assert code == 1 and "orb_2.txt: the estimate has" in err and "--frames A:B" in err
+    arguments = ("evaluate", run.path, "orb_2.txt", "--reference", run.path, "--frames", f"0:{rows // 2}")
+    code, out, _ = call(*arguments, "--json")
+    assert code == 0 and [each["poses"] for each in json.loads(out)] == [rows // 2] * 2
+    assert json.loads(out)[1]["align"]["7dof"]["ate_rmse_m"] == pytest.approx(
+        json.loads(out)[0]["align"]["7dof"]["ate_rmse_m"]
+    )
+    assert call(*arguments, "--fail-over", "ate_rmse_m=0")[0] == 1
+    for words, wanted in ((("no=*.none",), "no file or folder is named *.none"), (("a.txt",), "a.txt: no such file")):
+        code, _, err = call("evaluate", *words, "--reference", truth)
+        assert code == 1 and err.count("\n") == 1 and wanted in err
+    code, _, err = call("evaluate", run.path, "--reference", truth, "--csv", "orb_0.txt")
+    assert code == 1 and "choose another" in err
+
+
+def test_files_are_plotted_over_each_other(call: Call, make_run: MakeRun) -> None:
+    estimate, reference = files_of(make_run(), "kitti")
+    assert call("plot", estimate, reference, "--output", "plain.png")[0] == 0
+    code, _, err = call("plot", estimate, reference, "--what", "drift")
+    assert code == 1 and "need ground truth" in err
+    code, out, _ = call("plot", estimate, "--reference", reference, "--what", "trajectory,drift")
+    assert code == 0 and "plot.png" in out and cv2.imread("plot.png").std() > 5
 
 
 def test_plot(call: Call, make_run: MakeRun) -> None:

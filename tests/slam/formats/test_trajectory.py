@@ -161,6 +161,38 @@ def test_untimed_trajectories_match_row_by_row() -> None:
     assert "\n" not in str(error.value)
 
 
+def test_rows_with_frame_numbers_match_the_rows_of_the_reference(tmp_path: Path) -> None:
+    rows = "".join(f"{k} 1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in (2, 3, 7))
+    estimate = read_trajectory(written(tmp_path, rows))
+    assert estimate.numbered and not estimate.timed
+    reference = Trajectory(np.arange(10.0), wander(10).T_world_camera, timed=False)
+    ours, truth = associate(estimate, reference)
+    np.testing.assert_array_equal(ours.positions[:, 0], [2, 3, 7])
+    np.testing.assert_array_equal(truth.T_world_camera, reference.T_world_camera[[2, 3, 7]])
+    ours, truth = associate(estimate, reference, (3, 10))
+    np.testing.assert_array_equal(ours.positions[:, 0], [3, 7])
+    with pytest.raises(TrajectoryError, match="no poses of frames 4:6, only 2 to 7"):
+        associate(estimate, reference, (4, 6))
+    with pytest.raises(TrajectoryError, match="line 2: frame numbers must increase"):
+        read_trajectory(written(tmp_path, rows.splitlines()[0] + "\n" + rows))
+
+
+def test_frames_cut_the_reference_and_a_file_of_as_many_rows_is_of_these_frames() -> None:
+    reference = Trajectory(np.arange(10.0), wander(10).T_world_camera, timed=False)
+    for estimate in (reference, reference.select(np.arange(4, 8))):
+        ours, truth = associate(estimate, reference, (4, 8))
+        np.testing.assert_array_equal(ours.T_world_camera, reference.T_world_camera[4:8])
+        np.testing.assert_array_equal(truth.T_world_camera, reference.T_world_camera[4:8])
+
+
+def test_seven_columns_are_a_camera_that_looks_along_x(tmp_path: Path) -> None:
+    """TartanVO's: ahead, right and down are x, y and z; a turn to the right is about its z."""
+    half = np.sin(np.pi / 4)
+    poses = read_trajectory(written(tmp_path, f"1 2 3 0 0 0 1\n1 2 3 0 0 {half} {half}\n")).T_world_camera
+    np.testing.assert_allclose(poses[0], se3.make(np.eye(3), np.array([2.0, 3.0, 1.0])), atol=1e-12)
+    np.testing.assert_allclose(poses[1, :3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+
+
 def test_stamps_match_one_to_one_within_half_a_period() -> None:
     reference = wander(50)
     stamps = reference.stamps[10:40:2] + 0.03

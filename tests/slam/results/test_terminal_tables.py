@@ -20,7 +20,7 @@ MakeRun = Callable[..., RunFolder]
 MakeMetrics = Callable[..., dict[str, Any]]
 
 
-def printed(runs: list[RunFolder], width: int = 140) -> str:
+def printed(runs: list[RunFolder], width: int = 160) -> str:
     console = Console(width=width, record=True, file=None, quiet=False, force_terminal=False)
     with console.capture() as capture:
         console.print(comparison_table(runs))
@@ -90,8 +90,8 @@ def test_rows_columns_and_title() -> None:
     ]
     assert row[5:10] == [f"{align[name]['ate_rmse_m']:.3f}" for name in ("none", "first", "scale", "6dof", "7dof")]
     assert row[10] == f"{align['7dof']['t_rel_percent']:.2f}"
-    assert row[12] == f"{evo['ape_rmse_m_7dof']:.3f}"
-    assert len(row) == 14
+    assert row[14] == f"{evo['ape_rmse_m_7dof']:.3f}"
+    assert len(row) == 16
 
 
 def test_missing_numbers_are_dashes_with_one_reason_each() -> None:
@@ -99,4 +99,14 @@ def test_missing_numbers_are_dashes_with_one_reason_each() -> None:
     assert text.count("no segment of 100 m fits") == 1
     assert "– network, odometry: no segment" in text
     assert "– lidar: not recorded." in text
-    assert next(each for each in text.splitlines() if "lidar" in each).split() == ["lidar", *["–"] * 11]
+    assert next(each for each in text.splitlines() if "lidar" in each).split() == ["lidar", *["–"] * 13]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_narrow_terminal_turns_the_table_and_cuts_nothing(make_run: MakeRun, width: int) -> None:
+    wide = printed([make_run("morning"), make_run("b")], 300)
+    narrow = printed([make_run("morning"), make_run("b")], width)
+    numbers = sorted(word for word in wide.split() if word[0].isdigit() and "." in word)
+    assert sorted(word for word in narrow.split() if word[0].isdigit() and "." in word) == numbers and len(numbers) > 40
+    assert "…" not in narrow and max(map(len, narrow.splitlines())) <= width
+    assert "t_rel % 7dof" in narrow

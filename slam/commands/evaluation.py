@@ -1,0 +1,155 @@
+"""The verbs ``evaluate`` and ``plot`` of the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from slam.commands.options import Json, UnusedDevice, UnusedSeed
+from slam.runtime.errors import SlamError
+from slam.runtime.terminal import print_table
+
+verbs = typer.Typer()
+
+Format = Annotated[Literal["auto", "kitti", "tum"], typer.Option(help="of the files")]
+Reference = Annotated[Path | None, typer.Option(help="the truth: a trajectory file or a run folder")]
+Frames = Annotated[str | None, typer.Option(help="A:B of the reference, half-open")]
+
+
+@verbs.command()
+def evaluate(
+    paths: Annotated[
+        list[str], typer.Argument(help="ESTIMATE REFERENCE (two files), or run folders; with --reference any of both")
+    ],
+    reference: Reference = None,
+    frames: Frames = None,
+    format: Format = "auto",
+    csv: Annotated[Path | None, typer.Option(help="all numbers, with --reference")] = None,
+    latex: Annotated[Path | None, typer.Option(help="the table, with --reference")] = None,
+    plot: Annotated[Path | None, typer.Option(help="png, pdf or svg of all trajectories, with --reference")] = None,
+    fail_over: Annotated[list[str] | None, typer.Option(help="METRIC=VALUE: exit 1 if it is larger; repeat")] = None,
+    as_json: Json = False,
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Errors of trajectories or of whole runs.
+
+    Of two trajectory files: all metrics under all alignments. Of run folders: their tables side by side. With
+    --reference: one table of any number of files and runs. NAME=PATH names a system; of several with one NAME the table
+    has mean and deviation.
+
+    Example: erfsfm-slam evaluate ours=results/latest "orb=orb_*.txt" --reference poses/09.txt --plot systems.png
+    """
+    if reference is not None:
+        _compare(paths, reference, frames, format, fail_over or [], as_json, csv, latex, plot)
+        return
+    files = [Path(path) for path in paths]
+    if frames or csv or latex or plot:
+        raise typer.BadParameter("--frames, --csv, --latex and --plot need --reference FILE")
+    if all(path.is_dir() for path in files):
+        if fail_over:
+            raise typer.BadParameter("a limit applies to trajectory files: give --reference", param_hint="--fail-over")
+        _evaluate_runs(files, as_json)
+    elif len(paths) == 2:
+        _evaluate_files(files[0], files[1], format, fail_over or [], as_json)
+    else:
+        given = ", ".join(paths)
+        raise typer.BadParameter(f"give two trajectory files, run folders that exist, or --reference FILE; got {given}")
+
+
+@verbs.command()
+def plot(
+    runs: Annotated[list[str], typer.Argument(help="run folders side by side; with files all over each other")],
+    what: Annotated[str, typer.Option(help="comma list of trajectory, errors, drift")] = "trajectory",
+    output: Annotated[Path, typer.Option(help="png, pdf or svg")] = Path("plot.png"),
+    reference: Reference = None,
+    frames: Frames = None,
+    format: Format = "auto",
+    seed: UnusedSeed = 0,
+    device: UnusedDevice = "auto",
+) -> None:
+    """Figures of runs, or of trajectory files over each other, for a paper.
+
+    Example: erfsfm-slam plot results/latest --what trajectory,errors --output figure.pdf
+    """
+    from slam.results.folder import RunFolder
+    from slam.results.report.plots import plot_runs, plot_systems
+    from slam.results.systems import by_name, compare, named_paths, trajectory_at
+
+    panels = what.split(",")
+    if reference is not None:
+        plot_systems(by_name(compare(named_paths(runs), reference, format, frames)), panels, output)
+    elif frames is not None:
+        raise typer.BadParameter("--frames needs --reference FILE")
+    elif all(Path(run).is_dir() or not Path(run).suffix for run in runs):
+        plot_runs([RunFolder.open(run) for run in runs], panels, output)
+    else:
+        plot_systems({name: trajectory_at(path, format) for name, path in named_paths(runs)}, panels, output)
+    typer.echo(f"figure in {output}")
+
+
+def _compare(
+    paths: list[str],
+    reference: Path,
+    frames: str | None,
+    format: str,
+    limits: list[str],
+    as_json: bool,
+    csv: Path | None,
+    latex: Path | None,
+    plot: Path | None,
+) -> None:
+    from slam.evaluation.trajectory import exceeded
+    from slam.results.output_file import check_replaced
+    from slam.results.report.plots import plot_systems
+    from slam.results.systems import by_name, compare, named_paths, systems_table, write_csv, write_latex
+
+    for file, beginning in ((csv, {".csv": b"system,path"}), (latex, {".tex": rb"\begin{tabular}"})):
+        if file is not None:
+            check_replaced(file, beginning)
+    runs = compare(named_paths(paths), reference, format, frames)
+    if csv is not None:
+        write_csv(runs, csv)
+    if latex is not None:
+        write_latex(runs, latex)
+    if plot is not None:
+        plot_systems(by_name(runs), ["trajectory", "errors"], plot)
+    if as_json:
+        typer.echo(json.dumps([run.tree() for run in runs], indent=2))
+    else:
+        print_table(systems_table(runs, reference))
+    broken = [f"{run.path}: {line}" for run in runs for line in exceeded(run.errors, limits)]
+    if broken:
+        raise SlamError("; ".join(broken))
+
+
+def _evaluate_runs(paths: list[Path], as_json: bool) -> None:
+    from slam.results.folder import RunFolder
+    from slam.results.terminal_tables import comparison_json, comparison_table
+
+    runs = [RunFolder.open(path) for path in paths]
+    if as_json:
+        typer.echo(json.dumps(comparison_json(runs), indent=2))
+    else:
+        print_table(comparison_table(runs))
+
+
+def _evaluate_files(estimate: Path, reference: Path, format: str, limits: list[str], as_json: bool) -> None:
+    from slam.evaluation.trajectory import evo_commands, exceeded, trajectory_metrics
+    from slam.formats.trajectory import associate, read_trajectory
+    from slam.results.terminal_tables import metrics_table
+
+    pair = associate(read_trajectory(estimate, format), read_trajectory(reference, format))
+    metrics = trajectory_metrics(*pair)
+    if as_json:
+        typer.echo(metrics.to_json())
+    else:
+        print_table(metrics_table({estimate.name: metrics}, f"against {reference.name}"))
+        for line in evo_commands(estimate, reference, format):
+            typer.echo(line)
+    broken = exceeded(metrics, limits)
+    if broken:
+        raise SlamError("; ".join(broken))

@@ -1,0 +1,182 @@
+"""Trajectories of several systems against one reference: their errors as a table, as CSV and as LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.evaluation.trajectory import TrajectoryMetrics, trajectory_metrics
+from slam.formats.trajectory import Trajectory, associate, read_trajectory
+from slam.results.error_columns import COLUMNS, DASH, ErrorColumn, missing_by_reason, written
+from slam.results.folder import RunFolder
+from slam.results.terminal_tables import UNITS
+from slam.runtime.errors import RunError, TrajectoryError
+from slam.runtime.run_files import REFERENCE
+from slam.runtime.storage.files import write_atomically
+from slam.runtime.storage.record import Missing
+from slam.runtime.terminal import TerminalTable
+from slam.sequences.excerpt import frame_range
+
+_COLUMNS = COLUMNS[:-1]  # without the difference to evo
+_SPECIAL = str.maketrans({c: f"\\{c}" for c in "_%&#$"} | {"±": "$\\pm$", DASH: "--"})
+
+
+@dataclass(frozen=True)
+class SystemRun:
+    """One trajectory of a system, its poses that have a true one, their truth, and its errors."""
+
+    system: str
+    path: Path
+    estimate: Trajectory
+    reference: Trajectory
+    errors: TrajectoryMetrics
+
+    def tree(self) -> dict[str, Any]:
+        """For JSON: the system, the file, the number of compared poses, and T of ``metrics.json``."""
+        return {"system": self.system, "path": str(self.path), "poses": len(self.estimate)} | self.errors.tree()
+
+
+def named_paths(words: Sequence[str]) -> list[tuple[str, Path]]:
+    """Files and run folders with the names of their systems.
+
+    Args:
+        words: each a path, whose system has the name of the file or folder, or ``NAME=PATH``, where PATH may be a
+            pattern (``orb=runs/orb_*.txt``); all paths of one NAME are of one system.
+
+    Raises:
+        RunError: a pattern that no file fits.
+    """
+    found: list[tuple[str, Path]] = []
+    for word in words:
+        name, _, pattern = word.rpartition("=")
+        if not name or Path(word).exists():
+            path = Path(word)
+            found.append((path.resolve().name if path.is_dir() else path.stem, path))
+            continue
+        paths = sorted(glob(pattern))  # noqa: PTH207 - Path.glob takes no whole path
+        if not paths:
+            raise RunError(f"{word}: no file or folder is named {pattern}")
+        found += [(name, Path(path)) for path in paths]
+    plain = [name for (name, _), word in zip(found, words) if Path(word).exists()]
+    return [(str(path) if plain.count(name) > 1 else name, path) for name, path in found]
+
+
+def trajectory_at(path: Path, format: str = "auto", of_run: str = "optimised") -> Trajectory:
+    """A trajectory file, or one of the trajectories of a run folder.
+
+    Raises:
+        SlamError: it cannot be read, or the run has none.
+    """
+    if not path.is_dir():
+        return read_trajectory(path, format)
+    trajectory = RunFolder.open(path).trajectory(of_run)
+    if trajectory is None:
+        raise RunError(f"{path} has no {of_run} trajectory: give a trajectory file, or another run")
+    return trajectory
+
+
+def compare(
+    paths: Sequence[tuple[str, Path]], reference: Path, format: str = "auto", frames: str | None = None
+) -> list[SystemRun]:
+    """Errors of trajectories against one reference.
+
+    Args:
+        paths: files or run folders by system (`named_paths`).
+        reference: a trajectory file, or a run folder with a reference.
+        format: of the files.
+        frames: ``A:B`` of the reference, half-open; a file of B - A rows without frame numbers is of these frames.
+
+    Raises:
+        SlamError: a file cannot be read, or its poses do not belong to those of the reference.
+    """
+    truth = trajectory_at(reference, format, REFERENCE)
+    chosen = None if frames is None else frame_range(frames, len(truth))
+    runs = []
+    for name, path in paths:
+        try:
+            pair = associate(trajectory_at(path, format), truth, chosen)
+        except TrajectoryError as error:
+            raise TrajectoryError(f"{path}: {error}") from error
+        runs.append(SystemRun(name, path, *pair, trajectory_metrics(*pair)))
+    return runs
+
+
+def systems_table(runs: Sequence[SystemRun], reference: Path) -> TerminalTable:
+    """A row for each system; of several trajectories of one, the mean and the deviation of a sample."""
+    reasons = missing_by_reason({run.system: run.errors for run in runs}, _COLUMNS)
+    notes = [f"{DASH} {', '.join(names)}: {reason}." for reason, names in reasons.items()]
+    title = f"Errors against {reference}"
+    return TerminalTable(["system", "poses", *(c.short for c in _COLUMNS)], list(_rows(runs)), title, [UNITS, *notes])
+
+
+def by_name(runs: Sequence[SystemRun]) -> dict[str, Trajectory]:
+    """The trajectories to draw over each other, with the reference of the most poses."""
+    found = {REFERENCE: max((run.reference for run in runs), key=len)}
+    for run in runs:
+        before = sum(each.system == run.system for each in runs[: runs.index(run)])
+        found[f"{run.system} #{before + 1}" if before else run.system] = run.estimate
+    return found
+
+
+def write_csv(runs: Sequence[SystemRun], output: Path) -> None:
+    """Every number of every trajectory, a row each; unknown ones are empty.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    rows = [dict(_flat(run.tree())) for run in runs]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)))
+    writer.writeheader()
+    writer.writerows(rows)
+    _write(output, text.getvalue())
+
+
+def write_latex(runs: Sequence[SystemRun], output: Path) -> None:
+    """The table of systems in the style of the package booktabs.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    head = ["system", "poses", *(c.name for c in _COLUMNS)]
+    lines = [" & ".join(cell.translate(_SPECIAL) for cell in row) + r" \\" for row in (head, *_rows(runs))]
+    begin = rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}"
+    table = [begin, r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule", r"\end{tabular}"]
+    _write(output, "\n".join(table) + "\n")
+
+
+def _rows(runs: Sequence[SystemRun]) -> Iterator[list[str]]:
+    for system in dict.fromkeys(run.system for run in runs):
+        own = [run for run in runs if run.system == system]
+        poses = "/".join(map(str, sorted({len(run.estimate) for run in own})))
+        name = f"{system} ({len(own)} runs)" if len(own) > 1 else system
+        yield [name, poses, *(_spread(column, own) for column in _COLUMNS)]
+
+
+def _spread(column: ErrorColumn, runs: Sequence[SystemRun]) -> str:
+    """The number of one run; of several the mean and the deviation of those that have it."""
+    values = [value for value in (column.value(run.errors) for run in runs) if not isinstance(value, Missing)]
+    if len(values) < 2:
+        return written(values[0] if values else None, column.decimals)
+    mean, deviation = float(np.mean(values)), float(np.std(values, ddof=1))
+    return f"{written(mean, column.decimals)} ± {written(deviation, column.decimals)}"
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Numbers by their dotted paths, without reasons."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif not key.endswith("_reason"):
+            yield prefix + key, value
+
+
+def _write(output: Path, text: str) -> None:
+    write_atomically(output, lambda partial: partial.write_text(text, encoding="utf-8", newline=""), RunError)

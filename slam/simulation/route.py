@@ -54,9 +54,7 @@ class Route:
     sample: FloatArray
 
 
-def plan_route(
-    route: RouteKind, frames: int, seed: int, still_frames: int = 0, mount: Mount | None = None
-) -> Route:
+def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, mount: Mount | None = None) -> Route:
     """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:

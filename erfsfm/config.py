@@ -14,6 +14,7 @@ from erfsfm.common.config_tree import dump_yaml as dump_yaml
 
 Fidelity = Literal["default", "paper"]
 TrainedNetworks = Literal["both", "depth", "pose"]
+Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 _COARSEST = 32  # pixels: images are aligned from a 32nd of their size on
 _LAST_MAP_ONE_PIXEL = 128  # pixels of an image; seven convolutions halve it
 
@@ -93,6 +94,13 @@ class DataConfig(Section):
     )
     weather: float = Field(
         default=0.0, ge=0, le=1, description="probability of simulated blur, rain and exposure changes in a snippet"
+    )
+    exact: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="share of each batch that is single images of simulated worlds with their true depth as the label "
+        "(simulate --depth); such worlds are then used for nothing else",
     )
     cache_mb: int = Field(default=4000, ge=0, description="memory for decoded images and labels, MB per process")
     workers: int = Field(default=1, ge=0, le=128, description="data loader processes; 0: in the training process")
@@ -214,8 +222,10 @@ class TrainingConfig(Section):
     )
     checkpoint_every: int = Field(default=500, ge=1, description="steps between checkpoints")
     log_every: int = Field(default=50, ge=1, description="steps between log entries")
-    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = Field(
-        default="32-true", description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, with a warning"
+    precision: Precision = Field(
+        default="32-true",
+        description="of the networks; a CPU uses bf16-mixed in place of 16-mixed, and 32-true if it has no bfloat16, "
+        "with a warning",
     )
     seed: int = Field(default=0, ge=0, le=2**31 - 1, description="of initial weights, snippets and augmentation")
 
@@ -223,6 +233,10 @@ class TrainingConfig(Section):
     def processes(self) -> int:
         """Number of processes on all machines."""
         return self.nodes * self.devices
+
+    def of_batch(self, share: float) -> int:
+        """Samples of a batch that a share comes to, rounded down."""
+        return int(share * self.batch)
 
 
 class ExperimentConfig(Section):
@@ -254,6 +268,11 @@ class ExperimentConfig(Section):
             raise ValueError(
                 "network.masks needs a loss.mask_weight above 0 (Zhou et al. 2017 take 0.2): without it masks of zero "
                 "have the least loss, and nothing else is learned"
+            )
+        if self.data.exact > 0 and (self.teacher.views != "many" or self.teacher.structure_weight == 0):
+            raise ValueError(
+                "data.exact needs teacher.views: many, whose lengths have the unit of exact depth, and a "
+                "teacher.structure_weight above 0"
             )
         if self.training.networks == "pose" and self.teacher.views != "many":
             raise ValueError("training.networks: pose needs teacher.views: many, which measures motion without depth")

@@ -87,11 +87,19 @@ def _odometry(root: OdometryRoot, sequence: Path) -> list[Recording]:
             Camera.of(pinhole),
             depth=_depth(sequence, files.paths) if camera == ODOMETRY_CAMERAS[0] else None,
             poses_file=poses if poses.is_file() else None,
+            camera_height_m=_simulated_height(root),
             t_camera_cam0=(tx, ty, tz),
             sequence=sequence.name,
         )
         recordings += split_at_gaps(whole, files)
     return recordings
+
+
+def _simulated_height(root: OdometryRoot) -> float | None:
+    """The camera's height in a simulated world; None in a real root, or where no file tells."""
+    file = root.base / CAMERA_FILE
+    simulated = root.simulation_seed() is not None and file.is_file()
+    return read_camera_file(file).height_or(None) if simulated else None
 
 
 def open_drive(drive: Path) -> list[Recording]:

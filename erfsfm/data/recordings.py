@@ -29,11 +29,12 @@ class Recording:
 
     ``camera`` belongs to the images as stored. ``start`` is the number of the first frame, by which the files
     beside the images are indexed. ``depth``, perhaps of some frames alone, and ``poses_file`` are ground truth where it
-    is known; the poses are of camera 0, which lies at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the
-    name of its folder in an odometry root, ``oxts`` the folder of the GPS/IMU's packets, one a frame. For a part of a
-    recording with gaps, ``skipped`` images come before it and there are ``stored`` in all; pose files may have rows for
-    these alone. ``without_stops`` says that frames in which the car stands still were taken out when it was packed.
-    The frames of one with ``packed`` are in tar files; `erfsfm.data.shard_draws` reads them.
+    is known, and so is ``camera_height_m`` above the road in a simulated world; the poses are of camera 0, which lies
+    at ``t_camera_cam0`` in this camera's frame. ``sequence`` is the name of its folder in an odometry root, ``oxts``
+    the folder of the GPS/IMU's packets, one a frame. For a part of a recording with gaps, ``skipped`` images come
+    before it and there are ``stored`` in all; pose files may have rows for these alone. ``without_stops`` says that
+    frames in which the car stands still were taken out when it was packed. The frames of one with ``packed`` are in tar
+    files; `erfsfm.data.shard_draws` reads them.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Recording:
     video: Video | None = None
     depth: tuple[Path | None, ...] | None = None
     poses_file: Path | None = None
+    camera_height_m: float | None = None
     t_camera_cam0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start: int = 0
     sequence: str = ""
@@ -91,6 +93,11 @@ class Recording:
         image = read_image(stored)
         self._require_size(stored, *image.shape[:2])
         return resize_image(image, height, width)
+
+    @property
+    def exact(self) -> bool:
+        """Whether all depth is known, in camera heights too: that of a simulated world with depth maps."""
+        return self.camera_height_m is not None and self.depth is not None and None not in self.depth
 
     def true_depth(self, index: int) -> NDArray[np.float32] | None:
         """z-depth in metres ``(H, W)``, 0 where unknown; None where the frame has no depth."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from erfsfm.config import ExperimentConfig
-from erfsfm.data.augmentation import augment
+from erfsfm.data.augmentation import Maps, augment
 from erfsfm.data.weather import weathered
 from erfsfm.geometry.camera import Camera
 from erfsfm.labels.structure import TeacherStructure
@@ -53,17 +53,45 @@ def training_sample(
     sample["frames"] = torch.arange(number, number + network.sources + 1)
     if seen is not None:
         T_source_target = mirror_motion(seen.T_source_target) if mirrored else seen.T_source_target
+        nearer = 1.0
         if config.teacher.views == "many":
-            nearer = varied.fy / network.height / FOCAL_LENGTH
-            bounds = [values * np.float32(nearer) for values in bounds]
+            nearer = _nearer(varied, config)
             T_source_target = T_source_target.copy()
             T_source_target[:, :3, 3] /= nearer
         sample["T_source_target"] = torch.from_numpy(T_source_target)
-        sample["least"], sample["most"] = (torch.from_numpy(values)[None] for values in bounds)
+        sample |= _bounds(bounds, nearer)
     probability = config.data.weather
     if probability > 0:
         sample["shown"] = _stacked(weathered(images, rng) if rng.random() < probability else images)
     return sample
+
+
+def single_image(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    bounds: Maps,
+    config: ExperimentConfig,
+    rng: np.random.Generator,
+) -> dict[str, Tensor]:
+    """Augment an image ``(H, W, 3)`` with exact bounds of its inverse depth and make it a sample without sources.
+
+    Returns:
+        Tensors ``target``, ``K``, ``least`` and ``most`` as in `training_sample`.
+    """
+    images, bounds, varied, _ = augment([image], bounds, camera, config.data, config.network.fidelity, rng)
+    sample = {"target": _stacked(images)[0], "K": torch.from_numpy(varied.K)}
+    return sample | _bounds(bounds, _nearer(varied, config))
+
+
+def _nearer(camera: Camera, config: ExperimentConfig) -> float:
+    """How much nearer everything looks to this camera than to one of `FOCAL_LENGTH`."""
+    return float(camera.fy / config.network.height / FOCAL_LENGTH)
+
+
+def _bounds(bounds: Maps, nearer: float) -> dict[str, Tensor]:
+    """Least and most inverse depth ``(1, H, W)`` as the reference camera would see them."""
+    least, most = (torch.from_numpy(values * np.float32(nearer))[None] for values in bounds)
+    return {"least": least, "most": most}
 
 
 def as_tensors(images: list[NDArray[np.uint8]], K: NDArray[np.float32]) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
+from erfsfm.data.exact_depth import ExactImages, by_label
 from erfsfm.data.many_view_teacher import ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.data.samples import as_tensors, training_sample
@@ -56,7 +57,9 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
         self._many_views = many_views
         length = config.network.sources + 1
         self.recordings = usable(recordings, length)
-        self._probabilities = chances(self.recordings, length, config.data)
+        exact, self._measured = by_label(self.recordings, config.data)
+        self._exact = ExactImages(exact, config, self._cache) if exact else None
+        self._probabilities = chances(self._measured, length, config.data)
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         worker = get_worker_info()
@@ -68,9 +71,14 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
                 yield from (self.draw(i) for i in range(first, min(first + batch, self._draws)))
 
     def draw(self, number: int) -> dict[str, Tensor]:
-        """Sample ``number``, a `training_sample` of the first snippet drawn that can be read."""
-        rng = np.random.default_rng([self._config.training.seed, number])
-        network = self._config.network
+        """Sample ``number``, a `training_sample` of the first snippet drawn that can be read.
+
+        The first samples of a batch are of `ExactImages` under ``data.exact``.
+        """
+        training, network = self._config.training, self._config.network
+        rng = np.random.default_rng([training.seed, number])
+        if self._exact is not None and number % training.batch < training.of_batch(self._config.data.exact):
+            return self._exact.draw(rng)
         snippet, images = self._reader.first_readable(
             self._chosen(rng), lambda snippet: load_window(self._cache, snippet, network.sources + 1)
         )
@@ -82,7 +90,7 @@ class SnippetDraws(IterableDataset[dict[str, Tensor]]):
     def _chosen(self, rng: np.random.Generator) -> Iterator[Snippet]:
         """Random snippets without end."""
         while True:
-            recording = self.recordings[int(rng.choice(len(self.recordings), p=self._probabilities))]
+            recording = self._measured[int(rng.choice(len(self._measured), p=self._probabilities))]
             starts = self._starts(recording)
             yield Snippet(recording, starts[int(rng.integers(len(starts)))])
 

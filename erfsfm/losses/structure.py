@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 MAX_BOUND_RATIO = 1.5  # most over least
@@ -26,20 +27,23 @@ class Bounds:
     least: Tensor
     most: Tensor
 
-    def strided(self, step: int) -> Bounds:
-        """Every ``step``-th pixel, from the middle of each block; the last blocks may be cut off."""
-        rows, columns = (
-            torch.arange(step // 2, size + step // 2, step, device=self.least.device).clamp(max=size - 1)
-            for size in self.least.shape[-2:]
-        )
-        return Bounds(self.least[..., rows[:, None], columns], self.most[..., rows[:, None], columns])
-
     def log_scale(self, disparity: Tensor) -> Tensor:
         """Mean of log disparity minus log measured ``(B, 1, 1, 1)``, over pixels with narrow bounds; 0 without any."""
         narrow = (self.least > 0) & (self.most < MAX_BOUND_RATIO * self.least)
         middle = torch.where(narrow, (self.least * self.most).sqrt(), 1)
         difference = torch.where(narrow, disparity.log() - middle.log(), 0).sum(dim=(1, 2, 3), keepdim=True)
         return difference / narrow.sum(dim=(1, 2, 3), keepdim=True).clamp(min=1)
+
+
+def enlarged(disparity: Tensor, level: int, size: tuple[int, int]) -> Tensor:
+    """Disparity ``(B, 1, h, w)`` of a pyramid level at the full size (height, width): ``(B, 1, H, W)``.
+
+    A pixel of the level lies in the middle of its ``2**level`` by ``2**level`` pixels; the last may be cut off.
+    """
+    if level == 0:
+        return disparity
+    full = F.interpolate(disparity, scale_factor=2.0**level, mode="bilinear", align_corners=False)
+    return full[..., : size[0], : size[1]]
 
 
 def disagreement(disparity: Tensor, bounds: Bounds, log_scale: Tensor) -> Tensor:

@@ -32,6 +32,21 @@ _DILATED_STAGES = (0, 1)
 _DEFORMABLE_STAGES: dict[Variant, tuple[int, ...]] = {"dfc": (0, 1, 2, 3), "dfcv2": (3, 4, 5, 6)}
 
 
+class DisparityHead(nn.Conv2d):
+    """Features to disparity in (0.01, 10.01), in single precision under autocast: bfloat16 has some 300 such values."""
+
+    def __init__(self, in_channels: int) -> None:
+        super().__init__(in_channels, 1, 3, padding=1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to ``(B, 1, H, W)``."""
+        kind = features.device.type
+        if torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind):
+            with torch.autocast(kind, enabled=False):
+                return self.forward(features.float())
+        return MAX_DISPARITY * torch.sigmoid(super().forward(features)) + MIN_DISPARITY
+
+
 class DepthNet(nn.Module):
     """Encoder-decoder with skip connections and four disparity heads.
 
@@ -73,7 +88,7 @@ class DepthNet(nn.Module):
             ConvBlock(up + skip + disparity, up, Layer(3, 1), fidelity, normalisation)
             for up, skip, disparity in zip(decoder, skips, coarser)
         )
-        self.heads = nn.ModuleList(nn.Conv2d(channels, 1, 3, padding=1) for channels in decoder[-_SCALES:])
+        self.heads = nn.ModuleList(DisparityHead(channels) for channels in decoder[-_SCALES:])
         initialise(self, fidelity)
         if fidelity == "default":
             for head in self.heads:
@@ -124,8 +139,7 @@ class DepthNet(nn.Module):
             features = iconv(torch.cat(parts, dim=1))
             head = level - len(self.upconvs) + _SCALES
             if head >= 0:
-                raw = cast(Tensor, self.heads[head](features))
-                disparities.insert(0, MAX_DISPARITY * torch.sigmoid(raw) + MIN_DISPARITY)
+                disparities.insert(0, self.heads[head](features))
         return disparities
 
 

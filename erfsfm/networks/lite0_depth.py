@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from erfsfm.networks.blocks import ConvBlock, Layer, Variant, crop_like, initialise, scaled
-from erfsfm.networks.depth_net import FIRST_LOGIT, MAX_DISPARITY, MIN_DISPARITY
+from erfsfm.networks.depth_net import FIRST_LOGIT, DisparityHead
 from erfsfm.networks.lite0 import CHANNELS, SKIP_CHANNELS, SKIPS, Lite0Encoder
 
 _DECODER_CHANNELS = (128, 64, 48, 32, 16)  # at 1/32 (the encoder's context), then before each doubling
@@ -43,9 +43,7 @@ class Lite0DepthNet(nn.Module):
             after.append(ConvBlock(count + skip, count, layer))
             inside = count
         self.reductions, self.fusions = before, after
-        self.heads = nn.ModuleList(
-            nn.Conv2d(count, 1, 3, padding=1) for count in [*channels[1:], channels[-1]][-_SCALES:]
-        )
+        self.heads = nn.ModuleList(DisparityHead(count) for count in [*channels[1:], channels[-1]][-_SCALES:])
         initialise(self, "default")
         for head in self.heads:
             nn.init.constant_(cast(Tensor, head.bias), FIRST_LOGIT)
@@ -75,5 +73,5 @@ class Lite0DepthNet(nn.Module):
             features = fuse(features)
             head = level - len(self.fusions) + _SCALES
             if head >= 0 and (self.training or level == len(self.fusions) - 1):
-                disparities.insert(0, MAX_DISPARITY * torch.sigmoid(self.heads[head](features)) + MIN_DISPARITY)
+                disparities.insert(0, self.heads[head](features))
         return disparities if self.training else disparities[0]

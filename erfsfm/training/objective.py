@@ -19,6 +19,7 @@ from erfsfm.losses.regularisation import edge_aware_smoothness, explainability_p
 from erfsfm.losses.structure import (
     Bounds,
     disagreement,
+    enlarged,
     rotation_disagreement,
     step_disagreement,
     translation_disagreement,
@@ -29,11 +30,12 @@ HEIGHTS = 10.0  # camera heights in the depth's unit under a teacher: steps are 
 
 @dataclass(frozen=True)
 class SnippetBatch:
-    """``target`` ``(B, 3, H, W)`` and ``sources`` ``(B, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
+    """``target`` ``(B, 3, H, W)`` and ``sources`` ``(S, N, 3, H, W)`` in [0, 1], time order; ``K`` ``(B, 3, 3)``.
 
+    The sources are of the last S targets; the others are single images with exact bounds of their depth.
     Measurements of the teacher (`erfsfm.labels.structure`), where one is used: ``T_source_target``
-    ``(B, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the target's inverse depth.
-    With simulated weather: ``shown`` ``(B, N + 1, 3, H, W)``, all images in time order as the networks get them.
+    ``(S, N, 4, 4)`` in camera heights, NaN where nothing is known, and ``bounds`` of the B targets' inverse depth.
+    With simulated weather: ``shown`` ``(S, N + 1, 3, H, W)``, all images in time order as the networks get them.
     """
 
     target: Tensor
@@ -49,15 +51,20 @@ class SnippetBatch:
             return to_network_range(self.target), [to_network_range(source) for source in self.sources.unbind(dim=1)]
         images = [to_network_range(image) for image in self.shown.unbind(dim=1)]
         target = images.pop(len(images) // 2)
-        return target, images
+        return torch.cat([to_network_range(self.target[: -len(target)]), target]), images
+
+    def snippets(self) -> SnippetBatch:
+        """Images and cameras of the targets that have sources."""
+        count = len(self.sources)
+        return SnippetBatch(self.target[-count:], self.sources, self.K[-count:])
 
 
 @dataclass(frozen=True)
 class ObjectiveResult:
     """The loss, its terms, and the networks' outputs.
 
-    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(B, N, 4, 4)``;
-    ``warped`` ``(B, N, 3, H, W)`` the sources at full resolution warped to the target, None without photometric error.
+    ``disparities`` finest first, each ``(B, 1, h, w)``; ``T_source_target`` ``(S, N, 4, 4)``;
+    ``warped`` ``(S, N, 3, H, W)`` the sources at full resolution warped to the target, None without photometric error.
     """
 
     total: Tensor
@@ -103,6 +110,7 @@ class _Prediction:
     def of(depth_net: nn.Module, pose_net: nn.Module, batch: SnippetBatch, config: ExperimentConfig) -> _Prediction:
         precise = batch.target.dtype
         target, sources = batch.seen()
+        of_snippets = target[-len(batch.sources) :]
         disparities: list[Tensor] = []
         if needs_depth(config):
             if not depth_net.training:
@@ -110,13 +118,13 @@ class _Prediction:
             disparities = [disparity.to(precise) for disparity in depth_net(target)]
         masks: list[Tensor] | None = None
         if config.network.masks:
-            pose_vectors, masks = pose_net.forward_with_masks(target, sources)  # type: ignore[operator]
+            pose_vectors, masks = pose_net.forward_with_masks(of_snippets, sources)  # type: ignore[operator]
             masks = [mask.to(precise) for mask in masks]
             _require_sizes(masks, disparities, config)
         elif needs_poses(config):
-            pose_vectors = pose_net(target, sources)
+            pose_vectors = pose_net(of_snippets, sources)
         else:
-            pose_vectors = target.new_zeros(len(target), len(sources), 6)
+            pose_vectors = target.new_zeros(len(of_snippets), len(sources), 6)
         return _Prediction(disparities, pose_vectors.to(precise), masks)
 
 
@@ -158,8 +166,9 @@ def _evaluate(prediction: _Prediction, batch: SnippetBatch, config: ExperimentCo
         T_warp = with_rotation(T_source_target, batch.T_source_target[..., :3, :3])
     photometric, smoothness = batch.target.new_zeros(()), batch.target.new_zeros(())
     finest: Tensor | None = None
+    snippets = batch.snippets()
     for level in range(loss.scales if prediction.disparities else 0):
-        scale = _Level.of(batch, prediction.disparities[level], config)
+        scale = _Level.of(snippets, prediction.disparities[level][-len(snippets.target) :], config)
         smoothness = smoothness + scale.smoothness(loss) / 2**level
         if loss.photometric_weight > 0:
             warped, projection = scale.warp(T_warp)
@@ -188,19 +197,19 @@ def _teacher_terms(
     has been fitted to the depth network's, and the unit itself is a separate term. Many views have one scale a drive.
     """
     terms: dict[str, Tensor] = {}
-    unit = T_measured.new_full((len(T_measured), 1, 1, 1), math.log(HEIGHTS))
+    unit = T_measured.new_full((len(bounds.least), 1, 1, 1), math.log(HEIGHTS))
     disparities = prediction.disparities
     if disparities:
         log_scale = bounds.log_scale(disparities[0])
         terms["unit"] = (log_scale - math.log(HEIGHTS)).abs().mean()
         unit = unit if config.teacher.views == "many" else log_scale.detach()
-        scales = config.loss.scales
-        structure = [disagreement(disparities[k], bounds.strided(2**k), unit) for k in range(scales)]
-        terms["structure"] = torch.stack(structure).mean()
+        height, width = bounds.least.shape[-2:]
+        levels = [enlarged(disparities[k], k, (height, width)) for k in range(config.loss.scales)]
+        terms["structure"] = torch.stack([disagreement(level, bounds, unit) for level in levels]).mean()
         if config.teacher.edge_weight > 0:
             terms["edge"] = step_disagreement(disparities[0], bounds)
     if needs_poses(config):
-        t_measured = T_measured[..., :3, 3] * torch.exp(-unit[..., 0])
+        t_measured = T_measured[..., :3, 3] * torch.exp(-unit[-len(T_measured) :, ..., 0])
         terms["rotation"] = rotation_disagreement(T_source_target[..., :3, :3], T_measured[..., :3, :3])
         terms["translation"] = translation_disagreement(T_source_target[..., :3, 3], t_measured)
     return terms

@@ -30,7 +30,8 @@ from erfsfm.common.lock import FolderLock
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import single_threaded_opencv
-from erfsfm.config import ExperimentConfig, TrainingConfig
+from erfsfm.config import ExperimentConfig, Precision, TrainingConfig
+from erfsfm.data.exact_depth import by_label, stacked
 from erfsfm.data.recordings import Recording
 from erfsfm.data.shard_draws import ShardDraws, in_shards
 from erfsfm.data.snippets import SnippetDraws, ValidationSnippets, split_recordings
@@ -44,6 +45,8 @@ from erfsfm.training.progress import StepBar
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
+
+_BFLOAT16 = ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16")  # capabilities of a processor
 
 
 def train(
@@ -150,10 +153,13 @@ def _draws(
     done_steps, rank = position
     together = config.training.batch * config.training.processes
     draws, done = config.training.steps * together, done_steps * together
+    if sharded and config.data.exact > 0:
+        raise ConfigError("data.exact needs worlds as files, not in shards: set data.exact=0, or name the worlds")
     if sharded:
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / "teacher"
-    many_views = measured_views(training, config, folder, quiet or rank > 0)
+    _, measured = by_label(training, config.data)
+    many_views = measured_views(measured, config, folder, quiet or rank > 0)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
@@ -165,6 +171,7 @@ def _loader(draws: SnippetDraws | ShardDraws, config: ExperimentConfig, device: 
         num_workers=workers,
         pin_memory=choose_device(device) == "cuda",
         worker_init_fn=_single_threaded_worker,
+        collate_fn=stacked,
         persistent_workers=workers > 0,
     )
 
@@ -239,10 +246,7 @@ def _trainer(
 ) -> lightning.Trainer:
     training = config.training
     on_cpu = choose_device(device) == "cpu"
-    precision = training.precision
-    if on_cpu and precision == "16-mixed":
-        logger.warning("training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU")
-        precision = "bf16-mixed"
+    precision = _precision_on_cpu(training.precision) if on_cpu else training.precision
     if on_cpu and precision == "bf16-mixed" and max(config.network.height, config.network.width) <= 64:
         # PyTorch 2.13 leaves gradients of its bfloat16 convolutions uninitialised where the feature map is one pixel
         raise ConfigError(
@@ -285,6 +289,16 @@ def _trainer(
         enable_model_summary=False,
         default_root_dir=output,
     )
+
+
+def _precision_on_cpu(wanted: Precision) -> Precision:
+    """What the processor computes with; without instructions for bfloat16 that takes six times as long as float32."""
+    able = torch.cpu.get_capabilities()
+    fitting: Precision = "bf16-mixed" if any(able.get(name) for name in _BFLOAT16) else "32-true"
+    if wanted in ("32-true", fitting):
+        return wanted
+    logger.warning("training.precision %s does not fit this processor: %s is used", wanted, fitting)
+    return fitting
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

@@ -89,6 +89,9 @@ def simulate(
     lidar: Annotated[bool, typer.Option("--lidar", help="write 64-beam scans")] = False,
     depth: Annotated[bool, typer.Option("--depth", help="write exact depth maps")] = False,
     hazards: Annotated[str, typer.Option(help="comma list of moving-cars, exposure, blur, stop, rain")] = "",
+    varied: Annotated[
+        bool, typer.Option("--varied", help="another camera than KITTI's, railings, people, cars that overtake")
+    ] = False,
     device: UnusedDevice = "auto",
 ) -> None:
     """A simulated street as a KITTI odometry root. Its ground truth is exact.
@@ -97,7 +100,7 @@ def simulate(
     """
     from slam.simulation.street import SimulatedStreet, parse_options, write_kitti_root
 
-    street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards))
+    street = SimulatedStreet(parse_options(route, frames, seed, width, height, hazards, varied))
     with progress_bar() as progress:
         write_kitti_root(street, output, depth, lidar, lambda done: progress("frames", done, frames))
     typer.echo(f"{frames} frames in {output}: erfsfm-slam run --dataset {output} --sequence sim")

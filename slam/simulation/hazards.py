@@ -67,9 +67,9 @@ def shutter_poses(T_street_camera: FloatArray, index: int) -> FloatArray:
 
 
 class Traffic:
-    """Moving cars: one ahead of the camera for a while, others oncoming."""
+    """Moving cars: one ahead of the camera for a while, others oncoming; some overtake it if wanted."""
 
-    def __init__(self, drive: Route, seed: int) -> None:
+    def __init__(self, drive: Route, seed: int, overtaking: bool = False) -> None:
         rng = np.random.default_rng([seed, 33])
         self._route = drive
         self._starts: list[tuple[float, float, float]] = []  # offset in lane samples, per frame, side in metres
@@ -79,20 +79,33 @@ class Traffic:
             start = float(drive.sample[int(meets)]) - speed * meets
             self._starts.append((start, speed, 2.0 * drive.lane_offset_m + float(rng.uniform(0.0, 0.3))))
             meets += float(rng.uniform(12.0, 40.0))
+        self._passing = self._plan_passing(np.random.default_rng([seed, 34])) if overtaking else []
         self._gap = float(rng.uniform(9.0, 14.0)) / STEP
         self._leader_leaves = float(rng.uniform(0.4, 0.8)) * len(drive.sample)
         soup = Soup(rng)
         firsts = []
-        for _ in range(len(self._starts) + 1):
+        for _ in range(1 + len(self._starts) + len(self._passing)):
             firsts.append(soup.instances)
             car(soup, rng, frame_at(0.0, 0.0, 0.0))
         self._mesh = soup.finish(_FLAT)
         self._car_of_triangle = np.searchsorted(firsts, self._mesh.instance, side="right") - 1
 
+    def _plan_passing(self, rng: np.random.Generator) -> list[tuple[float, float, float]]:
+        """Cars on the camera's left, and slower ones on its right, in the form of ``_starts``."""
+        passing = []
+        for _ in range(max(1, len(self._route.sample) // 12)):
+            beside = int(rng.integers(len(self._route.sample)))
+            left = rng.random() < 0.75
+            speed = float(rng.uniform(1.15, 1.9) if left else rng.uniform(0.2, 0.8)) / STEP
+            side = self._route.lane_offset_m * float(rng.uniform(1.5, 2.1) if left else rng.uniform(-1.1, -0.9))
+            passing.append((float(self._route.sample[beside]) - speed * beside, speed, side))
+        return passing
+
     def placed(self, index: int) -> Mesh | None:
         """The cars within sight at a frame, in the street frame; None if there are none."""
         camera = self._route.T_street_camera[index, :3, 3]
         T_street_cars = [self._leader(index), *(self._oncoming(start, index) for start in self._starts)]
+        T_street_cars += [self._at(start + speed * index, left_m, 1.0) for start, speed, left_m in self._passing]
         parts = []
         for number, T_street_car in enumerate(T_street_cars):
             if T_street_car is None:

@@ -1,4 +1,4 @@
-"""Objects of a street: buildings, trees, cars, poles, signs, hedges and fences."""
+"""Objects of a street: buildings, trees, cars, poles, signs, hedges, fences, railings and people."""
 
 import numpy as np
 
@@ -171,6 +171,42 @@ def sign(soup: Soup, rng: np.random.Generator, x: float, y: float, facing: float
     frame = frame_at(x, y, facing - np.pi / 2.0, height)
     frame[3] -= 0.06 * frame[1] + half * frame[0]
     box(soup, frame, np.zeros(3), np.array([2 * half, 0.02, 2 * half]), plate)
+
+
+def railing(soup: Soup, rng: np.random.Generator, frame: FloatArray, length: float) -> None:
+    """Posts and bars along the frame's x axis, which one sees through."""
+    steel = soup.instance(
+        Material.METAL, colour(rng, (0.55, 0.56, 0.57), (0.18, 0.20, 0.20), (0.72, 0.72, 0.70), (0.42, 0.30, 0.20))
+    )
+    height, spacing = float(rng.uniform(0.6, 1.3)), float(rng.choice([0.15, 0.3, 1.5, 2.5]))
+    radius = float(rng.uniform(0.015, 0.05))
+    posts = np.arange(0.0, length, max(spacing, length / 120))
+    for along in posts:
+        foot = frame[3] + along * frame[0]
+        tube(soup, foot, foot + height * UP, (radius, radius), steel)
+    for level in np.linspace(1.0, 0.25, int(rng.integers(1, 4))):
+        bar = frame[3] + level * height * UP
+        tube(soup, bar, bar + posts[-1] * frame[0] + 1e-3 * frame[0], (radius, radius), steel)
+
+
+def post(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
+    """A bollard, a guide post or a mast."""
+    steel = soup.instance(Material.METAL, colour(rng, (0.85, 0.85, 0.82), (0.30, 0.28, 0.26), (0.50, 0.50, 0.52)))
+    foot, radius = np.array([x, y, 0.0]), float(rng.uniform(0.03, 0.12))
+    tube(soup, foot, foot + float(rng.choice([1.0, 3.0, 7.0])) * UP, (radius, 0.8 * radius), steel)
+
+
+def person(soup: Soup, rng: np.random.Generator, x: float, y: float) -> None:
+    """Legs, body and head of somebody who stands."""
+    clothes = [colour(rng, (0.2, 0.2, 0.25), (0.6, 0.2, 0.2), (0.7, 0.7, 0.68), (0.2, 0.3, 0.55)) for _ in range(2)]
+    trousers, coat = (soup.instance(Material.METAL, shade) for shade in clothes)
+    skin = soup.instance(Material.METAL, colour(rng, (0.75, 0.58, 0.47), (0.45, 0.32, 0.25), spread=0.03))
+    size = float(rng.uniform(0.85, 1.08))
+    foot, side = np.array([x, y, 0.1]), 0.12 * np.array([*np.sin(rng.uniform(0, 7) + np.array([0, np.pi / 2])), 0.0])
+    for leg in (foot + side, foot - side):
+        tube(soup, leg, foot + 0.5 * (leg - foot) + 0.85 * size * UP, (0.08, 0.11), trousers)
+    tube(soup, foot + 0.8 * size * UP, foot + 1.45 * size * UP, (0.17, 0.21), coat)
+    ball(soup, rng, foot + 1.62 * size * UP, np.array([0.11, 0.11, 0.15]), skin)
 
 
 def car(soup: Soup, rng: np.random.Generator, frame: FloatArray) -> None:

@@ -1,5 +1,7 @@
 """The simulated camera: intrinsics, rays and the size of a pixel on a surface."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from slam.simulation.geometry import Float32Array, FloatArray
@@ -15,6 +17,28 @@ def kitti_intrinsics(width: int, height: int) -> FloatArray:
     sx, sy = width / _KITTI_SIZE[0], height / _KITTI_SIZE[1]
     cx, cy = (_KITTI_CENTRE_PX[0] + 0.5) * sx - 0.5, (_KITTI_CENTRE_PX[1] + 0.5) * sy - 0.5
     return np.array([[_KITTI_FOCAL_PX * sx, 0.0, cx], [0.0, _KITTI_FOCAL_PX * sy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera that differs from KITTI's.
+
+    Attributes:
+        zoom: factor on the focal length.
+        height_m: above the road at rest.
+        pitch: downwards, radians.
+    """
+
+    zoom: float
+    height_m: float
+    pitch: float
+
+
+def draw_mount(seed: int) -> Mount:
+    """The camera of a varied world."""
+    rng = np.random.default_rng([seed, 5])
+    zoom, height_m = np.exp(rng.uniform(np.log((0.75, 1.1)), np.log((1.4, 2.4))))
+    return Mount(float(zoom), float(height_m), float(np.deg2rad(rng.uniform(-3.0, 3.0))))
 
 
 def pixel_rays(K: FloatArray, width: int, height: int) -> Float32Array:

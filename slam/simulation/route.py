@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.simulation.geometry import Bend, FloatArray, road_bend, town_bend
+from slam.simulation.optics import Mount
 from slam.simulation.streets import (
     SMALLEST_BLOCK,
     StreetPlan,
@@ -53,7 +54,7 @@ class Route:
     sample: FloatArray
 
 
-def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) -> Route:
+def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0, mount: Mount | None = None) -> Route:
     """Lay out streets and a drive of ``frames`` frames over them.
 
     Args:
@@ -62,6 +63,7 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) 
         frames: how many poses.
         seed: decides everything.
         still_frames: how long to stand still in the middle.
+        mount: of the camera; None for one like KITTI's.
 
     Raises:
         SequenceError: if there are too few frames for the route.
@@ -77,9 +79,11 @@ def plan_route(route: RouteKind, frames: int, seed: int, still_frames: int = 0) 
     if route == "loop":
         arrival *= (moving - 1.0) / arrival[-1]
     rng = np.random.default_rng([seed, 2])
-    camera_height_m = float(rng.uniform(1.5, 1.8))
+    camera_height_m, pitch = float(rng.uniform(1.5, 1.8)), None
+    if mount is not None:
+        camera_height_m, pitch = mount.height_m, mount.pitch
     sample = np.interp(np.arange(moving), arrival, np.arange(len(arrival)))
-    T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m)
+    T_street_camera = _poses(rng, bend, lane_plan, sample, camera_height_m, pitch)
     if stops:
         rest = int(np.argmin(np.diff(sample)))
         order = np.insert(np.arange(moving), rest, [rest] * still_frames)
@@ -200,9 +204,17 @@ def _arrival(bend: Bend, lane_plan: FloatArray, stops: bool, moving: int) -> Flo
 
 
 def _poses(
-    rng: np.random.Generator, bend: Bend, lane_plan: FloatArray, sample: FloatArray, camera_height_m: float
+    rng: np.random.Generator,
+    bend: Bend,
+    lane_plan: FloatArray,
+    sample: FloatArray,
+    camera_height_m: float,
+    pitch: float | None,
 ) -> FloatArray:
-    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension."""
+    """``T_street_camera`` ``(N, 4, 4)`` at fractional lane points ``sample`` ``(N,)``, with suspension.
+
+    Without a ``pitch`` it is drawn, as of a camera that was mounted level.
+    """
     rows = np.arange(len(lane_plan))
     direction = gaussian_filter1d(np.gradient(lane_plan, axis=0), 4.0, axis=0)
     plan_xy = np.stack([np.interp(sample, rows, lane_plan[:, i]) for i in range(2)], axis=1)
@@ -218,7 +230,7 @@ def _poses(
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     down = np.cross(forward, right)
     suspension = _suspension(rng, len(at))
-    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8))
+    suspension[:, 0] += np.deg2rad(rng.uniform(-0.8, 0.8)) if pitch is None else -pitch
     position = bend(at) - (camera_height_m + suspension[:, 3:]) * down
     T_street_level = se3.make(np.stack([right, down, forward], axis=2), position)
     return T_street_level @ se3.from_rotation_vector(suspension[:, :3], np.zeros((len(at), 3)))

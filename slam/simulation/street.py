@@ -31,7 +31,7 @@ from slam.simulation.kitti_layout import (
 )
 from slam.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
 from slam.simulation.light import draw_weather, sky
-from slam.simulation.optics import kitti_intrinsics, pixel_rays
+from slam.simulation.optics import draw_mount, kitti_intrinsics, pixel_rays
 from slam.simulation.painter import Hits, facing_normals, paint
 from slam.simulation.route import RouteKind, plan_route
 from slam.simulation.town import build_town
@@ -45,7 +45,10 @@ FARTHEST_M = 200.0  # surfaces beyond are treated as sky
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """The street to simulate; ``seed`` determines everything else."""
+    """The street to simulate; ``seed`` determines everything else.
+
+    A ``varied`` one has another camera than KITTI's, railings and people, and cars that overtake if any move.
+    """
 
     route: RouteKind = "loop"
     frames: int = 300
@@ -53,6 +56,7 @@ class SimulationOptions:
     width: int = 416
     height: int = 128
     hazards: tuple[Hazard, ...] = ()
+    varied: bool = False
 
     def __post_init__(self) -> None:
         """Refuse invalid options.
@@ -75,14 +79,17 @@ class SimulationOptions:
             )
 
 
-def parse_options(route: str, frames: int, seed: int, width: int, height: int, hazards: str) -> SimulationOptions:
+def parse_options(
+    route: str, frames: int, seed: int, width: int, height: int, hazards: str, varied: bool = False
+) -> SimulationOptions:
     """Options from a command line; ``hazards`` is a comma list.
 
     Raises:
         SequenceError: if one of them is invalid.
     """
     names = tuple(name.strip() for name in hazards.split(",") if name.strip())
-    return SimulationOptions(cast(RouteKind, route), frames, seed, width, height, cast(tuple[Hazard, ...], names))
+    kinds = cast(tuple[Hazard, ...], names)
+    return SimulationOptions(cast(RouteKind, route), frames, seed, width, height, kinds, varied)
 
 
 @dataclass(frozen=True)
@@ -132,14 +139,17 @@ class SimulatedStreet:
         self.options = options
         self.K: FloatArray = kitti_intrinsics(options.width, options.height)
         still = effects.STILL_FRAMES if "stop" in options.hazards else 0
-        self._route = plan_route(options.route, options.frames, options.seed, still)
+        mount = draw_mount(options.seed) if options.varied else None
+        if mount is not None:
+            self.K[[0, 1], [0, 1]] *= mount.zoom
+        self._route = plan_route(options.route, options.frames, options.seed, still, mount)
         self.camera_height_m = self._route.camera_height_m
         self.T_camera_lidar: FloatArray = T_CAMERA_LIDAR.copy()
         self.T_world_camera: FloatArray = se3.invert(self._route.T_street_camera[0]) @ self._route.T_street_camera
         self.T_world_camera[0] = np.eye(4)
         self._weather = draw_weather(options.seed)
         self._exposure = effects.exposure_curve(options.seed, options.frames)
-        self._traffic = Traffic(self._route, options.seed) if "moving-cars" in options.hazards else None
+        self._traffic = Traffic(self._route, options.seed, options.varied) if "moving-cars" in options.hazards else None
         self._rays = pixel_rays(self.K, options.width, options.height)
         self._stretch = np.linalg.norm(self._rays, axis=1).astype(np.float32)  # ray length per depth
 
@@ -193,7 +203,7 @@ class SimulatedStreet:
 
     @functools.cached_property
     def _still(self) -> _Surface:
-        return _surface(build_town(self._route.plan, self._route.bend, self.options.seed))
+        return _surface(build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied))
 
     def _surfaces(self, index: int) -> list[_Surface]:
         """The surfaces at a frame: the static town and the moving cars."""

@@ -11,10 +11,10 @@ ROUNDING = 5.0  # radius of kerbs at corners, metres
 Rectangle = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 
-def build_town(plan: StreetPlan, bend: Bend, seed: int) -> Mesh:
-    """Every static surface of the world, in street coordinates."""
+def build_town(plan: StreetPlan, bend: Bend, seed: int, varied: bool = False) -> Mesh:
+    """Every static surface of the world, in street coordinates; a varied one also has railings and people."""
     rng = np.random.default_rng([seed, 10])
-    town = _Town(plan, rng)
+    town = _Town(plan, rng, np.random.default_rng([seed, 11]) if varied else None)
     town.ground()
     for i in range(len(plan.xs) - 1):
         for j in range(len(plan.ys) - 1):
@@ -26,8 +26,8 @@ def build_town(plan: StreetPlan, bend: Bend, seed: int) -> Mesh:
 class _Town:
     """The mesh under construction, with the colours and proportions of one world."""
 
-    def __init__(self, plan: StreetPlan, rng: np.random.Generator) -> None:
-        self.plan, self.rng, self.soup = plan, rng, Soup(rng)
+    def __init__(self, plan: StreetPlan, rng: np.random.Generator, more: np.random.Generator | None) -> None:
+        self.plan, self.rng, self.more, self.soup = plan, rng, more, Soup(rng)
         self.density = float(rng.uniform(0.5, 0.9))  # of buildings
         self.parking = float(rng.uniform(0.1, 0.6))  # of cars along the kerb
         self.greenery = float(rng.uniform(0.25, 0.8))
@@ -174,6 +174,23 @@ class _Town:
                 spot = start + along * ahead - 0.95 * inward
                 objects.car(self.soup, rng, objects.frame_at(spot[0], spot[1], angle + rng.normal(0.0, 0.03)))
             along += float(rng.uniform(5.4, 7.5))
+        if self.more is not None:
+            self._furnish_more(self.more, start, ahead, length)
+
+    def _furnish_more(self, rng: np.random.Generator, start: FloatArray, ahead: FloatArray, length: float) -> None:
+        """A railing along a part of the kerb, thin posts, and people on the pavement."""
+        inward = np.array([-ahead[1], ahead[0]])
+        angle = float(np.arctan2(ahead[1], ahead[0]))
+        if rng.random() < 0.45 and length > 16.0:
+            first, last = np.sort(rng.uniform(6.0, length - 6.0, 2))
+            foot = start + first * ahead + float(rng.uniform(0.2, 0.8)) * inward
+            objects.railing(self.soup, rng, objects.frame_at(foot[0], foot[1], angle, KERB), float(last - first))
+        for _ in range(int(rng.poisson(length / 14.0))):
+            spot = start + rng.uniform(5.0, max(length - 5.0, 6.0)) * ahead + rng.uniform(-0.8, 1.6) * inward
+            if rng.random() < 0.6:
+                objects.person(self.soup, rng, float(spot[0]), float(spot[1]))
+            else:
+                objects.post(self.soup, rng, float(spot[0]), float(spot[1]))
 
     def _split(self, lot: Rectangle, inner: Rectangle, sides: tuple[bool, ...]) -> None:
         """Cut a lot in two until each piece is of the size of a house."""

@@ -6,6 +6,7 @@ import torch
 from erfsfm.losses.structure import (
     Bounds,
     disagreement,
+    enlarged,
     rotation_disagreement,
     step_disagreement,
     translation_disagreement,
@@ -44,13 +45,19 @@ def test_exact_bounds_have_gradients():
 
 
 @pytest.mark.parametrize("size", [(128, 416), (94, 310), (75, 248)])
-def test_every_level_of_the_networks_has_its_bounds(size):
-    rows = torch.arange(size[0], dtype=torch.float32)[:, None].expand(1, 1, *size)
+def test_on_a_level_road_every_level_of_the_networks_agrees_with_the_labels(size):
+    def road(rows):  # inverse depth, linear in the image row, of a horizon above the image
+        return 0.01 * (rows + 3.0)
+
+    full = road(torch.arange(size[0], dtype=torch.float32))[:, None].expand(1, 1, *size)
     for level in range(4):
-        strided = Bounds(rows, rows).strided(2**level).least
-        assert strided.shape[2:] == tuple(math.ceil(length / 2**level) for length in size)
-        blocks = strided[0, 0, :, -1] // 2**level
-        assert blocks.tolist() == list(range(len(blocks))), "one of each block"
+        step = 2**level
+        height, width = (math.ceil(length / step) for length in size)
+        middles = step * torch.arange(height, dtype=torch.float32) + (step - 1) / 2
+        shown = enlarged(road(middles)[:, None].expand(1, 1, height, width), level, size)
+        assert shown.shape == full.shape
+        inside = slice(step, size[0] - size[0] % step - step)  # at the border there is no row to interpolate to
+        assert torch.allclose(shown[..., inside, :], full[..., inside, :], rtol=1e-5), f"level {level}"
 
 
 def test_the_scale_is_removed_first():
@@ -85,11 +92,6 @@ def test_a_lower_bound_alone_penalises_farther_depth():
 def test_no_bounds_no_loss():
     unbounded = Bounds(torch.zeros(2, 1, 4, 4), torch.full((2, 1, 4, 4), torch.inf))
     assert disagreement(torch.ones(2, 1, 4, 4), unbounded, ZERO) == 0
-
-
-def test_coarser_bounds_are_pixels_of_the_finest():
-    least = torch.arange(16.0).reshape(1, 1, 4, 4)
-    assert Bounds(least, least + 1).strided(2).least.flatten().tolist() == [5, 7, 13, 15]
 
 
 def test_translation_by_hand_with_one_unmeasured():

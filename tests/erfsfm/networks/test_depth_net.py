@@ -4,6 +4,7 @@ import torch
 from erfsfm.common.errors import ConfigError
 from erfsfm.networks.blocks import Layer
 from erfsfm.networks.depth_net import DepthNet
+from erfsfm.networks.lite0_depth import Lite0DepthNet
 
 VARIANTS = ["plain", "dilated", "dfc", "dfcv2"]
 
@@ -59,6 +60,17 @@ def test_disparity_lies_in_its_range():
             torch.nn.init.constant_(head.bias, bias)
         for disparity in network(torch.rand(1, 3, 16, 16)):
             torch.testing.assert_close(disparity, torch.full_like(disparity, wanted))
+
+
+@pytest.mark.parametrize("build", [lambda: DepthNet(width=0.25), Lite0DepthNet])
+def test_disparity_is_in_single_precision_under_autocast(build):
+    torch.manual_seed(0)
+    network = build()
+    image = torch.rand(1, 3, 128, 416) * 2 - 1
+    with torch.autocast("cpu", torch.bfloat16):
+        finest = network(image)[0]
+    assert finest.dtype == torch.float32
+    assert len(finest.unique()) > 10_000, "bfloat16 has some hundred values between these"
 
 
 def test_zero_offsets_start_as_the_plain_network():

@@ -769,23 +769,39 @@ def test_licence_of(seen: list[str], licence: str) -> None:
     assert licence_of(seen).startswith(licence)
 
 
-@pytest.mark.parametrize("precision", ["bf16-mixed"])
-def test_mixed_precision_trains(both: Configure, small: Small, tmp_path: Path, precision: str) -> None:
+def test_mixed_precision_trains(both: Configure, small: Small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
     small["network"] |= FOR_BFLOAT16
-    config = both(training={"precision": precision, "steps": 2})
+    config = both(training={"precision": "bf16-mixed", "steps": 2})
     output = train(config, tmp_path / "run", device="cpu")
     assert all(tensor.dtype != torch.bfloat16 for tensor in weights_of(output))
 
 
-def test_half_precision_on_a_cpu_is_announced(
-    alone: Configure, small: Small, tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("able", "wanted", "used"),
+    [
+        ({"avx512_bf16": True}, "16-mixed", "bf16-mixed"),
+        ({"avx2": True, "avx512_bf16": False}, "16-mixed", "32-true"),
+        ({"avx2": True, "avx512_bf16": False}, "bf16-mixed", "32-true"),
+        ({"architecture": "aarch64", "bf16": True}, "bf16-mixed", None),
+    ],
+)
+def test_precision_is_that_of_the_processor_and_another_is_announced(
+    alone: Configure,
+    small: Small,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    able: dict[str, Any],
+    wanted: str,
+    used: str | None,
 ) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able)
     small["network"] |= FOR_BFLOAT16
     with caplog.at_level(logging.WARNING):
-        train(alone(training={"precision": "16-mixed", "steps": 1}), tmp_path / "run", device="cpu")
-    assert [r.message for r in caplog.records if "precision" in r.message] == [
-        "training.precision 16-mixed needs a GPU: bf16-mixed is used on this CPU"
-    ]
+        train(alone(training={"precision": wanted, "steps": 1}), tmp_path / "run", device="cpu")
+    said = [f"training.precision {wanted} does not fit this processor: {used} is used"] if used else []
+    assert [r.message for r in caplog.records if "precision" in r.message] == said
 
 
 @pytest.mark.slow

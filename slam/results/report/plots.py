@@ -221,16 +221,12 @@ def png(figure: Figure) -> bytes:
 
 
 def plot_systems(trajectories: Mapping[str, Trajectory], what: Sequence[str], output: Path) -> None:
-    """Write one figure of trajectories over each other, a row for each of ``what``.
+    """Write one figure of trajectories over each other, a row for each of ``what``; raises as `plot_runs`.
 
     Args:
         trajectories: by the name of their system; ``reference`` is the truth.
         what: of `PANELS`.
         output: the file to write.
-
-    Raises:
-        RunError: an unknown ``what``, or one that needs a reference where there is none.
-        ConfigError: as `require_figure`.
     """
     rows = _panels(what)
     require_figure(output)

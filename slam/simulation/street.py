@@ -20,7 +20,7 @@ from slam.geometry import se3
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d
 from slam.simulation import hazards as effects
-from slam.simulation.geometry import Float32Array, FloatArray, Mesh
+from slam.simulation.geometry import Float32Array, FloatArray
 from slam.simulation.hazards import Hazard, Traffic
 from slam.simulation.kitti_layout import (
     write_calibration,
@@ -34,6 +34,7 @@ from slam.simulation.light import draw_weather, sky
 from slam.simulation.optics import draw_mount, kitti_intrinsics, pixel_rays
 from slam.simulation.painter import Hits, facing_normals, paint
 from slam.simulation.route import RouteKind, plan_route
+from slam.simulation.surface import Surface, place_rays
 from slam.simulation.town import build_town
 
 VERSION = 1  # of the world: the same options give the same bytes within a version
@@ -111,14 +112,6 @@ class SimulatedFrame:
     T_world_camera: FloatArray
 
 
-@dataclass(frozen=True)
-class _Surface:
-    """A mesh and its ray casting scene."""
-
-    mesh: Mesh
-    scene: Any
-
-
 class SimulatedStreet:
     """A street world and a drive through it; frames are rendered on demand.
 
@@ -173,8 +166,8 @@ class SimulatedStreet:
     def depth(self, index: int) -> Float32Array:
         """The z-depth ``(H, W)`` of `render`, without the image."""
         self._require(index)
-        rays = _rays(self._route.T_street_camera[index], self._rays)
-        depth: Float32Array = np.min([_cast(surface.scene, rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
+        rays = place_rays(self._route.T_street_camera[index], self._rays)
+        depth: Float32Array = np.min([surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
@@ -184,11 +177,11 @@ class SimulatedStreet:
         rng = np.random.default_rng([self.options.seed, 40, index])
         directions = beam_directions(rng)
         T_street_lidar = self._route.T_street_camera[index] @ self.T_camera_lidar
-        rays = _rays(T_street_lidar, directions)
+        rays = place_rays(T_street_lidar, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
         reflectance = np.zeros(len(rays), dtype=np.float32)
         for surface in self._surfaces(index):
-            answer = _cast(surface.scene, rays)
+            answer = surface.cast(rays)
             nearer = np.flatnonzero(answer["t_hit"] < ranges)
             ranges[nearer] = answer["t_hit"][nearer]
             instance = surface.mesh.instance[answer["primitive_ids"][nearer]]
@@ -202,19 +195,19 @@ class SimulatedStreet:
         return np.asarray(self._still.scene.compute_distance(tensor).numpy(), dtype=np.float64)
 
     @functools.cached_property
-    def _still(self) -> _Surface:
-        return _surface(build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied))
+    def _still(self) -> Surface:
+        return Surface.of(build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied))
 
-    def _surfaces(self, index: int) -> list[_Surface]:
+    def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: the static town and the moving cars."""
         cars = self._traffic.placed(index) if self._traffic else None
-        return [self._still] if cars is None else [self._still, _surface(cars)]
+        return [self._still] if cars is None else [self._still, Surface.of(cars)]
 
-    def _view(self, surfaces: list[_Surface], T_street_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
+    def _view(self, surfaces: list[Surface], T_street_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose."""
-        rays = _rays(T_street_camera, self._rays)  # z = 1, so that t is z-depth
+        rays = place_rays(T_street_camera, self._rays)  # z = 1, so that t is z-depth
         unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
-        answers = [_cast(surface.scene, rays) for surface in surfaces]
+        answers = [surface.cast(rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
         depth[depth >= FARTHEST_M] = 0.0
@@ -240,7 +233,7 @@ class SimulatedStreet:
         return rgb.reshape(*shape, 3), depth.reshape(shape)
 
     def _sunlit(
-        self, surfaces: list[_Surface], rays: Float32Array, hits: Hits, pixels: NDArray[np.int64]
+        self, surfaces: list[Surface], rays: Float32Array, hits: Hits, pixels: NDArray[np.int64]
     ) -> Float32Array:
         """Visibility of the sun from each hit, smoothed over neighbouring pixels, ``(N,)``."""
         towards = np.flatnonzero(self._weather.sun @ hits.normals > 0.0)
@@ -337,24 +330,3 @@ def _write_records(street: SimulatedStreet, root: Path) -> None:
     camera |= {"cx": K[0, 2], "cy": K[1, 2], "fps": FPS, "camera_height_m": street.camera_height_m}
     write_lines(root / "camera.yaml", [f"{key}: {value}" for key, value in camera.items()] + ["model: pinhole"])
     write_lines(root / "simulation.json", [json.dumps({**asdict(options), "version": VERSION}, indent=2)])
-
-
-def _surface(mesh: Mesh) -> _Surface:
-    open3d = import_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(open3d.core.Tensor(mesh.vertices), open3d.core.Tensor(mesh.triangles))
-    return _Surface(mesh, scene)
-
-
-def _rays(T_street_sensor: FloatArray, directions: Float32Array) -> Float32Array:
-    """Origin and direction in the street frame of directions ``(N, 3)`` in a sensor's, ``(N, 6)``."""
-    rays = np.empty((len(directions), 6), dtype=np.float32)
-    rays[:, :3] = T_street_sensor[:3, 3]
-    rays[:, 3:] = directions @ T_street_sensor[:3, :3].T.astype(np.float32)
-    return rays
-
-
-def _cast(scene: Any, rays: Float32Array) -> dict[str, NDArray[Any]]:
-    """Where rays ``(N, 6)`` meet a scene: ``t_hit`` (infinite if nowhere), triangle and barycentric weights."""
-    answer = scene.cast_rays(import_open3d().core.Tensor(rays))
-    return {name: answer[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs")}

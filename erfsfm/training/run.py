@@ -292,7 +292,7 @@ def _trainer(
 
 
 def _precision_on_cpu(wanted: Precision) -> Precision:
-    """What the processor computes with; without instructions for bfloat16 that takes six times as long as float32."""
+    """What the processor computes with; without instructions for it, bfloat16 takes six times as long as float32."""
     able = torch.cpu.get_capabilities()
     fitting: Precision = "bf16-mixed" if any(able.get(name) for name in _BFLOAT16) else "32-true"
     if wanted in ("32-true", fitting):

@@ -33,8 +33,8 @@ from slam.simulation.lidar import T_CAMERA_LIDAR, beam_directions, measured
 from slam.simulation.light import draw_weather, sky
 from slam.simulation.optics import draw_mount, kitti_intrinsics, pixel_rays
 from slam.simulation.painter import Hits, facing_normals, paint
-from slam.simulation.ray_casting import Surface, cast_rays, rays_of, surface_of
 from slam.simulation.route import RouteKind, plan_route
+from slam.simulation.surface import Surface, place_rays
 from slam.simulation.town import build_town
 
 VERSION = 1  # of the world: the same options give the same bytes within a version
@@ -166,10 +166,8 @@ class SimulatedStreet:
     def depth(self, index: int) -> Float32Array:
         """The z-depth ``(H, W)`` of `render`, without the image."""
         self._require(index)
-        rays = rays_of(self._route.T_street_camera[index], self._rays)
-        depth: Float32Array = np.min(
-            [cast_rays(surface.scene, rays)["t_hit"] for surface in self._surfaces(index)], axis=0
-        )
+        rays = place_rays(self._route.T_street_camera[index], self._rays)
+        depth: Float32Array = np.min([surface.cast(rays)["t_hit"] for surface in self._surfaces(index)], axis=0)
         depth[depth >= FARTHEST_M] = 0.0
         return depth.reshape(self.options.height, self.options.width)
 
@@ -179,11 +177,11 @@ class SimulatedStreet:
         rng = np.random.default_rng([self.options.seed, 40, index])
         directions = beam_directions(rng)
         T_street_lidar = self._route.T_street_camera[index] @ self.T_camera_lidar
-        rays = rays_of(T_street_lidar, directions)
+        rays = place_rays(T_street_lidar, directions)
         ranges = np.full(len(rays), np.inf, dtype=np.float32)
         reflectance = np.zeros(len(rays), dtype=np.float32)
         for surface in self._surfaces(index):
-            answer = cast_rays(surface.scene, rays)
+            answer = surface.cast(rays)
             nearer = np.flatnonzero(answer["t_hit"] < ranges)
             ranges[nearer] = answer["t_hit"][nearer]
             instance = surface.mesh.instance[answer["primitive_ids"][nearer]]
@@ -198,18 +196,18 @@ class SimulatedStreet:
 
     @functools.cached_property
     def _still(self) -> Surface:
-        return surface_of(build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied))
+        return Surface.of(build_town(self._route.plan, self._route.bend, self.options.seed, self.options.varied))
 
     def _surfaces(self, index: int) -> list[Surface]:
         """The surfaces at a frame: the static town and the moving cars."""
         cars = self._traffic.placed(index) if self._traffic else None
-        return [self._still] if cars is None else [self._still, surface_of(cars)]
+        return [self._still] if cars is None else [self._still, Surface.of(cars)]
 
     def _view(self, surfaces: list[Surface], T_street_camera: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Colour ``(H, W, 3)``, about [0, 1], and z-depth ``(H, W)`` from a pose."""
-        rays = rays_of(T_street_camera, self._rays)  # z = 1, so that t is z-depth
+        rays = place_rays(T_street_camera, self._rays)  # z = 1, so that t is z-depth
         unit = np.ascontiguousarray(rays[:, 3:].T) / self._stretch  # (3, H * W)
-        answers = [cast_rays(surface.scene, rays) for surface in surfaces]
+        answers = [surface.cast(rays) for surface in surfaces]
         depths = np.stack([answer["t_hit"] for answer in answers])
         nearest, depth = np.argmin(depths, axis=0), depths.min(axis=0)
         depth[depth >= FARTHEST_M] = 0.0

@@ -255,3 +255,23 @@ def test_invalid_options_are_refused(change: dict[str, object], says: str) -> No
 def test_frames_outside_the_drive_are_refused(straight: SimulatedStreet) -> None:
     with pytest.raises(IndexError, match="0 to 39"):
         straight.render(40)
+
+
+def test_a_varied_world_has_its_own_camera_and_the_usual_one_is_as_before() -> None:
+    usual, varied = (SimulatedStreet(SimulationOptions("straight", 4, 3, varied=wide)) for wide in (False, True))
+    assert usual.K[0, 0] == pytest.approx(718.856 * 416 / 1241)
+    assert 1.5 <= usual.camera_height_m <= 1.8
+    assert varied.K[0, 0] / usual.K[0, 0] == pytest.approx(varied.K[1, 1] / usual.K[1, 1])
+    assert varied.K[0, 0] != usual.K[0, 0] and varied.camera_height_m != usual.camera_height_m
+    many = [SimulatedStreet(SimulationOptions("straight", 4, seed, varied=True)) for seed in range(12)]
+    assert min(each.camera_height_m for each in many) < 1.5 and max(each.camera_height_m for each in many) > 1.8
+    assert min(each.K[0, 0] for each in many) < usual.K[0, 0] < max(each.K[0, 0] for each in many)
+
+
+def test_cars_overtake_in_a_varied_world_with_moving_cars() -> None:
+    def car_triangles(varied: bool) -> int:
+        options = SimulationOptions("straight", 20, 3, hazards=("moving-cars",), varied=varied)
+        street = SimulatedStreet(options)
+        return sum(len(cars.mesh.triangles) for index in range(20) for cars in street._surfaces(index)[1:])
+
+    assert car_triangles(varied=True) > 1.5 * car_triangles(varied=False)

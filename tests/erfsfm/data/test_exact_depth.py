@@ -1,0 +1,105 @@
+"""Single images of simulated worlds with their true depth as the label."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from erfsfm.common.errors import ConfigError, DataError
+from erfsfm.config import ExperimentConfig, load_experiment
+from erfsfm.data.exact_depth import FARTHEST_M, by_label, stacked
+from erfsfm.data.many_view_teacher import ManyViewTeacher
+from erfsfm.data.samples import FOCAL_LENGTH
+from erfsfm.data.snippets import SnippetDraws, split_recordings
+from erfsfm.training.run import train
+from slam.simulation.street import SimulatedStreet, SimulationOptions, write_kitti_root
+
+SIZE = (64, 96)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("exact") / "world"
+    write_kitti_root(SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)), folder, depth=True)
+    return folder
+
+
+@pytest.fixture
+def mixed(world: Path, write_root: Callable[..., Path], tmp_path: Path) -> Callable[..., ExperimentConfig]:
+    """An experiment on the world and a real drive, half exact."""
+    real = write_root(tmp_path / "real", 12)
+
+    def build(roots: tuple[Path, ...] = (world, real), **data: Any) -> ExperimentConfig:
+        sections: dict[str, Any] = {
+            "network": {"height": SIZE[0], "width": SIZE[1], "sources": 2, "depth_width": 0.1, "pose_width": 0.1},
+            "data": {"workers": 0, "flip": 0, "zoom": 1, "exact": 0.5, "validation": [], "roots": list(roots)} | data,
+            "loss": {"smoothness": "disparity-edge-aware", "smoothness_weight": 0.001},
+            "teacher": {"views": "many", "structure_weight": 1, "edge_weight": 1, "cache": tmp_path / "measured"},
+            "training": {"networks": "depth", "batch": 4, "steps": 1},
+        }
+        return ExperimentConfig.model_validate(sections)
+
+    return build
+
+
+def test_the_label_is_the_inverse_depth_in_camera_heights(
+    world: Path, mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    recordings, _ = split_recordings(config.data)
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, config.teacher.stride)  # type: ignore[arg-type]
+    sample = SnippetDraws(recordings, config, 8, many_views=teacher).draw(0)
+    recording = next(each for each in recordings if each.exact)
+    height_m = SimulatedStreet(SimulationOptions("straight", 6, 1, 96, 64, varied=True)).camera_height_m
+    assert recording.camera_height_m == pytest.approx(height_m)
+    images = [recording.image(index, *SIZE) for index in range(len(recording))]
+    shown = np.rint(sample["target"].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    index = next(k for k, image in enumerate(images) if np.array_equal(image, shown))
+    depth_m = recording.true_depth(index)
+    assert depth_m is not None
+    nearer = recording.camera.fy / SIZE[0] / FOCAL_LENGTH
+    wanted = torch.from_numpy(height_m / np.where(depth_m > 0, depth_m, FARTHEST_M) * nearer).float()
+    torch.testing.assert_close(sample["most"][0], wanted)
+    known = torch.from_numpy(depth_m > 0)
+    torch.testing.assert_close(sample["least"][0], torch.where(known, wanted, 0))
+
+
+def test_a_batch_begins_with_its_share_of_single_images(
+    mixed: Callable[..., ExperimentConfig], measure: Callable[..., None]
+) -> None:
+    config = mixed()
+    measure(config, lambda *_: 0.25)
+    recordings, _ = split_recordings(config.data)
+    teacher = ManyViewTeacher(config.teacher.cache, SIZE, config.teacher.stride)  # type: ignore[arg-type]
+    draws = SnippetDraws(recordings, config, 8, many_views=teacher)
+    for batch in DataLoader(draws, 4, collate_fn=stacked):
+        assert len(batch["target"]) == len(batch["least"]) == len(batch["K"]) == 4
+        assert len(batch["sources"]) == len(batch["T_source_target"]) == 2
+    singles = ["sources" not in draws.draw(number) for number in range(8)]
+    assert singles == [True, True, False, False] * 2
+
+
+def test_it_trains(mixed: Callable[..., ExperimentConfig], measure: Callable[..., None], tmp_path: Path) -> None:
+    config = mixed(weather=1.0)
+    measure(config, lambda *_: 0.25)
+    output = train(config, tmp_path / "run", device="cpu")
+    assert load_experiment(output / "config.yaml").data.exact == 0.5
+
+
+def test_both_kinds_of_recording_are_wanted(world: Path, mixed: Callable[..., ExperimentConfig]) -> None:
+    config = mixed((world,))
+    recordings, _ = split_recordings(config.data)
+    with pytest.raises(DataError, match=r"data\.exact mixes .* found 1 and 0"):
+        by_label(recordings, config.data)
+
+
+def test_lengths_need_the_unit_of_many_views() -> None:
+    with pytest.raises(ConfigError, match=r"data\.exact needs teacher\.views: many"):
+        load_experiment("tiny", ["data.exact=0.5"])

@@ -25,6 +25,7 @@ from erfsfm.common.readers.images import resize_image
 from erfsfm.common.threads import usable_cores
 from erfsfm.model_record import FILES, ModelRecord, find_weights, read_record, weights_sha256
 from erfsfm.model_record import commit as commit  # likewise
+from erfsfm.model_record import record_of_whole_weights as record_of_whole_weights
 from erfsfm.networks.onnx_graph import OnnxGraph
 from erfsfm.pose_noise import NOISE_FILE, PoseNoise, file_sha256, read_pose_noise
 

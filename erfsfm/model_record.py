@@ -8,7 +8,10 @@ import subprocess
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from pydantic import ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
 
 from erfsfm.common.config_tree import Section, first_problem
 from erfsfm.common.errors import CheckpointError
@@ -69,6 +72,24 @@ def find_weights(name_or_folder: str | Path) -> Path:
             "written weights yet)"
         )
     raise CheckpointError(f"no weights '{name_or_folder}': neither a folder nor one of {', '.join(shipped) or 'none'}")
+
+
+def record_of_whole_weights(name_or_folder: str | Path) -> ModelRecord:
+    """The record of weights whose tensors can be read and are finite, which needs no PyTorch.
+
+    Raises:
+        CheckpointError: missing or damaged. Whether the tensors fit the networks is known when these are built.
+    """
+    folder = find_weights(name_or_folder)
+    record = read_record(folder / "model.yaml")
+    for path in (folder / name for name in FILES if record.networks in ("both", Path(name).stem)):
+        try:
+            is_finite = all(np.isfinite(tensor).all() for tensor in load_file(path).values())
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"{path} is missing or damaged ({error}); copy the whole weights folder") from error
+        if not is_finite:
+            raise CheckpointError(f"{path} holds NaN or infinite values; use other weights")
+    return record
 
 
 def weights_sha256(folder: Path) -> str:

@@ -122,14 +122,17 @@ def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
     camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
 ) -> None:
-    """Check the installation. Missing parts come with what to do.
+    """Check the installation. Missing parts come with what to do, and exit code 1.
 
     Example: erfsfm-slam doctor --dataset /data/kitti
     """
-    from slam.commands.doctor import examine
+    from slam.commands.doctor import NO_DATA_SET, examine
 
-    for line in examine(dataset, camera):
+    lines = examine(dataset, camera)
+    for line in lines:
         typer.echo(line)
+    if any(line.startswith("missing") for line in lines if line != NO_DATA_SET):
+        raise typer.Exit(1)
 
 
 def _print_run(path: Path, metrics: Metrics) -> None:

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import platform
-from importlib.metadata import PackageNotFoundError, version
+import re
+from importlib.metadata import distribution, version
 from pathlib import Path
 
 from erfsfm.common.errors import ErfsfmError
-from erfsfm.inference import DepthPosePredictor
+from erfsfm.inference import record_of_whole_weights
 from slam.runtime.errors import SlamError
 from slam.runtime.imports import import_open3d
 from slam.sequences.catalogue import KITTI_VARIABLE, open_sequence, sequence_kinds
 
-PACKAGES = ("torch", "numpy", "gtsam", "kiss_icp", "evo", "cv2", "onnxruntime", "lightning")
-DISTRIBUTIONS = {"kiss_icp": "kiss-icp", "cv2": "opencv-python-headless"}
+IMPORTED = {
+    "numpy": "numpy",
+    "gtsam": "gtsam",
+    "kiss-icp": "kiss_icp.pybind.kiss_icp_pybind",
+    "opencv-python-headless": "cv2",
+    "onnxruntime": "onnxruntime",
+}
+COMPARED = ("torch", "lightning", "evo")  # with the list of their files: to import them takes up to five seconds
 WEIGHTS = ("default", "sim", "erf-dfc", "erf-dfcv2")
+NO_DATA_SET = (
+    f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)"  # no fault
+)
 
 
 def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
@@ -27,25 +38,48 @@ def examine(dataset: Path | None, camera: Path | None = None) -> list[str]:
         camera: a ``camera.yaml`` in place of its own, or ``fov=DEGREES``.
     """
     lines = [f"ok       python {platform.python_version()} on {platform.machine()}"]
-    lines += [_package(name) for name in PACKAGES]
+    lines += [_package(name) for name in (*COMPARED, *IMPORTED)]
     lines.append(_open3d())
     lines += [_weights(name) for name in WEIGHTS]
     variable = os.environ.get(KITTI_VARIABLE)
     root = dataset or (Path(variable) if variable else None)
-    if root is None:
-        lines.append(f"missing  a data set: set ${KITTI_VARIABLE} or give --dataset (the simulated street needs none)")
-    else:
-        lines += _dataset(root, camera)
-    return lines
+    if root is not None:
+        return lines + _dataset(root, camera)
+    if camera is not None:
+        lines.append(f"missing  the data set of camera {camera}: give --dataset")
+    return [*lines, NO_DATA_SET]
 
 
 def _package(name: str) -> str:
-    distribution = DISTRIBUTIONS.get(name, name)
     try:
-        importlib.import_module(name)
-        return f"ok       {distribution} {version(distribution)}"
-    except (ImportError, OSError, PackageNotFoundError) as error:
-        return f"missing  {distribution}: {error}; run make setup, or pip install {distribution}"
+        if name in IMPORTED:
+            importlib.import_module(IMPORTED[name])
+        else:
+            _require_whole(name)
+        return f"ok       {name} {version(name)}"
+    except (ImportError, OSError) as error:
+        return f"missing  {name}: {error}; run make setup, or pip install --force-reinstall {name}"
+
+
+def _require_whole(name: str) -> None:
+    """Compare the files of a distribution with its list of them, and load PyTorch's library.
+
+    Raises:
+        ImportError: it, one of its files or what it needs is missing, or a file is damaged.
+        OSError: the library cannot be loaded.
+    """
+    found = distribution(name)
+    for file in found.files or ():
+        path = Path(str(found.locate_file(file)))
+        if file.suffix == ".pyc" or file.size is None:  # made after the installation
+            continue
+        if not path.is_file() or path.stat().st_size != file.size:
+            raise ImportError(f"its file {file} is missing or damaged")
+        if path.name.startswith("libtorch_python."):
+            ctypes.CDLL(str(path))
+    for needed in found.requires or ():
+        if ";" not in needed:  # without a condition
+            distribution(re.split(r"[^\w.-]", needed)[0])
 
 
 def _open3d() -> str:
@@ -57,7 +91,7 @@ def _open3d() -> str:
 
 def _weights(name: str) -> str:
     try:
-        record = DepthPosePredictor.from_weights(name).record
+        record = record_of_whole_weights(name)
         return f"ok       weights {name}: {record.network.depth} and {record.network.pose}, {record.licence}"
     except ErfsfmError as error:
         return f"missing  weights {name}: {error}"

@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import importlib
+import sys
 from contextlib import suppress
 from threading import Thread
 from types import ModuleType
@@ -25,6 +26,8 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...], type[SlamError]]] = {
     "ros": ("bags need rosbags", ("rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"), SequenceError),
 }
 
+_WINDOWS = "open3d.visualization"
+
 
 @functools.cache
 def import_open3d() -> ModuleType:
@@ -36,9 +39,28 @@ def import_open3d() -> ModuleType:
     try:
         libusb_package = importlib.import_module("libusb_package")
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-        return importlib.import_module("open3d")
+        return _without_windows()
     except (ImportError, OSError) as error:
         raise SlamError(f"Open3D cannot be loaded ({error}); install open3d-cpu and libusb-package") from error
+
+
+def _without_windows() -> ModuleType:
+    """Open3D, whose windows are imported where they are first used: their Dash and IPython are half of its time."""
+    if "open3d" in sys.modules:
+        return importlib.import_module("open3d")
+    sys.modules[_WINDOWS] = ModuleType(_WINDOWS)
+    try:
+        open3d = importlib.import_module("open3d")
+    finally:
+        sys.modules.pop(_WINDOWS, None)
+
+    def first_used(name: str) -> ModuleType:
+        if name != "visualization":
+            raise AttributeError(f"module 'open3d' has no attribute '{name}'")
+        return importlib.import_module(_WINDOWS)
+
+    vars(open3d)["__getattr__"] = first_used
+    return open3d
 
 
 def import_extra(extra: str) -> tuple[ModuleType, ...]:

@@ -7,20 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
-from erfsfm.common.config_tree import first_problem
 from slam.commands.options import LARGEST_SEED, Config, Device, Output, Overrides, Weights
 from slam.runtime.errors import RunError
 from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
-from slam.runtime.storage.record import known
 
 if TYPE_CHECKING:
     from slam.results.metrics import Provenance, Recording
 
 _RECORDING = ("dataset", "camera", "gps", "sequence", "frames")
-_AS_TEXT = BeforeValidator(lambda value: str(value) if isinstance(value, Path) else value)
+_TEXTS = ("weights", "config")  # names, or paths
 
 
 @dataclass(frozen=True)
@@ -44,8 +41,8 @@ class RunRequest:
     camera: Annotated[
         Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
     ] = None
-    weights: Annotated[Weights, _AS_TEXT] = "default"
-    config: Annotated[Config, _AS_TEXT] = None
+    weights: Weights = "default"
+    config: Config = None
     overrides: Overrides = None
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None
     output: Output = None
@@ -59,7 +56,6 @@ class RunRequest:
     gps: Annotated[Path | None, typer.Option(help="GPS track, CSV or NMEA; default: that of the old run")] = None
     seed: Annotated[
         int | None,
-        Field(ge=0, le=LARGEST_SEED),
         typer.Option(min=0, max=LARGEST_SEED, help="of every random draw; default: 0, or that of the old run"),
     ] = None
     device: Device = "auto"
@@ -74,13 +70,21 @@ class RunRequest:
             TypeError: an unknown argument.
             RunError: a value of another kind.
         """
+        from pydantic import TypeAdapter, ValidationError  # takes as long to import as the rest of the command line
+
+        from erfsfm.common.config_tree import first_problem
+
         unknown = arguments.keys() - {field.name for field in fields(cls)}
         if unknown:
             raise TypeError(f"run_slam has no argument {', '.join(sorted(unknown))}")
+        arguments |= {key: str(arguments[key]) for key in _TEXTS if isinstance(arguments.get(key), Path)}
         try:
-            return TypeAdapter(cls).validate_python(arguments)
+            request = TypeAdapter(cls).validate_python(arguments)
         except ValidationError as error:
             raise RunError(f"run_slam: {first_problem(error)}") from error
+        if request.seed is not None and not 0 <= request.seed <= LARGEST_SEED:
+            raise RunError(f"run_slam: seed: should be from 0 to {LARGEST_SEED}; got {request.seed}")
+        return request
 
     @property
     def recording(self) -> Recording:
@@ -97,6 +101,8 @@ class RunRequest:
 
     def resumed(self, before: Provenance, place: Path) -> RunRequest:
         """The request of a run that did not end, to go on in its folder with what it was run on."""
+        from slam.runtime.storage.record import known
+
         recording = known(before.recording)
         named = dict.fromkeys(_RECORDING) | ({} if recording is None else recording.tree())
         weights = (known(before.weights) or "default") if self.weights == "default" else self.weights

@@ -48,6 +48,7 @@ from slam.commands.cli import app
 
 verbs = typer.main.get_command(app).commands
 assert CliRunner().invoke(app, ["--help"]).exit_code == 0
+assert "pydantic" not in sys.modules  # typer imports it for a verb
 for verb in verbs:
     result = CliRunner().invoke(app, [verb, "--help"])
     assert result.exit_code == 0 and "Example: erfsfm-slam " + verb in result.output, (verb, result.output)
@@ -392,6 +393,12 @@ def test_doctor(call: Call, kitti_root: Path) -> None:
     assert code == 0
     assert all(line.split()[0] in ("ok", "missing") for line in out.splitlines())
     assert "sequence sim: 14 frames" in out
+    assert call("doctor")[0] == 0  # no data set was named
+
+    code, out, _ = call("doctor", "--dataset", "nowhere")
+    assert code == 1 and "nowhere" in out.splitlines()[-1]
+    code, out, _ = call("doctor", "--dataset", kitti_root, "--camera", "fov=700")
+    assert code == 1 and "700" in out.splitlines()[-1]
 
 
 def test_a_continued_run_prints_its_numbers_of_frames(

@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 
 from slam.commands.cli import app
 from slam.commands.live.request import LiveRequest
-from slam.commands.options import Json, options_of
+from slam.commands.options import LARGEST_SEED, Json, options_of
 from slam.commands.run.request import RunRequest
 from slam.results.metrics import Provenance
+from slam.runtime.errors import RunError
 
 
 @dataclass(frozen=True)
@@ -65,3 +66,9 @@ def test_a_run_that_goes_on_has_the_recording_that_it_was_run_on(tmp_path: Path)
     assert again == RunRequest.of(
         dataset=tmp_path, camera="fov=70", frames="0:9", weights="sim", seed=4, output=tmp_path / "run"
     )
+
+
+@pytest.mark.parametrize("seed", [-1, LARGEST_SEED + 1, "many"])
+def test_a_seed_from_python_is_checked(seed: object) -> None:
+    with pytest.raises(RunError, match="run_slam: seed: "):
+        RunRequest.of(seed=seed)

@@ -1,0 +1,25 @@
+"""Open3D without its windows, which are there where they are used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+WINDOWS = """
+import sys
+from slam.runtime.imports import import_open3d
+
+o3d = import_open3d()
+assert not {"dash", "plotly", "IPython"} & set(sys.modules)
+assert not hasattr(o3d, "nonesuch")
+%s
+assert o3d.visualization.draw_geometries and o3d.visualization is sys.modules["open3d.visualization"]
+"""
+
+
+@pytest.mark.parametrize("use", ["", "import open3d.visualization", "from open3d.visualization import rendering"])
+def test_the_windows_of_open3d_are_imported_at_their_first_use(use: str) -> None:
+    finished = subprocess.run([sys.executable, "-c", WINDOWS % use], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import ctypes
 import importlib
 import os
@@ -69,11 +70,12 @@ def _require_whole(name: str) -> None:
         OSError: the library cannot be loaded.
     """
     found = distribution(name)
-    for file in found.files or ():
+    # not by ``files``: once importlib_metadata is imported, it leaves out those that are missing
+    for file, _, size in csv.reader((found.read_text("RECORD") or "").splitlines()):
         path = Path(str(found.locate_file(file)))
-        if file.suffix == ".pyc" or file.size is None:  # made after the installation
+        if path.suffix == ".pyc" or not size:  # made after the installation
             continue
-        if not path.is_file() or path.stat().st_size != file.size:
+        if not path.is_file() or path.stat().st_size != int(size):
             raise ImportError(f"its file {file} is missing or damaged")
         if path.name.startswith("libtorch_python."):
             ctypes.CDLL(str(path))

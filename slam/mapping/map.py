@@ -143,8 +143,8 @@ class TsdfMap:
             EmptyMapError: nothing was fused or seen often enough.
             SlamError: a submap cannot be written, or the disk is full.
         """
+        self._fuse_waiting(None)
         if self._surface is None:
-            self._fuse_waiting(None)
             self._finish_submap()
             self._surface = MapSurface(submap_paths(self._folder), self._config, progress)
         return self._surface
@@ -167,7 +167,8 @@ class TsdfMap:
         return self._config.voxel_size_m
 
     def statistics(self) -> MapStatistics:
-        """Counts, zero for an empty map."""
+        """Counts of all that was given so far, zero for an empty map."""
+        self._fuse_waiting(None)
         filters, voxel_size = self._filters.shares(), self.voxel_size
         try:
             surface = self.surface()

@@ -202,3 +202,15 @@ def test_a_frame_with_hardly_any_depth_left_is_skipped(first: int, size: int, fu
     tsdf_map.integrate(KeyframeDepth(0, depth, None, GREY[:-1], pose(0.0, 0.0, 0.0)))
     tsdf_map.statistics()
     assert tsdf_map.statistics().frames_fused == fused
+
+
+def test_a_map_goes_on_after_its_surface_was_asked_for():
+    whole, asked = (TsdfMap(MappingConfig(min_component_triangles=10), CAMERA) for _ in range(2))
+    for k in range(6):
+        for tsdf_map in (whole, asked):
+            position = pose(0.0, 0.0, float(k))
+            tsdf_map.integrate(KeyframeDepth(k, street(position[:3, 3]), None, GREY, position))
+        counts = asked.statistics()
+        assert counts.frames_fused == k + 1 and sum(counts.filters.values()) > 0
+        assert counts.triangles == len(asked.mesh().triangles)
+    assert asked.mesh().vertices_world[:, 2].max() > whole.mesh().vertices_world[:, 2].max() - 0.5

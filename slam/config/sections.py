@@ -62,7 +62,7 @@ class DepthConfig(Section):
         default=1,
         ge=1,
         description="depth is predicted at every n-th frame and where the camera has moved on, and carried to those "
-        "between; snippets touch. 2 takes a third less time; more than 1 is not yet reproducible by --continue",
+        "between; snippets touch where it is more than 1",
     )
     kind: Literal["auto", "depth", "disparity"] = Field(
         default="auto",

@@ -260,10 +260,15 @@ class Observer:
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
                 views.append(self._features.view(frame, depth, height))
+        if frame.index in self._examples:
+            self._examples.keep(frame, depth, self._drive.examples)
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:
         """Depth and camera height, predicted late where nobody asked for them before."""
+        if recent.depth is None:  # a keyframe's may be on its way
+            self._finish_tasks("depth network")
+            recent = next(r for r in self._recent if r.frame is recent.frame)
         if recent.depth is not None:
             return recent.depth, recent.height
         carried = self._carried(recent)
@@ -282,7 +287,7 @@ class Observer:
         depth = self._odometry.carried(before.depth, step)
         if depth is None:
             return None
-        self._keep_for_map(recent.frame, depth)
+        self._keep(recent.frame, depth)
         return depth, self._remember(recent.frame, depth, before.height)
 
     def _remember(self, frame: Frame, depth: DepthMap, height: float | None) -> float | None:
@@ -328,20 +333,16 @@ class Observer:
         T_previous_current = motion.relative_pose.T_from_to
         return PendingTask("road", self._beside.submit(self._road.measure, previous, current, T_previous_current), keep)
 
-    def _finish_tasks(self) -> None:
-        """Wait for the tasks of the last frame."""
-        tasks, self._tasks = self._tasks, []  # so that a failed one is not raised again
+    def _finish_tasks(self, stage: str | None = None) -> None:
+        """Wait for the tasks of the last frame, or for those of one stage alone."""
+        tasks = [task for task in self._tasks if stage in (None, task.stage)]
+        self._tasks = [task for task in self._tasks if task not in tasks]  # so that a failed one is not raised again
         for task in tasks:
             with self._stopwatch.stage(task.stage):
                 task.keep(task.result.result())
 
     def _keep(self, frame: Frame, depth: DepthMap) -> None:
-        """Keep a thinned frame for the map, and a few whole ones for the report."""
-        if frame.index in self._examples:
-            self._examples.keep(frame, depth, self._drive.examples)
-        self._keep_for_map(frame, depth)
-
-    def _keep_for_map(self, frame: Frame, depth: DepthMap) -> None:
+        """Keep a thinned frame for the map."""
         mapping = self._config.mapping
         if mapping.enabled and frame.index % mapping.frame_stride == 0:
             keyframe = self._beside.submit(Keyframe.of, frame, depth, self._spill_file, mapping)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -47,8 +48,8 @@ def last_step(drive: Drive, index: int) -> Motion | None:
 def has_moved_on(drive: Drive, step: Motion, frames: int) -> bool:
     """Whether so many more steps as this one leave what the last predicted depth shows."""
     roads = drive.roads[: step.ends[1] + 1][-_LAST_ROADS:]
-    heights = [road.height_unscaled for road in roads if isinstance(road, GroundPlane)]
-    return bool(heights) and frames * step.length_unscaled > _MOVED_ON_HEIGHTS * heights[-1]
+    height = next((height for road in reversed(roads) if (height := height_of(road)) is not None), math.inf)
+    return frames * step.length_unscaled > _MOVED_ON_HEIGHTS * height
 
 
 def height_of(road: GroundPlane | MeasurementFailure) -> float | None:

@@ -249,9 +249,10 @@ def test_too_many_unreadable_images_raise_their_error() -> None:
         run(unreadable, BAD, "gaps.enabled=false")
 
 
-def test_flushing_after_each_frame_measures_the_same_as_going_on() -> None:
+@pytest.mark.parametrize("stride", [1, 2])
+def test_flushing_after_each_frame_measures_the_same_as_going_on(stride: int) -> None:
     sequence = Damaged(street(), black, range(12, 14))
-    config = config_with("mapping.enabled=false")
+    config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
     going_on, flushed = (
         Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch()) for _ in ("going on", "flushed")
     )
@@ -265,9 +266,10 @@ def test_flushing_after_each_frame_measures_the_same_as_going_on() -> None:
         assert_same(going_on, flushed)
 
 
-def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_session_written_and_resumed_after_every_frame_measures_the_same(tmp_path: Path, stride: int) -> None:
     sequence = Damaged(street(), black, range(12, 14))
-    config = config_with("mapping.enabled=false")
+    config = config_with("mapping.enabled=false", f"depth.frame_stride={stride}")
 
     def begin(state: FrontEndState | None = None) -> Observer:
         return Observer(oracle_of(sequence), sequence.intrinsics, config, Stopwatch(), state=state)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -119,9 +120,10 @@ def systems_table(runs: Sequence[SystemRun], reference: Path) -> TerminalTable:
 def by_name(runs: Sequence[SystemRun]) -> dict[str, Trajectory]:
     """The trajectories to draw over each other, with the reference of the most poses."""
     found = {REFERENCE: max((run.reference for run in runs), key=len)}
+    counts = Counter[str]()
     for run in runs:
-        before = sum(each.system == run.system for each in runs[: runs.index(run)])
-        found[f"{run.system} #{before + 1}" if before else run.system] = run.estimate
+        counts[run.system] += 1
+        found[f"{run.system} #{counts[run.system]}" if counts[run.system] > 1 else run.system] = run.estimate
     return found
 
 

@@ -9,7 +9,7 @@ single corners have errors of half a pixel, and those on the road all upwards, w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ from slam.frontend.visual.epipolar import UnitRelativePose
 
 _NEAREST = 1e-6
 _INVERSIONS = 2
+_GRID_PX = 3  # the flow is computed at every third pixel: learned depth has no finer detail
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,7 @@ class PredictedFlow:
 
     def depth_current(self) -> DepthMap:
         """Z-depth ``(H, W)`` of the later image, of the surfaces that the earlier one shows; NaN where unknown."""
-        v, u = (np.arange(side, dtype=np.float32) for side in self.depth_previous.shape)
-        grid = cv2.merge([np.broadcast_to(u, self.depth_previous.shape), np.repeat(v[:, None], len(u), axis=1)])
+        grid = _pixels(*self.depth_previous.shape)
         flow = self._current - grid
         before = grid - flow
         for _ in range(_INVERSIONS - 1):  # fixed point: a pixel less the flow that ends there
@@ -71,9 +71,12 @@ class PredictedFlow:
     @cached_property
     def _current(self) -> NDArray[np.float32]:
         """Pixels of the later image ``(H, W, 2)`` by those of the earlier one: ``K R K^-1 x + K t / z``."""
-        depth = self.depth_previous
+        height, width = self.depth_previous.shape
         turned, moved = self._projection
-        v, u = (np.arange(side, dtype=np.float32) for side in depth.shape)
+        rows, columns = max(height // _GRID_PX, 1), max(width // _GRID_PX, 1)
+        depth = cv2.resize(self.depth_previous, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
+        v = ((np.arange(rows) + 0.5) * height / rows - 0.5).astype(np.float32)
+        u = ((np.arange(columns) + 0.5) * width / columns - 0.5).astype(np.float32)
         near = cv2.divide(1.0, depth)
         near[~(depth > 0)] = 0.0
         x, y, z = (
@@ -81,4 +84,11 @@ class PredictedFlow:
             for row, shift in zip(turned, moved, strict=True)
         )
         ahead = cv2.max(z, _NEAREST)
-        return np.asarray(cv2.merge([cv2.divide(x, ahead), cv2.divide(y, ahead)]))
+        flow = cv2.merge([cv2.divide(x, ahead) - u, cv2.divide(y, ahead) - v[:, None]])
+        return np.asarray(cv2.resize(flow, (width, height)) + _pixels(height, width))
+
+
+@lru_cache(maxsize=2)
+def _pixels(height: int, width: int) -> NDArray[np.float32]:
+    """Each pixel's own column and row ``(H, W, 2)``."""
+    return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in (width, height))), axis=-1)

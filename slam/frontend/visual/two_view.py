@@ -32,7 +32,7 @@ from slam.geometry.se3 import FloatArray
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
 _OVERSTEP = 1.4
-_CONVERGED = 0.1  # sigmas of the motion
+_CONVERGED = 0.02  # sigmas of the motion
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0

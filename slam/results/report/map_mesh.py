@@ -16,7 +16,7 @@ from slam.runtime.imports import import_open3d
 
 _CHUNK = 500_000
 _COARSER = 1.15  # vertices of one surface do not all meet in its cells
-_FINER = 3  # triangles that quadric errors choose from, as a multiple of those that stay
+_FINER = 2  # triangles that quadric errors choose from, as a multiple of those that stay
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 
@@ -58,6 +58,11 @@ class MapMeshFile:
             RunError: it is no mesh that can be read.
         """
         self._vertices, self._faces = map_ply(path)
+
+    @property
+    def triangles(self) -> int:
+        """Number of triangles."""
+        return len(self._faces)
 
     def reduced(self, triangles: int) -> MapMesh:
         """The whole map with at most about so many triangles."""

@@ -77,8 +77,10 @@ def write_map_views(folder: RunFolder, triangles: int) -> MapViews | None:
     figure = map_figure(scene.from_above(trajectory.positions), trajectory, length_unit(folder))
     T_world_camera = trajectory.T_world_camera
     frame = scene.best_seat(T_world_camera)
-    near = file.near(T_world_camera[frame, :3, 3], _NEAR)
-    driver = (MapScene(near) if len(near.triangles) else scene).from_seat(T_world_camera[frame])
+    if file.triangles > _MOST_TRIANGLES:  # the driver sees the mesh as it is
+        near = file.near(T_world_camera[frame, :3, 3], _NEAR)
+        scene = MapScene(near) if len(near.triangles) else scene
+    driver = scene.from_seat(T_world_camera[frame])
     viewer = map_viewer(mesh.decimated(triangles), T_world_camera, frame) if triangles else None
     views = MapViews(png(figure), _png(driver), frame, viewer)
     folder.write(MAP_ABOVE, lambda path: path.write_bytes(views.above))

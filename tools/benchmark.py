@@ -1,11 +1,11 @@
 """Accuracy and speed: sequences x configurations x seeds, as CSV files and as docs/benchmarks.md.
 
 accuracy measures simulated worlds and KITTI sequences, full-size the same worlds and KITTI at the size of KITTI's
-cameras, ablation turns off one part at a time, speed measures time and memory, maps the errors of the map with one of
-its parts turned off at a time. Every run is a process and a folder of its own under --output. A successful one is not
-repeated as long as sources, weights and options stay the same, so that a killed benchmark can be resumed; a failed one
-is a row with its reason. --jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers
-need the same files at the same paths.
+cameras, ablation turns off one part at a time, maps the errors of the map with one of its parts turned off at a time.
+Every run is a process and a folder of its own under --output. A successful one is not repeated as long as sources,
+weights and options stay the same, so that a killed benchmark can be resumed; a failed one is a row with its reason.
+--jobs and --scheduler need Dask: pip install 'erfsfm-slam[cluster]'. A scheduler's workers need the same files at the
+same paths. speed measures two checkouts in turn: time, memory and stages; nothing of it is kept.
 
 Example: python tools/benchmark.py accuracy --kitti KITTI --jobs 2
 """
@@ -16,32 +16,31 @@ import argparse
 import csv
 import os
 import shlex
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from benchmarking import pairs
 from benchmarking.metrics import rows
-from benchmarking.page import PICTURE, draw, drawable, section, summary_table, with_section
+from benchmarking.page import PICTURE, draw, drawable, section, speed_section, summary_table, with_section
 from benchmarking.plan import (
     ABLATION,
     ACCURACY,
     EVERYTHING,
     FULL_SIZE,
-    GROWTH,
     MAPS,
-    SPEED,
     Condition,
     Configuration,
     Job,
-    excerpts,
     original_recordings,
     plan,
     raw_drives,
     recordings,
     worlds,
 )
-from benchmarking.work import ROOT, measured, workers
+from benchmarking.work import ROOT, measured, revision, simulate, workers
 from shared.command import one_line_errors, parser_of
 
 from slam.runtime.storage.files import write_atomically
@@ -71,9 +70,6 @@ MODES = {
     ),
     "full-size": Mode("the same at 1242x375, on worlds and on original images of KITTI", ACCURACY, _BOTH, (610, 611)),
     "ablation": Mode("the same with one part turned off at a time", ABLATION, _BOTH, weights=("default", "sim")),
-    "speed": Mode(
-        "time of every stage, memory, growth with the number of frames; one run after another", SPEED, ("loop",)
-    ),
     "maps": Mode("errors, size and cost of the map, with one of its parts turned off at a time", MAPS, ("loop",)),
 }
 
@@ -82,6 +78,9 @@ MODES = {
 def main(words: Sequence[str] | None = None) -> None:
     """Plan the runs, execute those that are missing, write tables."""
     options = _parser().parse_args(words)
+    if options.mode == "speed":
+        _compare_speed(options)
+        return
     at_a_time = getattr(options, "jobs", 1)
     scheduler = getattr(options, "scheduler", None)
     jobs = _jobs(options)
@@ -100,13 +99,43 @@ def main(words: Sequence[str] | None = None) -> None:
     known = (options.output, "OUTPUT"), (options.worlds_in, "WORLDS"), *roots, (ROOT, "."), *drives
     for path, name in known:
         text = text.replace(str(path.resolve()), name) if path else text
-    page = options.report.read_text(encoding="utf-8") if options.report.is_file() else ""
-    write_atomically(options.report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
+    _write_section(options.report, text)
     if options.mode in ("accuracy", "full-size"):
         print(summary_table(results))
     if options.mode == "accuracy" and drawable(results):
         draw(results, options.report.parent / PICTURE)
     print(f"{options.report}: {len(results)} runs, {sum(bool(o.reason) for o in results)} failed")
+
+
+def _write_section(report: Path, text: str) -> None:
+    page = report.read_text(encoding="utf-8") if report.is_file() else ""
+    write_atomically(report, lambda file: file.write_text(with_section(page, text), encoding="utf-8"))
+
+
+def _compare_speed(options: argparse.Namespace) -> None:
+    """Write the section of two checkouts in turn."""
+    drives, command = [], ["python", "tools/benchmark.py", "speed", "--against", "CHECKOUT"]
+    if options.kitti is not None:
+        drive = "--dataset", str(options.kitti.resolve()), "--sequence", options.sequence
+        drives.append(pairs.Drive(f"KITTI {options.sequence}", drive))
+        drives.append(pairs.Drive(f"KITTI {options.sequence}, no map", (*drive, "--set", "mapping.enabled=false")))
+        command += ["--kitti", "KITTI", "--sequence", options.sequence]
+    for folder in options.folders:
+        drives.append(pairs.Drive(folder.resolve().parent.name, ("--dataset", str(folder.resolve()))))
+        command += ["--folders", f"DATA/{folder.resolve().parent.name}/{folder.name}"]
+    if options.frames:
+        (grid,) = worlds((options.output / "worlds").resolve(), ["grid"], [610], options.frames)
+        simulate(grid)
+        drives.append(pairs.Drive(f"grid 610, {options.frames} frames", ("--dataset", str(grid.root))))
+    command += ["--frames", str(options.frames), "--pairs", str(options.pairs)]
+    checkouts = options.against.resolve(), ROOT
+    runs = (options.output / "speed").resolve()
+    shutil.rmtree(runs, ignore_errors=True)
+    runs.mkdir(parents=True)
+    costs = pairs.in_turn(checkouts, drives, options.pairs, runs)
+    text = pairs.tables([revision(checkout) for checkout in checkouts], drives, costs)
+    _write_section(options.report, speed_section(shlex.join(command), text))
+    print(text)
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
@@ -125,11 +154,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     if parts is not None:
         configurations = tuple(c for c in configurations if c is EVERYTHING or c.name in parts)
     rest = options.weights, options.seeds, options.set, options.device
-    jobs = plan(folder, drives, configurations, *rest)
-    if options.mode == "speed" and options.growth:
-        (grid,) = worlds(simulated, ["grid"], options.worlds[:1], max(options.growth))
-        jobs += plan(folder, excerpts(grid, options.growth), [GROWTH], *rest)
-    return jobs
+    return plan(folder, drives, configurations, *rest)
 
 
 def _command(options: argparse.Namespace) -> str:
@@ -151,7 +176,6 @@ def _command(options: argparse.Namespace) -> str:
         "sequences",
         "excerpt",
         "seeds",
-        "growth",
         "device",
         "set",
     ):
@@ -163,7 +187,7 @@ def _command(options: argparse.Namespace) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of(__doc__)
-    modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join(MODES))
+    modes = parser.add_subparsers(dest="mode", required=True, metavar="|".join([*MODES, "speed"]))
     for name, mode in MODES.items():
         add = modes.add_parser(
             name, help=mode.what, description=mode.what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
@@ -190,11 +214,20 @@ def _parser() -> argparse.ArgumentParser:
             add("--drives", nargs="+", type=Path, default=(), metavar="FOLDER", help="KITTI raw drives")
             parts = [each.name for each in mode.configurations if each is not EVERYTHING]
             add("--parts", nargs="*", choices=parts, metavar="PART", help=f"to turn off: {', '.join(parts)}; else all")
-        if name == "speed":
-            add("--growth", nargs="*", type=int, default=[500, 1000, 2000, 5000], help="frames of a simulated grid")
-        else:
-            add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
-            add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
+        add("--jobs", type=int, default=1, help="runs at a time; more than one needs Dask")
+        add("--scheduler", metavar="ADDRESS", help="of a Dask cluster in place of local processes")
+    what = "time, memory and stages of two checkouts in turn"
+    add = modes.add_parser(
+        "speed", help=what, description=what, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    ).add_argument
+    add("--against", type=Path, required=True, metavar="CHECKOUT", help="the other checkout, run before this one")
+    add("--kitti", type=Path, metavar="ROOT", help="a KITTI odometry root, run with its map and without")
+    add("--sequence", default="05", help="of that root")
+    add("--folders", nargs="*", type=Path, default=(), metavar="FOLDER", help="folders of images")
+    add("--frames", type=int, default=2000, help="of a simulated grid; 0 leaves it out")
+    add("--pairs", type=int, default=3, help="runs of each drive by each checkout")
+    add("--output", type=Path, default=Path("runs/benchmark"), help="keeps the last runs and the world")
+    add("--report", type=Path, default=Path("docs/benchmarks.md"), help="the page whose section is written")
     return parser
 
 

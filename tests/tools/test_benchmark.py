@@ -25,7 +25,9 @@ from slam.runtime.storage.record import Missing
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))  # as ``python tools/benchmark.py`` finds its modules
 benchmark = importlib.import_module("benchmark")
-page, plan, work = (importlib.import_module(f"benchmarking.{name}") for name in ("page", "plan", "work"))
+page, pairs, plan, work = (
+    importlib.import_module(f"benchmarking.{name}") for name in ("page", "pairs", "plan", "work")
+)
 
 
 def metrics(ate: float = 1.0, seconds: float = 20.0, **stages: float) -> Metrics:
@@ -162,28 +164,25 @@ def test_ablation_compares_with_the_same_seed(job: Any) -> None:
     assert "– map triangles, loop 610: no map." in text
 
 
-def test_speed_ratios_and_growth(job: Any) -> None:
-    asked = replace(job, configuration=plan.SPEED[0])
-    grown = replace(job, configuration=plan.GROWTH, drive=replace(job.drive, name="grid 610, 100 frames"))
-    results = [
-        work.JobResult(asked, metrics(seconds=20.0, read=5.0, map=10.0), "abc"),
-        work.JobResult(grown, metrics(seconds=10.0, loops=1.0, read=4.0), "abc"),
-    ]
-    table = cells(page.speed_tables(results))
-    assert ["sequence", "weights", "configuration", "read", "map", "rest"] in table
-    assert ["loop 610", "sim", "networks computed", "25.0", "50.0", "25.0"] in table
-    assert table[-1][:2] == ["grid 610, 100 frames", "sim"]
-    assert (table[-2][-2:], table[-1][-2:]) == (["loops", "read"], ["10.00", "40.00"])
-    assert table[-1][table[-2].index("loops closed")] == "3"
+@pytest.mark.slow
+def test_two_checkouts_in_turn(tmp_path: Path) -> None:
+    report, here = tmp_path / "page.md", Path(__file__).parents[2]
+    words = ["--against", str(here), "--frames", "12", "--pairs", "1"]
+    benchmark.main(["speed", *words, "--output", str(tmp_path / "out"), "--report", str(report)])
+    text = report.read_text()
+    table = cells(text)
+    head, row = table[0], table[1]
+    cpu, busiest = (head.index(name) for name in ("CPU ms / frame", "CPU ms / frame of the busiest thread"))
+    before, after = (float(part.split(":")[0]) for part in row[cpu].split(","))
+    assert row[0] == "grid 610, 12 frames" and before > 0 and after > 0
+    assert float(row[busiest].split(",")[0]) > 0
+    assert "geometry" in table[2] and str(tmp_path) not in text
 
 
-def test_a_missing_cache_is_refused(job: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "fingerprint", lambda weights: "same")
-    monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("ran"))
-    monkeypatch.setattr(work, "revision", lambda: "abc")
-    from_cache = replace(job, configuration=plan.SPEED[2])
-    work.perform(from_cache)
-    assert work.job_result(from_cache).reason.startswith("there is no cache in ")
+def test_a_failing_checkout_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"nonesuch by .* failed; see "):
+        drive = pairs.Drive("nonesuch", ("--dataset", str(tmp_path / "missing")))
+        pairs.in_turn([Path(__file__).parents[2]], [drive], 1, tmp_path)
 
 
 def test_only_successful_runs_of_the_same_sources_are_kept(job: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from statistics import fmean
 import numpy as np
 from benchmarking import metrics as m
 from benchmarking.metrics import Cell, MetricDefinition, drive, grouped, over_seeds, table, values, weights
-from benchmarking.plan import EVERYTHING, GROWTH
+from benchmarking.plan import EVERYTHING
 from benchmarking.work import FALSE_DEG, FALSE_M, JobResult
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -23,7 +23,7 @@ from slam.results.error_columns import DASH
 from slam.results.folder import RunFolder
 from slam.results.report.plots import draw_trajectories, trajectories_of
 from slam.runtime.storage.files import write_atomically
-from slam.runtime.storage.record import Missing, known
+from slam.runtime.storage.record import Missing
 
 PICTURE = "images/trajectories.png"  # beside the page
 SIDE_IN = 1.9
@@ -78,29 +78,6 @@ above 1, the part helps. The rest are means.
 {table(rows, by_drive, results)}{notes(results, (*errors, *others))}"""
 
 
-def speed_tables(results: Sequence[JobResult]) -> str:
-    """Frames a second, shares of the stages, growth with the number of frames."""
-    growth = [o for o in results if o.job.configuration.name == GROWTH.name]
-    whole = [o for o in results if o not in growth]
-    rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
-    costs = (m.FRAMES, m.RATE, m.TIME, m.CPU, m.COMMAND, m.MEMORY, m.LOAD)
-    grown = (m.TIME, m.CPU, m.MEMORY, m.LOOPS, m.LOAD)
-    shares = {stage: stage_share(stage) for stage in m.stages(whole)} | {"rest": rest_share}
-    by_stage = {q.title: over_seeds(q) for q in grown} | {stage: stage_ms(stage) for stage in m.stages(growth)}
-    return f"""Everything on. Frames a second count all from the first image to the evaluation; the whole command also
-start and report.
-
-{table(rows, {q.title: over_seeds(q) for q in costs}, whole)}
-
-Share of every stage, %:
-
-{table(rows, shares, whole)}
-
-Growth with the number of frames, without fusion; stages in ms / frame:
-
-{table({"sequence": drive, "weights": weights}, by_stage, growth)}{notes(results, (*costs, *grown))}"""
-
-
 def maps_tables(results: Sequence[JobResult]) -> str:
     """Errors of the map with everything on and with one part turned off; sizes and cost."""
     rows = {"sequence": drive, "weights": weights, "configuration": m.configuration}
@@ -122,7 +99,6 @@ TABLES: dict[str, Callable[[Sequence[JobResult]], str]] = {
     "accuracy": accuracy_tables,
     "full-size": error_tables,
     "ablation": ablation_tables,
-    "speed": speed_tables,
     "maps": maps_tables,
 }
 
@@ -141,24 +117,6 @@ def against_everything(definition: MetricDefinition, results: Sequence[JobResult
         return f"{math.exp(fmean(map(math.log, ratios))):.2f} ({max(ratios):.2f})" if ratios else DASH
 
     return cell
-
-
-def stage_share(stage: str) -> Cell:
-    """Per cent of the time of a run."""
-    return lambda group: m.mean([100 * _stage(o, stage) / _seconds(o) for o in group if not o.reason], 1)
-
-
-def rest_share(group: Sequence[JobResult]) -> str:
-    """Per cent outside of every stage."""
-    shares = [100 - 100 * sum(_stage(o, s) for s in m.stages([o])) / _seconds(o) for o in group if not o.reason]
-    return m.mean(shares, 1)
-
-
-def stage_ms(stage: str) -> Cell:
-    """Milliseconds a frame."""
-    return lambda group: m.mean(
-        [1e3 * _stage(o, stage) / frames for o in group if (frames := known(o.metrics.sequence.frames))], 2
-    )
 
 
 def notes(results: Sequence[JobResult], definitions: Iterable[MetricDefinition]) -> str:
@@ -191,21 +149,25 @@ Commit {commits}; seeds {seeds}; {len(results)} runs, {failed} failed; {at_a_tim
 """
 
 
+def speed_section(command: str, tables: str) -> str:
+    """The section of two checkouts in turn."""
+    return f"""## Speed
+
+    {command}
+
+On {os.cpu_count()} {platform.machine()} cores, load {os.getloadavg()[0]:.1f} at the end.
+
+{tables}
+"""
+
+
 def with_section(page: str, new: str) -> str:
-    """The page with a section in place of the one of the same title, in the order of ``TABLES``; others come last."""
+    """The page with a section in place of the one of the same title; those that no mode writes come last."""
     _, *old = re.split(r"(?m)^(?=## )", page)
     sections = {text.splitlines()[0]: text.strip() + "\n" for text in [*old, new]}
-    order = [f"## {mode.capitalize()}" for mode in TABLES]
+    order = [f"## {mode.capitalize()}" for mode in (*TABLES, "speed")]
     place = {title: number for number, title in enumerate(order)}
     return "\n".join([PAGE, *(sections[title] for title in sorted(sections, key=lambda t: place.get(t, len(order))))])
-
-
-def _stage(o: JobResult, stage: str) -> float:
-    return known(m.stage_seconds(o, stage)) or 0.0
-
-
-def _seconds(o: JobResult) -> float:
-    return known(o.metrics.timing.seconds_total) or math.nan
 
 
 def summary_table(results: Sequence[JobResult]) -> str:

@@ -31,18 +31,18 @@ class BenchmarkSequence:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Overrides of a run, and its cache of the networks' outputs: ``fill`` empties it first, ``full`` requires it."""
+    """Overrides of a run, and whether its drive keeps a cache of the networks' outputs."""
 
     name: str
     overrides: tuple[str, ...] = ()
-    cache: Literal["none", "keep", "fill", "full"] = "none"
+    cache: bool = False
 
 
 _UNINFORMATIVE = 100.0  # sigma of a logarithm: the measurement has no weight
 _NEVER = 1e9  # a limit that no measurement reaches
 QUIET = ("output.report=false",)
 ACCURACY = (Configuration("default", QUIET),)
-EVERYTHING = Configuration("everything on", QUIET, "keep")
+EVERYTHING = Configuration("everything on", QUIET, True)
 _PARTS: dict[str, tuple[str, ...]] = {
     "no image geometry": ("visual_odometry.enabled=false",),
     "no predicted flow": ("visual_odometry.predicted_flow=false",),
@@ -76,13 +76,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "no loop dropped": (f"pose_graph.max_loop_residual={_NEVER}",),
     "no fusion": ("mapping.enabled=false",),
 }
-ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _PARTS.items()))
-SPEED = (
-    Configuration("networks computed"),
-    Configuration("cache filled", cache="fill"),
-    Configuration("from the cache", cache="full"),
-    Configuration("from the cache, no fusion", ("mapping.enabled=false",), cache="full"),
-)
+ABLATION = (EVERYTHING, *(Configuration(name, (*QUIET, *off), True) for name, off in _PARTS.items()))
 _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "depth not refined": ("depth.refine=none",),
     "no border": ("mapping.border=0",),
@@ -94,10 +88,9 @@ _MAP_PARTS: dict[str, tuple[str, ...]] = {
     "small pieces kept": ("mapping.min_component_triangles=0",),
     "no loops": ("loops.enabled=false",),
 }
-MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off), "keep") for name, off in _MAP_PARTS.items()))
+MAPS = (EVERYTHING, *(Configuration(name, (*QUIET, *off), True) for name, off in _MAP_PARTS.items()))
 FULL_SIZE = 1242, 375  # pixels of KITTI's colour cameras
 ORIGINALS = ("kitti_odometry_original", "failures/kitti03_full")
-GROWTH = Configuration("no fusion", (*QUIET, "mapping.enabled=false"))
 
 
 @dataclass(frozen=True)
@@ -134,7 +127,7 @@ class Job:
         words += ["--sequence", drive.sequence] if drive.sequence else []
         words += ["--seed", str(self.seed), "--device", self.device, "--output", str(self.place / "run")]
         words += ["--frames", drive.frames] if drive.frames else []
-        words += ["--cache", str(self.cache)] if configuration.cache != "none" else []
+        words += ["--cache", str(self.cache)] if configuration.cache else []
         return words + [word for override in configuration.overrides for word in ("--set", override)]
 
 
@@ -205,14 +198,6 @@ def recordings(kitti: Path, names: Sequence[str], frames: str | None) -> list[Be
 def raw_drives(folders: Sequence[Path]) -> list[BenchmarkSequence]:
     """KITTI raw drives, each a folder of its own."""
     return [BenchmarkSequence(folder.name, folder.resolve(), sequence="", kind="KITTI raw") for folder in folders]
-
-
-def excerpts(drive: BenchmarkSequence, counts: Sequence[int]) -> list[BenchmarkSequence]:
-    """The first frames of a drive."""
-    return [
-        BenchmarkSequence(f"{drive.name}, {n} frames", drive.root, frames=f"0:{n}", simulate=drive.simulate)
-        for n in counts
-    ]
 
 
 def slug(text: str) -> str:

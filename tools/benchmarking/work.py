@@ -87,17 +87,12 @@ def perform(job: Job) -> None:
         return
     shutil.rmtree(job.place, ignore_errors=True)
     job.place.mkdir(parents=True)
-    if job.configuration.cache == "fill":
-        shutil.rmtree(job.cache, ignore_errors=True)
     record = {"identity": identity, "commit": revision(), "load": os.getloadavg()[0]}
-    if job.configuration.cache == "full" and not job.cache.is_dir():
-        record["reason"] = f"there is no cache in {job.cache}"
-    else:
-        start = time.perf_counter()
-        finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
-        record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
-        for name in BULKY:
-            (job.place / "run" / name).unlink(missing_ok=True)
+    start = time.perf_counter()
+    finished = subprocess.run(_slam(*job.arguments, "--json"), capture_output=True, text=True, check=False)
+    record |= {"seconds": time.perf_counter() - start, "reason": why_ended(finished.returncode, finished.stderr)}
+    for name in BULKY:
+        (job.place / "run" / name).unlink(missing_ok=True)
     write_atomically(job.place / "record.json", lambda path: path.write_text(json.dumps(record, indent=2)))
 
 
@@ -136,13 +131,13 @@ def fingerprint(weights: str) -> str:
     return digest.hexdigest()
 
 
-def revision() -> str:
+def revision(checkout: Path = ROOT) -> str:
     """The commit, with ``-dirty`` where sources were changed since; empty outside a checkout."""
-    if shutil.which("git") is None or not (ROOT / ".git").exists():
+    if shutil.which("git") is None or not (checkout / ".git").exists():
         return ""
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True).stdout
+        return subprocess.run(["git", "-C", str(checkout), *words], capture_output=True, text=True, check=True).stdout
 
     changed = git("status", "--porcelain", "--", *SOURCES)
     return git("rev-parse", "--short=12", "HEAD").strip() + ("-dirty" if changed else "")

@@ -122,5 +122,6 @@ def _thread_seconds(pid: int) -> dict[int, float]:
 
 def _median(costs: Sequence[Cost]) -> Cost:
     stages = {stage: median(c.stages_ms.get(stage, 0.0) for c in costs) for stage in costs[0].stages_ms}
-    numbers = (median(getattr(c, name) for c in costs) for name in ("cpu_ms", "ms", "busiest_ms", "peak_mib"))
-    return Cost(*numbers, stages)
+    names = "cpu_ms", "ms", "busiest_ms", "peak_mib"
+    cpu, ms, busiest, peak = (median(getattr(c, name) for c in costs) for name in names)
+    return Cost(cpu, ms, busiest, peak, stages)

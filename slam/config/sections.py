@@ -59,10 +59,10 @@ class DepthConfig(Section):
         default="network", description="network, onnx:FILE, or npy:FOLDER or png:FOLDER with one file a frame"
     )
     frame_stride: int = Field(
-        default=1,
+        default=2,
         ge=1,
-        description="depth is predicted at every n-th frame and where the camera has moved on, and carried to those "
-        "between; snippets touch where it is more than 1",
+        description="networks predict depth at every n-th frame and where the camera has moved on; it is carried to those "
+        "between, and snippets touch. With 1, and from files, every frame has its own",
     )
     kind: Literal["auto", "depth", "disparity"] = Field(
         default="auto",
@@ -89,6 +89,11 @@ class DepthConfig(Section):
         default="multiview",
         description="multiview: refine the keyframes' depth by neighbouring images at the optimised poses",
     )
+
+    @property
+    def predicted_stride(self) -> int:
+        """Frames between those whose depth is asked for: files have one for each."""
+        return 1 if self.source.startswith(("npy:", "png:")) else self.frame_stride
 
     @field_validator("source")
     @classmethod

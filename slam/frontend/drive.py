@@ -73,29 +73,32 @@ class Keyframe:
 
 
 class Examples:
-    """Chooses frames to keep whole for the report, evenly spread over a drive.
+    """Chooses frames to keep whole for the report, evenly spread over a drive: the first with depth from each place on.
 
-    Of a recording there are five, known before its first frame. Of a drive that grows, whose end nobody knows, every
-    frame of a stride is kept, and the stride doubles where more than eight would be.
+    Of a recording there are five places, known before its first frame. Of a drive that grows, whose end nobody knows,
+    there is one in every stride, and the stride doubles where more than eight would be kept.
     """
 
     def __init__(self, recording: range | None = None) -> None:
         """Choose among the frames of a recording; None is a drive that grows."""
         self._stride = 1
-        self._frames: frozenset[int] | None = None
+        self._places: list[int] | None = None
         if recording is not None:
             spread = np.linspace(recording.start, recording.stop - 1, _EXAMPLES + 2).round().astype(int)
-            self._frames = frozenset(spread[1:-1].tolist())
+            self._places = spread[1:-1].tolist() if recording else []
 
-    def __contains__(self, index: int) -> bool:
-        return index % self._stride == 0 if self._frames is None else index in self._frames
-
-    def keep(self, frame: Frame, depth: DepthMap, kept: list[tuple[int, Image, DepthMap]]) -> None:
-        """Add a chosen frame with its depth ``(H, W)`` to those that are kept."""
-        kept.append((frame.index, frame.image, depth))
-        if self._frames is None and len(kept) > _MOST_EXAMPLES:
+    def offer(self, frame: Frame, depth: DepthMap, kept: list[tuple[int, Image, DepthMap]]) -> None:
+        """Add the next frame with depth ``(H, W)`` to those that are kept, if it is chosen."""
+        last, index = kept[-1][0] if kept else -1, frame.index
+        if self._places is None:
+            is_chosen = index // self._stride > last // self._stride
+        else:
+            is_chosen = any(last < place <= index for place in self._places)
+        if is_chosen:
+            kept.append((index, frame.image, depth))
+        if self._places is None and len(kept) > _MOST_EXAMPLES:
             self._stride *= 2
-            kept[:] = [example for example in kept if example[0] in self]
+            kept[:] = kept[::2]
 
 
 @dataclass

@@ -43,7 +43,7 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    With ``depth.frame_stride`` depth is carried to the frames between by the measured motion, and snippets touch. While
+    With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets touch. While
     keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which touch.
     """
 
@@ -189,7 +189,7 @@ class Observer:
             self._snippet_frames = ()
 
     def _submit_networks(self, frame: Frame) -> PendingFrame:
-        sources, index, stride = self._predictor.sources, frame.index, self._config.depth.frame_stride
+        sources, index, stride = self._predictor.sources, frame.index, self._config.depth.predicted_stride
         is_first = len(self._snippet_frames) == sources  # since a gap
         self._snippet_frames = (*self._snippet_frames, frame)[-sources - 1 :]
         # what was measured two frames ago is finished, whatever else is
@@ -198,7 +198,7 @@ class Observer:
         far = step is not None and has_moved_on(self._drive, step, index + 1 - self._depth_index)
         is_seen = (index + sources // 2) % sources == 0 if by_keyframes else step is None or far or index % stride == 0
         depth = snippet = None
-        if is_seen or index in self._examples:
+        if is_seen or self._drive.repeated[-1:] == [index - 1]:  # what a frozen image hid is not carried
             self._depth_index = index
             depth = self._networks.submit(predicted_depth, self._predictor, frame)
         if len(self._snippet_frames) > sources and (is_first or is_dense or index % sources == 0):
@@ -260,8 +260,7 @@ class Observer:
         if loops.enabled and (not views or frame.index - views[-1].index >= loops.frame_stride):
             with self._stopwatch.stage("loops"):
                 views.append(self._features.view(frame, depth, height))
-        if frame.index in self._examples:
-            self._examples.keep(frame, depth, self._drive.examples)
+        self._examples.offer(frame, depth, self._drive.examples)
         self._keep(frame, depth)
 
     def _known(self, recent: RecentFrame) -> tuple[DepthMap, float | None]:

@@ -22,7 +22,6 @@ from slam.geometry.se3 import FloatArray
 # displacements that remain after the predicted flow are small
 _PREDICTED_LEVELS = 2
 _LIMITS = 30, 0.01  # most iterations, and the shift in pixels below which they end
-_LIMITS_BACK = 30, 0.1  # those of the check, whose bound is wider
 _CORNER_BLOCK_PX = 5
 _CORNER_QUALITY = 0.003  # least corner strength over that of the strongest corner
 _WIDE_WINDOW_PX = 31  # side of the window after most tracks were lost, pixels
@@ -147,12 +146,12 @@ class CornerTracker:
             tried = np.flatnonzero(~kept)
             if len(tried) == 0:
                 break
-            window = target.side, target.levels
-            forward, found = lucas_kanade(first, target.image, points[tried], *window, _LIMITS)
+            window = target.side, target.levels, _LIMITS
+            forward, found = lucas_kanade(first, target.image, points[tried], *window)
             tried, forward = tried[found], forward[found]
             if len(tried) == 0:
                 continue
-            backward, found_back = lucas_kanade(target.image, first, forward, *window, _LIMITS_BACK)
+            backward, found_back = lucas_kanade(target.image, first, forward, *window)
             error = np.abs(backward - points[tried]).max(axis=1)
             returned = found_back & (error < _FORWARD_BACKWARD_PX)
             pixels[tried[returned]], kept[tried[returned]] = target.in_current(forward[returned]), True

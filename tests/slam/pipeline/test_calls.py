@@ -22,8 +22,8 @@ from slam.simulation.street import SimulationOptions
 FRAMES = 60
 # calls over frames: a step measured by geometry, whose tracks all pass the first search at best
 MOST = {
-    "depth": 1.0,
-    "snippet": 1.0,
+    "depth": 0.6,
+    "snippet": 0.3,
     "calcOpticalFlowPyrLK": 6.0,
     "findEssentialMat": 0.5,
     "goodFeaturesToTrack": 1.1,

@@ -61,8 +61,8 @@ class DepthConfig(Section):
     frame_stride: int = Field(
         default=2,
         ge=1,
-        description="networks predict depth at every n-th frame and where the camera has moved on; it is carried to those "
-        "between, and snippets touch. With 1, and from files, every frame has its own",
+        description="networks predict depth at every n-th frame and where the camera has moved on; it is carried to "
+        "those between, and snippets touch. With 1, and from files, every frame has its own",
     )
     kind: Literal["auto", "depth", "disparity"] = Field(
         default="auto",

@@ -43,8 +43,9 @@ class Observer:
     relative rotations and keyframes are computed in a third. A task that depends on another waits for it, and its
     result is collected with the next frame, so results do not depend on the timing of threads.
 
-    With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets touch. While
-    keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which touch.
+    With ``depth.frame_stride`` above 1, depth is carried to the frames between by the measured motion, and snippets
+    touch. While keyframes alone measure the camera, depth is predicted for them and the targets of snippets, which
+    touch.
     """
 
     def __init__(

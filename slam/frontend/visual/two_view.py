@@ -32,7 +32,7 @@ from slam.geometry.se3 import FloatArray
 _ITERATIONS = 10
 # over-relaxation: reweighting alone converges by half of the distance an iteration
 _OVERSTEP = 1.4
-_CONVERGED = 0.02  # sigmas of the motion
+_CONVERGED = 3e-5  # radians: the least sigma of a rotation
 _LEAST_POINTS = 8
 _LEAST_PROPOSING_WEIGHT = 0.2
 _RESECTION_PX = 2.0
@@ -175,7 +175,7 @@ class TwoViewEstimator:
             normal[3:5, 3:5] += np.eye(2) / prior.axis_sigma**2
             gradient[3:5] += tangent.T @ deviation / prior.axis_sigma**2
             step = -_OVERSTEP * np.linalg.solve(normal, gradient)
-            if iteration == _ITERATIONS - 1 or step @ normal @ step < _CONVERGED**2:
+            if iteration == _ITERATIONS - 1 or np.abs(step[:5]).max() < _CONVERGED:
                 break
             direction = unit_pose.direction + tangent @ step[3:5]
             R_current_previous = Rotation.from_rotvec(step[:3]).as_matrix() @ unit_pose.R_current_previous

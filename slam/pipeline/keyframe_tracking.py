@@ -20,8 +20,6 @@ from slam.geometry.se3 import FloatArray, invert
 from slam.loops.relocalisation import Relocaliser
 from slam.pipeline.map_closure import views_of
 
-# a lost camera is looked for at every third frame
-_RELOCALISED_FRAMES = 3
 # looked back for the frame before, and keyframes that give the unit
 _FRAMES, _KEYFRAMES = 40, 20
 _LAST = 4  # number of the last steps, repeated frames and unusable frames that are checked
@@ -72,26 +70,22 @@ class KeyframeTracking:
         return None if self._odometry is None else self._odometry.state()
 
     def follow(self, frame: Frame) -> None:
-        """Track the next usable frame."""
-        if self._odometry is not None:
-            self._odometry.follow(frame)
-            if self._odometry.lost_map() is None:
-                self._places = None
+        """Track the next usable frame; a lost camera is looked for among the keyframes of its map."""
+        if self._odometry is None:
+            return
+        self._odometry.follow(frame)
+        lost = self._odometry.lost_map()
+        if lost is None:
+            self._places = None
+        elif self._loops.enabled:
+            self._relocalise(self._odometry, lost.map, frame)
 
     def learn(self, frame: Frame, depth: DepthMap) -> None:
         """Learned depth ``(H, W)`` of one of the last two frames."""
         if self._odometry is not None:
             self._odometry.learn(frame, depth)
 
-    def look_for_lost(self, frame: Frame, depth: DepthMap) -> None:
-        """Look for a lost camera in the last frame, of which depth ``(H, W)`` is known."""
-        if self._odometry is None:
-            return
-        lost = self._odometry.lost_map()
-        if lost is not None and self._loops.enabled and frame.index % _RELOCALISED_FRAMES == 0:
-            self._relocalise(self._odometry, lost.map, frame, depth)
-
-    def _relocalise(self, odometry: KeyframeOdometry, lost: LocalMap, frame: Frame, depth: DepthMap) -> None:
+    def _relocalise(self, odometry: KeyframeOdometry, lost: LocalMap, frame: Frame) -> None:
         """Look for the camera among all keyframes of the map in which it was lost."""
         if self._places is None:
             T_map_camera = invert(np.array([keyframe.T_camera_world for keyframe in lost.keyframes]))
@@ -105,7 +99,7 @@ class KeyframeTracking:
         tracks = np.array([lost.keyframes[keyframe].track_ids[corner] for keyframe, corner in seen])
         tracks, first = np.unique(tracks, return_index=True)
         place = lost.keyframes[found.nearest].index
-        odometry.relocalise(frame, depth, found.T_camera_map, tracks, corners[found.corners[first]], place)
+        odometry.relocalise(frame, found.T_camera_map, tracks, corners[found.corners[first]], place)
         self._places = None  # the new keyframe changes the map
 
     def choose(self, drive: Drive) -> None:

@@ -246,7 +246,6 @@ class Observer:
             with self._stopwatch.stage("depth network"):
                 depth = pending.depth.result()
             self._learn(frame, depth)
-            self._keyframes.look_for_lost(frame, depth)
         elif self._keyframes.is_keyframe(frame.index):
             late = self._networks.submit(predicted_depth, self._predictor, frame)
             self._tasks.append(PendingTask("depth network", late, partial(self._learn, frame)))

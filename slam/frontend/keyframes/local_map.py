@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
@@ -36,6 +37,7 @@ _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
+_LEAST_SIGHTINGS = 20  # of a keyframe that is adjusted
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
 
 
@@ -76,14 +78,19 @@ class TrackedKeyframe:
 
 @dataclass
 class LocalMap:
-    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated."""
+    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated.
+
+    ``guesses`` ``(N, 3)`` are points at the depth of their neighbours, by which a camera that turns is located while it
+    sees few others; they enter no adjustment.
+    """
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    guesses: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        return LocalMap(self.keyframes.copy(), self.points.copy())
+        return LocalMap(self.keyframes.copy(), self.points.copy(), self.guesses.copy())
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
@@ -92,7 +99,7 @@ class LocalMap:
     def new_tracks(self, count: int) -> TrackIds:
         """Identifiers of new tracks."""
         first = len(self.points)
-        self.points = np.vstack([self.points, np.full((count, 3), np.nan)])
+        self.points, self.guesses = (np.vstack([each, np.full((count, 3), np.nan)]) for each in (self.points, self.guesses))
         return np.arange(first, first + count)
 
     def add(self, keyframe: TrackedKeyframe) -> None:
@@ -104,6 +111,23 @@ class LocalMap:
     def forget_images(self) -> None:
         """Free the images of a map to which no keyframe will be added."""
         self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
+
+    def guess(self, intrinsics: Intrinsics) -> None:
+        """Guesses for the newest keyframe's tracks without a point, at the depth of the nearest corner with one."""
+        newest = self.keyframes[-1]
+        known = self.known(newest.track_ids)
+        depth = np.ones(len(known))
+        if known.any():
+            seen = apply(newest.T_camera_world, self.points[newest.track_ids[known]])[:, 2]
+            depth = seen[cKDTree(newest.pixels[known]).query(newest.pixels)[1]]
+        rays = intrinsics.rays(newest.pixels) * depth[:, None]
+        new = newest.track_ids[~known & np.isnan(self.guesses[newest.track_ids, 0])]
+        self.guesses[new] = apply(invert(newest.T_camera_world), rays)[np.searchsorted(newest.track_ids, new)]
+
+    def nearly(self, track_ids: TrackIds) -> FloatArray:
+        """Points of tracks ``(M, 3)``, guesses where they have none."""
+        points = self.points[track_ids]
+        return np.where(np.isfinite(points), points, self.guesses[track_ids])
 
     def triangulate(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
@@ -143,6 +167,7 @@ class LocalMap:
         sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
         free[: max(len(fixed), 1)] = False
+        free &= np.bincount(sightings.camera, minlength=len(chosen)) >= _LEAST_SIGHTINGS
         noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +37,10 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
+_REDUCED = 8  # an image over the reduced one that shows a turn
+_LEAST_RESPONSE = 0.03  # of a phase correlation
+_LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
+_FEW_POINTS = 60  # corners with points below which those with guesses help to locate a camera
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
@@ -74,6 +79,7 @@ class KeyframeOdometryState:
     T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
+    thumbnail: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
 
     def copy(self) -> KeyframeOdometryState:
@@ -118,7 +124,6 @@ class KeyframeOdometry:
     def relocalise(
         self,
         frame: Frame,
-        depth: DepthMap,
         T_camera_world: FloatArray,
         track_ids: TrackIds,
         pixels: Pixels,
@@ -128,7 +133,6 @@ class KeyframeOdometry:
 
         Args:
             frame: at the size of the intrinsics.
-            depth: its learned z-depth ``(H, W)``.
             T_camera_world: in the lost map.
             track_ids: of its points ``(M,)``, each once.
             pixels: where the frame sees them ``(M, 2)``.
@@ -145,15 +149,15 @@ class KeyframeOdometry:
         state.T_camera_world, state.T_last_step, state.lost = T_camera_world, np.eye(4), 0
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
-        segment.map.keyframes[-1] = segment.map.keyframes[-1].with_depth(depth)
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
+        shift = self._shift(frame)
         if not self._state.segments or self._state.lost > _MAX_LOST_FRAMES:
             self._begin(frame)
             return
         segment = self._state.segments[-1]
-        track_ids, pixels = self._track(segment, frame)
+        track_ids, pixels = self._track(segment, frame, shift)
         if segment.started:
             self._locate(segment, frame, track_ids, pixels)
         else:
@@ -187,13 +191,27 @@ class KeyframeOdometry:
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 
-    def _track(self, segment: MapSegment, frame: Frame) -> tuple[TrackIds, Pixels]:
-        """Corners of the last keyframe found in a frame; the others stay near their last places."""
+    def _shift(self, frame: Frame) -> Pixels:
+        """By how many pixels ``(2,)`` the image moved since the frame before, as a turning camera's does.
+
+        By the phase correlation of reduced images (Kuglin and Hines 1975); zero where they do not correlate.
+        """
+        height, width = frame.grey.shape
+        size = max(width // _REDUCED, 1), max(height // _REDUCED, 1)
+        before, now = self._state.thumbnail, cv2.resize(frame.grey, size, interpolation=cv2.INTER_AREA)
+        self._state.thumbnail = now = np.asarray(now, np.float32)
+        if before.shape != now.shape:
+            return np.zeros(2, np.float32)
+        shift, response = cv2.phaseCorrelate(before, now, cv2.createHanningWindow(size, cv2.CV_32F))
+        return np.float32(_REDUCED) * np.array(shift if response > _LEAST_RESPONSE else (0.0, 0.0), np.float32)
+
+    def _track(self, segment: MapSegment, frame: Frame, shift: Pixels) -> tuple[TrackIds, Pixels]:
+        """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a shift."""
         state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
         if keyframe.grey is None or not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-        guesses = state.places[rows]
+        guesses = state.places[rows] + (shift if np.hypot(*shift) > _LEAST_SHIFT_PX else np.float32(0))
         found, kept = flow(
             keyframe.grey,
             frame.grey,
@@ -209,7 +227,7 @@ class KeyframeOdometry:
         """The first points, once the parallax to the first keyframe gives them."""
         first, intrinsics = segment.map.keyframes[0], self._intrinsics
         if len(track_ids) < _LEAST_START_TRACKS:
-            self._begin(frame)
+            self._start_by_guesses(segment, frame, track_ids, pixels)
             return
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
         rows = np.searchsorted(first.track_ids, track_ids)
@@ -230,9 +248,26 @@ class KeyframeOdometry:
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
 
+    def _start_by_guesses(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
+        """Begin the map before there is parallax, because the camera turns away; a new map where that fails."""
+        self._state.T_camera_world = np.eye(4)
+        pose = self._resected(segment, track_ids, pixels)
+        if pose is None:
+            self._begin(frame)
+            return
+        segment.started = True
+        for before in self._state.segments[:-1]:
+            before.map.forget_images()
+        self._note(frame.index, "map begun", support=len(track_ids))
+        self._state.T_camera_world = pose.T_camera_world
+        self._add_keyframe(segment, frame, track_ids, pixels)
+        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
+        if known.sum() < _FEW_POINTS:
+            known = np.isfinite(segment.map.nearly(track_ids)[:, 0])
         pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
         if pose is None:
             state.lost += 1
@@ -256,7 +291,7 @@ class KeyframeOdometry:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points = segment.map.points[track_ids]
+        points = segment.map.nearly(track_ids)
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
@@ -293,6 +328,7 @@ class KeyframeOdometry:
             local.triangulate(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
+        local.guess(intrinsics)
         state.places = local.keyframes[-1].pixels.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
@@ -33,6 +35,8 @@ _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
 # a point that two keyframes do not find is hidden
 _ATTEMPTS = 2
+_NEAREST = 0.25  # depth of a point over its guess: nearer ones come from a wrong turn without a baseline
+_NEIGHBOURS = 8  # corners whose median depth is a guess
 _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
@@ -99,7 +103,9 @@ class LocalMap:
     def new_tracks(self, count: int) -> TrackIds:
         """Identifiers of new tracks."""
         first = len(self.points)
-        self.points, self.guesses = (np.vstack([each, np.full((count, 3), np.nan)]) for each in (self.points, self.guesses))
+        self.points, self.guesses = (
+            np.vstack([each, np.full((count, 3), np.nan)]) for each in (self.points, self.guesses)
+        )
         return np.arange(first, first + count)
 
     def add(self, keyframe: TrackedKeyframe) -> None:
@@ -113,16 +119,17 @@ class LocalMap:
         self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
 
     def guess(self, intrinsics: Intrinsics) -> None:
-        """Guesses for the newest keyframe's tracks without a point, at the depth of the nearest corner with one."""
+        """Guesses for the newest keyframe's tracks without any, at the depth of the corners around them."""
         newest = self.keyframes[-1]
-        known = self.known(newest.track_ids)
-        depth = np.ones(len(known))
-        if known.any():
-            seen = apply(newest.T_camera_world, self.points[newest.track_ids[known]])[:, 2]
-            depth = seen[cKDTree(newest.pixels[known]).query(newest.pixels)[1]]
-        rays = intrinsics.rays(newest.pixels) * depth[:, None]
-        new = newest.track_ids[~known & np.isnan(self.guesses[newest.track_ids, 0])]
-        self.guesses[new] = apply(invert(newest.T_camera_world), rays)[np.searchsorted(newest.track_ids, new)]
+        seen = apply(newest.T_camera_world, self.nearly(newest.track_ids))[:, 2]
+        known = np.isfinite(seen)
+        depth = np.ones(len(seen))
+        if known.sum() >= _NEIGHBOURS:
+            around = cKDTree(newest.pixels[known]).query(newest.pixels, _NEIGHBOURS)[1]
+            depth = np.median(seen[known][around], axis=1)
+        points = apply(invert(newest.T_camera_world), intrinsics.rays(newest.pixels) * depth[:, None])
+        new = np.isnan(self.guesses[newest.track_ids, 0])
+        self.guesses[newest.track_ids[new]] = points[new]
 
     def nearly(self, track_ids: TrackIds) -> FloatArray:
         """Points of tracks ``(M, 3)``, guesses where they have none."""
@@ -149,7 +156,8 @@ class LocalMap:
         error = np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)
         worst = np.zeros(len(track_ids))
         np.maximum.at(worst, row, error)
-        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)
+        depth, guess = (apply(newest.T_camera_world, each)[:, 2] for each in (X, self.guesses[track_ids]))
+        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & ~(depth < _NEAREST * guess)
         self.points[track_ids[good]] = X[good]
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
@@ -167,7 +175,9 @@ class LocalMap:
         sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
         free[: max(len(fixed), 1)] = False
-        free &= np.bincount(sightings.camera, minlength=len(chosen)) >= _LEAST_SIGHTINGS
+        free = anchored(sightings, free)
+        if not free.any():
+            return np.zeros(0, np.int64)
         noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
@@ -265,6 +275,24 @@ class LocalMap:
         near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
         order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
         return [kept[k] for k in near[order]]
+
+
+def anchored(sightings: Sightings, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the free cameras ``(K,)`` can be adjusted.
+
+    After a turn without parallax two parts of a map share no points. Of a part without a fixed camera the first two
+    stay, because nothing else tells where it is and how large.
+    """
+    shape = len(free), int(sightings.point.max(initial=-1)) + 1
+    seen = csr_array((np.ones(len(sightings)), (sightings.camera, sightings.point)), shape=shape)
+    shared = (seen @ seen.T).toarray()
+    count, parts = connected_components(shared >= _LEAST_SIGHTINGS, directed=False)
+    free = free & (np.diag(shared) >= _LEAST_SIGHTINGS)
+    for part in range(count):
+        members = np.flatnonzero(parts == part)
+        if free[members].all():
+            free[members[:2]] = False
+    return free
 
 
 def _matched(

@@ -11,7 +11,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +18,7 @@ from slam.config.sections import KeyframesConfig
 from slam.frames import DepthMap, Event, Frame, Intrinsics, TrackingEvent
 from slam.frontend.keyframes.camera_pose import INLIER_PX, MIN_POINTS, CameraPose, resect
 from slam.frontend.keyframes.descriptors import describe
-from slam.frontend.keyframes.flow import flow, new_corners
+from slam.frontend.keyframes.flow import Thumbnail, flow, image_shift, new_corners
 from slam.frontend.keyframes.initialisation import View, first_points
 from slam.frontend.keyframes.local_map import LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.sparse_flow import Pixels
@@ -37,9 +36,6 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
-_REDUCED = 8  # an image over the reduced one that shows a turn
-_LEAST_RESPONSE = 0.03  # of a phase correlation
-_LEAST_SHIFT_PX = 16.0  # smaller ones flow finds by itself
 _FEW_POINTS = 60  # corners with points below which those with guesses help to locate a camera
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
@@ -79,7 +75,7 @@ class KeyframeOdometryState:
     T_camera_world: FloatArray = field(default_factory=lambda: np.eye(4))
     T_last_step: FloatArray = field(default_factory=lambda: np.eye(4))
     lost: int = 0
-    thumbnail: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    thumbnail: Thumbnail = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     events: list[TrackingEvent] = field(default_factory=list)
 
     def copy(self) -> KeyframeOdometryState:
@@ -152,7 +148,7 @@ class KeyframeOdometry:
 
     def follow(self, frame: Frame) -> None:
         """Track and resect the next usable frame; make it a keyframe where that is wanted."""
-        shift = self._shift(frame)
+        shift, self._state.thumbnail = image_shift(self._state.thumbnail, frame.grey)
         if not self._state.segments or self._state.lost > _MAX_LOST_FRAMES:
             self._begin(frame)
             return
@@ -191,27 +187,13 @@ class KeyframeOdometry:
         state.T_camera_world, state.T_last_step, state.lost = np.eye(4), np.eye(4), 0
         self._add_keyframe(state.segments[-1], frame, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
 
-    def _shift(self, frame: Frame) -> Pixels:
-        """By how many pixels ``(2,)`` the image moved since the frame before, as a turning camera's does.
-
-        By the phase correlation of reduced images (Kuglin and Hines 1975); zero where they do not correlate.
-        """
-        height, width = frame.grey.shape
-        size = max(width // _REDUCED, 1), max(height // _REDUCED, 1)
-        before, now = self._state.thumbnail, cv2.resize(frame.grey, size, interpolation=cv2.INTER_AREA)
-        self._state.thumbnail = now = np.asarray(now, np.float32)
-        if before.shape != now.shape:
-            return np.zeros(2, np.float32)
-        shift, response = cv2.phaseCorrelate(before, now, cv2.createHanningWindow(size, cv2.CV_32F))
-        return np.float32(_REDUCED) * np.array(shift if response > _LEAST_RESPONSE else (0.0, 0.0), np.float32)
-
     def _track(self, segment: MapSegment, frame: Frame, shift: Pixels) -> tuple[TrackIds, Pixels]:
         """Corners of the last keyframe found in a frame; the others stay near their last places, moved by a shift."""
         state, keyframe = self._state, segment.map.keyframes[-1]
         rows = np.flatnonzero(~state.slipped)
         if keyframe.grey is None or not len(rows):
             return np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
-        guesses = state.places[rows] + (shift if np.hypot(*shift) > _LEAST_SHIFT_PX else np.float32(0))
+        guesses = state.places[rows] + shift
         found, kept = flow(
             keyframe.grey,
             frame.grey,
@@ -240,13 +222,8 @@ class KeyframeOdometry:
         if found is None:
             return
         segment.map.points[track_ids[found.solid]] = found.points[found.solid]
-        segment.started = True
-        for before in self._state.segments[:-1]:
-            before.map.forget_images()
-        self._note(frame.index, "map begun", support=int(found.solid.sum()))
-        self._state.T_camera_world = found.T_current_first
-        self._add_keyframe(segment, frame, track_ids, pixels)
-        segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
+        segment.frames.pop()
+        self._started(segment, frame, track_ids, pixels, found.T_current_first)
 
     def _start_by_guesses(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """Begin the map before there is parallax, because the camera turns away; a new map where that fails."""
@@ -254,12 +231,19 @@ class KeyframeOdometry:
         pose = self._resected(segment, track_ids, pixels)
         if pose is None:
             self._begin(frame)
-            return
+        else:
+            self._started(segment, frame, track_ids, pixels, pose.T_camera_world)
+
+    def _started(
+        self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, T_camera_world: FloatArray
+    ) -> None:
+        """The map has points; this frame is its second keyframe."""
         segment.started = True
         for before in self._state.segments[:-1]:
             before.map.forget_images()
-        self._note(frame.index, "map begun", support=len(track_ids))
-        self._state.T_camera_world = pose.T_camera_world
+        known = int(segment.map.known(track_ids).sum())
+        self._note(frame.index, "map begun", support=known or len(track_ids))
+        self._state.T_camera_world = T_camera_world
         self._add_keyframe(segment, frame, track_ids, pixels)
         segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
 

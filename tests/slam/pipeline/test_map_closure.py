@@ -121,7 +121,6 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
         frame = room.frame(k, T, seeds[k])
         tracking.follow(frame)
         tracking.learn(frame, room.depth_map(T))
-        tracking.look_for_lost(frame, room.depth_map(T))
     state = tracking.state()
     assert state is not None
     _, lost, found = state.events
@@ -139,7 +138,7 @@ def test_after_a_short_loss_the_camera_is_found_again_in_its_map() -> None:
 @pytest.mark.parametrize(
     ("places", "unseen", "sparse", "relocalised"),
     [
-        ([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 69]),
+        ([*range(60), *range(82, 89), *range(35, 38)], range(60, 66), (), [66, 67]),
         ([*range(61), 68, 60, 8], (60, 62), (61,), [63]),
     ],
     ids=["relocalised before", "located in a frame without depth before"],
@@ -159,7 +158,6 @@ def test_a_camera_that_is_lost_again_at_once_is_found_in_the_map_as_it_then_is(
             tracking.follow(frame)
             if k not in sparse:
                 tracking.learn(frame, depth)
-                tracking.look_for_lost(frame, depth)
         resumed = KeyframeTracking(config, CONFIG.loops, room.INTRINSICS, 0, resumed.state())
     assert [each.frame for each in going_on.events if each.event == "relocalised"] == relocalised
     assert going_on.events == resumed.events

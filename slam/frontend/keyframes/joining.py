@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.frames import Intrinsics
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise
-from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds, anchored
+from slam.frontend.keyframes.local_map import OUTLIER_PX, LocalMap, TrackedKeyframe, TrackIds
 from slam.frontend.keyframes.odometry import MapSegment, TrackedFrame
 from slam.geometry.se3 import FloatArray, apply, invert
 
@@ -147,7 +147,7 @@ def _adjust_all(local: LocalMap, intrinsics: Intrinsics) -> None:
     noise = Noise()
     for limit in _OUTLIER_LIMITS:
         sightings, track_ids = local.sightings(range(len(local.keyframes)), np.isfinite(local.points[:, 0]))
-        free = anchored(sightings, np.arange(len(local.keyframes)) > 0)
+        free = np.arange(len(local.keyframes)) > 0
         poses = np.array([keyframe.T_camera_world for keyframe in local.keyframes])
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         solved = problem.solve(poses, local.points[track_ids], _ITERATIONS)

@@ -8,9 +8,6 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from slam.frames import DepthMap, Grey, Intrinsics, nearest_depth
 from slam.frontend.keyframes.bundle_adjustment import BundleAdjustment, Noise, Sightings
@@ -35,13 +32,10 @@ _PROJECTED_PX = 4.0
 _ALIGNED_KEYFRAMES = 4
 # a point that two keyframes do not find is hidden
 _ATTEMPTS = 2
-_NEAREST = 0.25  # depth of a point over its guess: nearer ones come from a wrong turn without a baseline
-_NEIGHBOURS = 8  # corners whose median depth is a guess
 _MIN_ANGLE_DEG = 0.6  # least angle between rays of a point, degrees
 _ITERATIONS = 12  # most iterations of a bundle adjustment
 _TOLERANCE = 1e-3  # relative fall of the cost at which it ends: each keyframe is adjusted ten times
 OUTLIER_PX = 5.0  # residual of a sighting that is taken out, pixels
-_LEAST_SIGHTINGS = 20  # of a keyframe that is adjusted
 _ADJUSTED = 10  # number of the last keyframes that are adjusted
 
 
@@ -82,19 +76,14 @@ class TrackedKeyframe:
 
 @dataclass
 class LocalMap:
-    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated.
-
-    ``guesses`` ``(N, 3)`` are points at the depth of their neighbours, by which a camera that turns is located while it
-    sees few others; they enter no adjustment.
-    """
+    """``keyframes`` in time order and ``points`` ``(N, 3)`` in the world by track, NaN where not triangulated."""
 
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    guesses: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def copy(self) -> LocalMap:
         """A snapshot, which stays while this map grows."""
-        return LocalMap(self.keyframes.copy(), self.points.copy(), self.guesses.copy())
+        return LocalMap(self.keyframes.copy(), self.points.copy())
 
     def known(self, track_ids: TrackIds) -> NDArray[np.bool_]:
         """Which tracks have a point ``(M,)``."""
@@ -103,9 +92,7 @@ class LocalMap:
     def new_tracks(self, count: int) -> TrackIds:
         """Identifiers of new tracks."""
         first = len(self.points)
-        self.points, self.guesses = (
-            np.vstack([each, np.full((count, 3), np.nan)]) for each in (self.points, self.guesses)
-        )
+        self.points = np.vstack([self.points, np.full((count, 3), np.nan)])
         return np.arange(first, first + count)
 
     def add(self, keyframe: TrackedKeyframe) -> None:
@@ -117,24 +104,6 @@ class LocalMap:
     def forget_images(self) -> None:
         """Free the images of a map to which no keyframe will be added."""
         self.keyframes = [replace(keyframe, grey=None) for keyframe in self.keyframes]
-
-    def guess(self, intrinsics: Intrinsics) -> None:
-        """Guesses for the newest keyframe's tracks without any, at the depth of the corners around them."""
-        newest = self.keyframes[-1]
-        seen = apply(newest.T_camera_world, self.nearly(newest.track_ids))[:, 2]
-        known = np.isfinite(seen)
-        depth = np.ones(len(seen))
-        if known.sum() >= _NEIGHBOURS:
-            around = cKDTree(newest.pixels[known]).query(newest.pixels, _NEIGHBOURS)[1]
-            depth = np.median(seen[known][around], axis=1)
-        points = apply(invert(newest.T_camera_world), intrinsics.rays(newest.pixels) * depth[:, None])
-        new = np.isnan(self.guesses[newest.track_ids, 0])
-        self.guesses[newest.track_ids[new]] = points[new]
-
-    def nearly(self, track_ids: TrackIds) -> FloatArray:
-        """Points of tracks ``(M, 3)``, guesses where they have none."""
-        points = self.points[track_ids]
-        return np.where(np.isfinite(points), points, self.guesses[track_ids])
 
     def triangulate(self, intrinsics: Intrinsics) -> None:
         """Points of the newest keyframe's tracks that have none, where the angle and the residuals allow one."""
@@ -156,8 +125,7 @@ class LocalMap:
         error = np.where(in_front, np.linalg.norm(offset, axis=1), np.inf)
         worst = np.zeros(len(track_ids))
         np.maximum.at(worst, row, error)
-        depth, guess = (apply(newest.T_camera_world, each)[:, 2] for each in (X, self.guesses[track_ids]))
-        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX) & ~(depth < _NEAREST * guess)
+        good = (angle > np.deg2rad(_MIN_ANGLE_DEG)) & (worst < OUTLIER_PX)
         self.points[track_ids[good]] = X[good]
 
     def adjust(self, intrinsics: Intrinsics) -> TrackIds:
@@ -175,9 +143,6 @@ class LocalMap:
         sightings, track_ids = self.sightings(chosen, seen)
         free = np.ones(len(chosen), np.bool_)
         free[: max(len(fixed), 1)] = False
-        free = anchored(sightings, free)
-        if not free.any():
-            return np.zeros(0, np.int64)
         noise = Noise()
         problem = BundleAdjustment(sightings, intrinsics, free, noise)
         poses = np.array([self.keyframes[k].T_camera_world for k in chosen])
@@ -275,24 +240,6 @@ class LocalMap:
         near = np.flatnonzero((distance < _NEAR_DEPTHS) & (cosine > _NEAR_COSINE))
         order = np.argsort((distance + 2.0 * (1.0 - cosine))[near], kind="stable")
         return [kept[k] for k in near[order]]
-
-
-def anchored(sightings: Sightings, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the free cameras ``(K,)`` can be adjusted.
-
-    After a turn without parallax two parts of a map share no points. Of a part without a fixed camera the first two
-    stay, because nothing else tells where it is and how large.
-    """
-    shape = len(free), int(sightings.point.max(initial=-1)) + 1
-    seen = csr_array((np.ones(len(sightings)), (sightings.camera, sightings.point)), shape=shape)
-    shared = (seen @ seen.T).toarray()
-    count, parts = connected_components(shared >= _LEAST_SIGHTINGS, directed=False)
-    free = free & (np.diag(shared) >= _LEAST_SIGHTINGS)
-    for part in range(count):
-        members = np.flatnonzero(parts == part)
-        if free[members].all():
-            free[members[:2]] = False
-    return free
 
 
 def _matched(

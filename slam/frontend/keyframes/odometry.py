@@ -36,7 +36,6 @@ _PYRAMID_LEVELS = 3  # image pyramid levels above the full image
 _START_PARALLAX_RATIO = 0.0125  # least median parallax of the first two keyframes, over the image width
 _KEYFRAME_TRACKS_RATIO = 0.35  # ratio of a keyframe's corners still tracked that asks for another
 _MAX_LOST_FRAMES = 10  # frames without a pose after which a new map is begun
-_FEW_POINTS = 60  # corners with points below which those with guesses help to locate a camera
 _LAST_FRAMES = 4  # frames in which a pose is looked up
 _KEYFRAME_PARALLAX_RATIO = 0.03  # median parallax that asks for a keyframe, over the image width
 
@@ -209,7 +208,7 @@ class KeyframeOdometry:
         """The first points, once the parallax to the first keyframe gives them."""
         first, intrinsics = segment.map.keyframes[0], self._intrinsics
         if len(track_ids) < _LEAST_START_TRACKS:
-            self._start_by_guesses(segment, frame, track_ids, pixels)
+            self._begin(frame)
             return
         segment.frames.append(TrackedFrame(frame.index, track_ids, pixels, None, 0))
         rows = np.searchsorted(first.track_ids, track_ids)
@@ -222,36 +221,17 @@ class KeyframeOdometry:
         if found is None:
             return
         segment.map.points[track_ids[found.solid]] = found.points[found.solid]
-        segment.frames.pop()
-        self._started(segment, frame, track_ids, pixels, found.T_current_first)
-
-    def _start_by_guesses(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
-        """Begin the map before there is parallax, because the camera turns away; a new map where that fails."""
-        self._state.T_camera_world = np.eye(4)
-        pose = self._resected(segment, track_ids, pixels)
-        if pose is None:
-            self._begin(frame)
-        else:
-            self._started(segment, frame, track_ids, pixels, pose.T_camera_world)
-
-    def _started(
-        self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels, T_camera_world: FloatArray
-    ) -> None:
-        """The map has points; this frame is its second keyframe."""
         segment.started = True
         for before in self._state.segments[:-1]:
             before.map.forget_images()
-        known = int(segment.map.known(track_ids).sum())
-        self._note(frame.index, "map begun", support=known or len(track_ids))
-        self._state.T_camera_world = T_camera_world
+        self._note(frame.index, "map begun", support=int(found.solid.sum()))
+        self._state.T_camera_world = found.T_current_first
         self._add_keyframe(segment, frame, track_ids, pixels)
-        segment.frames.append(self._tracked(segment, frame, track_ids, pixels))
+        segment.frames[-1] = self._tracked(segment, frame, track_ids, pixels)
 
     def _locate(self, segment: MapSegment, frame: Frame, track_ids: TrackIds, pixels: Pixels) -> None:
         """The camera's pose from known points."""
         state, known = self._state, segment.map.known(track_ids)
-        if known.sum() < _FEW_POINTS:
-            known = np.isfinite(segment.map.nearly(track_ids)[:, 0])
         pose = self._resected(segment, track_ids[known], pixels[known]) if known.any() else None
         if pose is None:
             state.lost += 1
@@ -275,7 +255,7 @@ class KeyframeOdometry:
             return None
         T_last = self._state.T_camera_world
         guesses = T_last, self._state.T_last_step @ T_last
-        points = segment.map.nearly(track_ids)
+        points = segment.map.points[track_ids]
         pose = resect(guesses, points, pixels.astype(np.float64), self._intrinsics, self._seed)
         return pose if (pose.residual_px < INLIER_PX).sum() >= MIN_POINTS else None
 
@@ -312,7 +292,6 @@ class KeyframeOdometry:
             local.triangulate(intrinsics)
             local.keyframes[-1] = local.keyframes[-1].without(local.adjust(intrinsics))
             state.T_camera_world = local.keyframes[-1].T_camera_world
-        local.guess(intrinsics)
         state.places = local.keyframes[-1].pixels.astype(np.float32)
         state.slipped = np.zeros(len(state.places), np.bool_)
 

@@ -96,8 +96,8 @@ def _segment_poses(segment: MapSegment, intrinsics: Intrinsics, seed: int) -> li
         pixels = frame.pixels.astype(np.float64)
         guess = T_guess if frame.T_camera_world is None else frame.T_camera_world
         located = _seen_from(local, frame.track_ids, pixels, guess, intrinsics, seed)
-        if located is not None or frame.T_camera_world is not None:
-            T_guess, sigmas = (guess, None) if located is None else located
+        if located is not None:
+            T_guess, sigmas = located
             nearest = max((k for k in keyframes if k.index < frame.index), key=lambda k: k.index)
             found.append(_relative(nearest, frame.index, T_guess, sigmas))
     return found

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_extra
+from slam.runtime.progress import Progress, ProgressLines
 from slam.runtime.storage.files import from_anywhere
 from slam.runtime.storage.record import MISSING, Missing
 from slam.sequences.catalogue import open_sequence
@@ -59,7 +62,13 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
         TypeError: an unknown argument.
         SlamError, ErfsfmError: as `perform`.
     """
-    return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
+    request = RunRequest.of(dataset=dataset, sequence=sequence, **options)
+    return perform(request if request.progress else replace(request, progress=logged_progress()))
+
+
+def logged_progress(clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Progress as a line of the log every ten seconds (level INFO)."""
+    return ProgressLines(lambda line: logger.info("%s", line), clock)
 
 
 def perform(request: RunRequest) -> RunFolder:

@@ -16,6 +16,7 @@ from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
 from erfsfm.common import command_line
+from erfsfm.common.progress import progress_bar
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,8 @@ def train(
         changes.append(f"training.seed={seed}")
     experiment = load_experiment(config, changes).with_roots(dataset or [])
     command = shlex.join(["erfsfm", *sys.argv[1:]])
-    folder = run_training(experiment, output, resume, device, command, quiet=not sys.stderr.isatty())
+    with progress_bar() as progress:
+        folder = run_training(experiment, output, resume, device, command, progress)
     typer.echo(f"weights in {folder}: use them with --weights {folder}")
 
 
@@ -94,7 +96,8 @@ def pack(
     from erfsfm.training.pack import pack as run_packing
 
     experiment = load_experiment(config, list(overrides or [])).with_roots(dataset or [])
-    done = run_packing(experiment, output, shard_megabytes, quality, quiet=not sys.stderr.isatty())
+    with progress_bar() as progress:
+        done = run_packing(experiment, output, shard_megabytes, quality, progress)
     typer.echo(
         f"{done.size / 1e6:.1f} MB in {output}: {done.shards} shards with {done.frames} frames and {done.labels} labels"
     )

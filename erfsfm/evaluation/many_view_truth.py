@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
-from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher, Progress
+from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import PoseDepthNetworks, named_recordings, refuse_leak

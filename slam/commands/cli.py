@@ -13,6 +13,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.common import command_line
+from erfsfm.common.progress import progress_bar
 from slam.commands.batch.cli import verbs as batch_verbs
 from slam.commands.calibration.cli import verbs as calibration_verbs
 from slam.commands.downloads.cli import verbs as download_verbs
@@ -22,7 +23,6 @@ from slam.commands.live.cli import verbs as live_verbs
 from slam.commands.localisation.cli import verbs as localisation_verbs
 from slam.commands.options import Json, Seed, UnusedDevice, options_of
 from slam.commands.run.request import RunRequest
-from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from erfsfm.common.progress import Progress
 from slam.commands.batch.cluster import Spread
 from slam.commands.batch.manifest import Drive
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.runtime.progress import Progress
 
 Status = Literal["whole", "kept", "failed"]
 _POLL_S = 0.5

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import UnusedDevice, UnusedSeed
-from slam.runtime.progress import progress_bar
 
 verbs = typer.Typer()
 
@@ -49,7 +49,9 @@ def export(
     options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
     folder = RunFolder.open(run)
     with progress_bar() as progress:
+        progress(f"export of {what}", 0, 1)
         written = export_run(folder, what, output, up, options, progress)
+        progress(f"export of {what}", 1, 1)
     typer.echo(f"{what} of {run} in {written}")
     for note in folder.metrics().unit_notes():
         typer.echo(note)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.progress import Progress
 from slam.commands.exports.raster import write_png
 from slam.formats.ply import Ply, write_ply
 from slam.formats.trajectory import Trajectory, nearest_stamps
@@ -20,7 +21,6 @@ from slam.geometry.se3 import FloatArray
 from slam.loops.places import Places
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.progress import Progress
 from slam.runtime.run_files import PLACES
 from slam.runtime.storage.files import remove
 from slam.runtime.storage.record import Missing, known
@@ -42,7 +42,7 @@ def write_scene(
     trajectory: Trajectory,
     cloud: Ply | None,
     dataset: Path | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> None:
     """Write ``images/``, ``points.ply`` and, last, ``transforms.json``.
 
@@ -63,8 +63,7 @@ def write_scene(
     poses: dict[str, FloatArray] = {}
     left_out = interpolated(folder)
     for k, row in enumerate(rows):
-        if progress is not None:
-            progress("images", k + 1, len(rows))
+        progress("images", k + 1, len(rows))
         if row is None or k in left_out:
             continue
         try:

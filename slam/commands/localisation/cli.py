@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import Json, UnusedDevice, UnusedSeed
-from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 
 verbs = typer.Typer()

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from erfsfm.common.progress import Progress
 from slam.commands.options import LARGEST_SEED, Config, Device, Output, Overrides, Weights
 from slam.runtime.errors import RunError
-from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
 
 if TYPE_CHECKING:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
 from erfsfm.common.lock import FolderLock
+from erfsfm.common.progress import progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
 from slam.commands.run.continuation import (
@@ -37,7 +36,6 @@ from slam.results.output_folder import check_output, whole_place
 from slam.results.run_log import run_log
 from slam.runtime.errors import RunError
 from slam.runtime.imports import import_extra
-from slam.runtime.progress import Progress, ProgressLines
 from slam.runtime.storage.files import from_anywhere
 from slam.runtime.storage.record import MISSING, Missing
 from slam.sequences.catalogue import open_sequence
@@ -49,6 +47,8 @@ logger = logging.getLogger(__name__)
 
 def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
     """Run the whole system on one sequence.
+
+    Without ``progress``, the log says every ten seconds (level INFO) what is done.
 
     Args:
         dataset: as in `RunRequest`.
@@ -63,12 +63,10 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
         SlamError, ErfsfmError: as `perform`.
     """
     request = RunRequest.of(dataset=dataset, sequence=sequence, **options)
-    return perform(request if request.progress else replace(request, progress=logged_progress()))
-
-
-def logged_progress(clock: Callable[[], float] = time.monotonic) -> Progress:
-    """Progress as a line of the log every ten seconds (level INFO)."""
-    return ProgressLines(lambda line: logger.info("%s", line), clock)
+    if request.progress is not None:
+        return perform(request)
+    with progress_lines(logger.info) as progress:
+        return perform(replace(request, progress=progress))
 
 
 def perform(request: RunRequest) -> RunFolder:
@@ -144,11 +142,11 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
         )
     predictor = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     rest = checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
-    pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
     settings = _settings_from_anywhere(settings)
-    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress)
+    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress or silent)
 
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:

@@ -24,6 +24,7 @@ class Recording(Record):
     gps: Known[str] = MISSING
     sequence: Known[str] = MISSING
     frames: Known[str] = MISSING
+    truth: Known[str] = MISSING
 
 
 class Provenance(Record):

@@ -17,6 +17,7 @@ from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.ros import loader as ros
+from slam.sequences.truth import take_truth
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
@@ -54,6 +55,7 @@ def open_sequence(
     name: str | None = None,
     camera: Path | None = None,
     frames: str | None = None,
+    truth: Path | None = None,
 ) -> Sequence:
     """Open a sequence of any kind.
 
@@ -64,6 +66,7 @@ def open_sequence(
         name: which sequence of ``dataset``; optional where there is one only.
         camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
+        truth: its true poses, in place of those that the data set has.
 
     Returns:
         The sequence, or the ``Excerpt`` of it.
@@ -72,12 +75,15 @@ def open_sequence(
         SequenceError: one line on what was searched, where, what was found and what to do.
     """
     if dataset is None and name is None:
-        if camera is not None:
-            raise SequenceError(f"a camera file ({camera}) without a data set: give --dataset as well")
+        for what, given in (("a camera file", camera), ("a file of true poses", truth)):
+            if given is not None:
+                raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
         sequence = _open_embedded()
     else:
         root = _root(dataset, name)
         sequence = _choose(root, Asked(name, camera))
+    if truth is not None:
+        take_truth(sequence, truth)
     if frames is None:
         return sequence
     return Excerpt(sequence, *frame_range(frames, len(sequence)))

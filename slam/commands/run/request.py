@@ -16,7 +16,7 @@ from slam.runtime.storage.files import from_anywhere
 if TYPE_CHECKING:
     from slam.results.metrics import Provenance, Recording
 
-_RECORDING = ("dataset", "camera", "gps", "sequence", "frames")
+_RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 _TEXTS = ("weights", "config")  # names, or paths
 
 
@@ -45,6 +45,9 @@ class RunRequest:
     config: Config = None
     overrides: Overrides = None
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None
+    truth: Annotated[Path | None, typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)")] = (
+        None
+    )
     output: Output = None
     cache: Annotated[
         Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")

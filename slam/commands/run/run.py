@@ -121,7 +121,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)
-    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
+    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording

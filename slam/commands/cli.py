@@ -120,7 +120,9 @@ def config() -> None:
 @app.command()
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", "--calibration", help="camera.yaml of the data set, or fov=70")
+    ] = None,
 ) -> None:
     """Check the installation. Missing parts come with what to do, and exit code 1.
 

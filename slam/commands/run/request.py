@@ -39,7 +39,8 @@ class RunRequest:
         typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
     ] = None
     camera: Annotated[
-        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+        Path | None,
+        typer.Option("--camera", "--calibration", help="camera.yaml, or fov=70: the horizontal field of view, degrees"),
     ] = None
     weights: Weights = "default"
     config: Config = None

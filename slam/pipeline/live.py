@@ -138,7 +138,7 @@ class Slam:
 
     @property
     def unit_name(self) -> str | None:
-        """Of the lengths of `trajectory`: ``m``, ``camera heights`` or ``the networks' own unit``.
+        """Of the lengths of `trajectory`: ``m``, ``camera heights``, ``no metric unit`` or ``the networks' own unit``.
 
         None before the first snippet and, where metres are wanted, until a road is seen: lengths are the networks' own
         up to then.

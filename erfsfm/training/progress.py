@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from typing import Any
 
 import lightning
@@ -9,14 +11,28 @@ from lightning.pytorch.callbacks import Callback
 
 from erfsfm.common.progress import Progress
 
+logger = logging.getLogger(__name__)
+
+_TIMED_STEPS = 20
+
 
 class StepProgress(Callback):
-    """Tells of the steps of the whole run, also after a resume, and of the loss of the latest."""
+    """Tells of all steps, also after a resume, and of the loss of the latest; logs what a step takes."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
+        self._began: tuple[int, float] | None = None
+
+    def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Tell that the steps begin."""
+        self._progress("steps", trainer.global_step, trainer.max_steps)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Tell of a step; reading the loss waits for the device."""
         loss = float(trainer.callback_metrics["loss"])
-        self._progress(f"steps, loss {loss:.4g}", trainer.global_step, trainer.max_steps)
+        step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
+        first, began_s = self._began = self._began or (step, now_s)
+        if step - first == min(_TIMED_STEPS, steps - first) > 0:
+            took_s = (now_s - began_s) / (step - first)
+            logger.info("a step takes %.2g s, all %d steps take %.2g min", took_s, steps, steps * took_s / 60)
+        self._progress(f"steps, loss {loss:.4g}", step, steps)

@@ -28,7 +28,7 @@ def progress_bar() -> Iterator[Progress]:
         with _bars() as update:
             yield update
     else:
-        with progress_lines(lambda line: print(line, file=sys.stderr, flush=True)) as update:  # noqa: T201
+        with progress_lines(lambda line: sys.stderr.write(f"{line}\n")) as update:
             yield update
 
 

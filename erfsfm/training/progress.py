@@ -25,10 +25,13 @@ class StepProgress(Callback):
 
     def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Tell that the steps begin."""
-        self._progress("steps", trainer.global_step, trainer.max_steps)
+        if trainer.is_global_zero:
+            self._progress("steps", trainer.global_step, trainer.max_steps)
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
         """Tell of a step; reading the loss waits for the device."""
+        if not trainer.is_global_zero:
+            return
         loss = float(trainer.callback_metrics["loss"])
         step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
         first, began_s = self._began = self._began or (step, now_s)

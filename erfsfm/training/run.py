@@ -81,7 +81,6 @@ def train(
     _require_devices(config.training.devices, device)
     folder = OutputFolder(output)
     rank = rank_of(config.training)
-    progress = progress if rank == 0 else silent
     done_steps = folder.resumable_steps(config) if resume else 0
     if rank == 0 and not resume:  # the first process has written there before it starts the others
         folder.require_free()
@@ -161,7 +160,7 @@ def _draws(
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / "teacher"
     _, measured = by_label(training, config.data)
-    many_views = measured_views(measured, config, folder, progress)
+    many_views = measured_views(measured, config, folder, progress if rank == 0 else silent)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 

@@ -17,7 +17,6 @@ from erfsfm.common.readers.folder import image_folder
 from erfsfm.common.readers.images import list_images, read_image
 from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.threads import take_working_memory
-from slam.commands.localisation.structure import PlaceStructure
 from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
 from slam.frontend.keyframes.camera_pose import CameraPose, resect
@@ -26,6 +25,7 @@ from slam.geometry.se3 import FloatArray, apply, invert, make
 from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
+from slam.loops.structure import PlaceStructure
 from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
 from slam.loops.verification import matches
 from slam.results.folder import RunFolder

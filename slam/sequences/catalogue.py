@@ -12,6 +12,7 @@ from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
+from slam.runtime.imports import import_plug_in, plug_ins
 from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
@@ -24,7 +25,9 @@ KITTI_NAME = "KITTI"
 EMBEDDED_SEED = 1000
 EMBEDDED_FRAMES = 320
 
-# the first that recognises a path opens it
+PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names a `Loader`
+
+# the first that recognises a path opens it; loaders of other packages come before these
 LOADERS: tuple[Loader, ...] = (
     odometry.LOADER,
     raw.LOADER,
@@ -144,8 +147,12 @@ def _contents(root: Path, asked: Asked) -> dict[str, Found]:
     return found
 
 
+def _loaders() -> tuple[Loader, ...]:
+    return (*map(import_plug_in, plug_ins(PLUG_INS).values()), *LOADERS)
+
+
 def _recognised(root: Path, asked: Asked) -> dict[str, Found]:
-    for loader in LOADERS:
+    for loader in _loaders():
         openers = loader.find(root, asked)
         if openers:
             return {name: Found(loader.kind, opener) for name, opener in openers.items()}
@@ -184,7 +191,7 @@ def _unknown(root: Path) -> str:
             f"no sequence with images under {kitti.sequences}: looked for png or jpg in */image_2, image_3, "
             f"image_0, image_1; found {_listed(kitti.sequences)}; unpack the images there"
         )
-    looked = ", ".join(f"{loader.layout} ({loader.kind})" for loader in LOADERS)
+    looked = ", ".join(f"{loader.layout} ({loader.kind})" for loader in _loaders())
     return f"{root} is no data set: looked for {looked}; found {_listed(root)}; check the path"
 
 

@@ -30,7 +30,10 @@ def export(
     origin: Annotated[
         str | None, typer.Option(help="LAT,LON,HEADING of the first camera, degrees: a raster also as GeoTIFF")
     ] = None,
-    dataset: Annotated[Path | None, typer.Option(help="where the images of the run are now, for nerfstudio")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
+    ] = None,
+    points: Annotated[int | None, typer.Option(help="at most so many points of a COLMAP model")] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:
@@ -46,7 +49,7 @@ def export(
     from slam.commands.exports.options import ExportOptions, parse_crop, parse_origin
     from slam.results.folder import RunFolder
 
-    options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
+    options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset, points)
     folder = RunFolder.open(run)
     with progress_bar() as progress:
         progress(f"export of {what}", 0, 1)

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.progress import Progress, silent
-from slam.commands.exports.nerfstudio import interpolated, write_scene
+from slam.commands.exports.colmap import write_model
+from slam.commands.exports.nerfstudio import write_scene
 from slam.commands.exports.occupancy import occupancy_grid
 from slam.commands.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
 from slam.commands.exports.parts import PARTS, check_options, check_target
 from slam.commands.exports.raster import height_raster, write_raster
 from slam.commands.exports.surface import prepared
 from slam.config.sections import load_stored
-from slam.formats.colmap import write_colmap
 from slam.formats.g2o import check_g2o
 from slam.formats.gltf import write_gltf
 from slam.formats.las import write_las
@@ -28,13 +28,12 @@ from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry import se3
-from slam.loops.places import Places
 from slam.mapping.submap import Submap, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, MAP_CLOUD, MAP_MESH, SUBMAPS
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import known
 
@@ -88,7 +87,15 @@ def export(
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
     elif what == "colmap":
-        _export_colmap(folder, output, up, options, progress)
+        write_model(
+            folder,
+            output,
+            _trajectory(folder, up),
+            R_UP_WORLDS[up],
+            _cloud(folder, up, options, progress),
+            options,
+            progress,
+        )
     elif what == "nerfstudio":
         cloud = _cloud(folder, up, options, progress)
         write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
@@ -112,15 +119,6 @@ def _export_map(
             write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
         else:
             _WRITERS[suffix](output, _rotated(prepared(ply, options), up))
-
-
-def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress) -> None:
-    """Poses of all frames with a usable image, the run's camera, and the cloud of the map where there is one."""
-    trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
-    cloud = _cloud(folder, up, options, progress)
-    points = np.zeros((0, 3)) if cloud is None else cloud.points
-    colours = np.zeros((0, 3), np.uint8) if cloud is None else cloud.colours_or_grey
-    write_colmap(output, camera, trajectory.T_world_camera, points, colours, interpolated(folder))
 
 
 def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress) -> None:

@@ -45,6 +45,7 @@ class Outcome:
 def run_drives(drives: list[Drive], output: Path, limits: Limits, spread: Spread, progress: Progress) -> list[Outcome]:
     """Run the drives that are not whole in ``output``; one outcome a drive, in their order."""
     outcomes: dict[int, Outcome] = {}
+    progress("drives", 0, len(drives))
     for number, result in spread(partial(run_drive, output=output.absolute(), limits=limits), drives):
         drive = drives[number]
         if isinstance(result, Outcome):

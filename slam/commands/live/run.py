@@ -99,7 +99,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
 
 
-_DROPPED = "; {} images were dropped, for they came faster than they were measured ('run' takes all of a recording)"
+_DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
 
 
 class _Session:

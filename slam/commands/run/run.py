@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
 from erfsfm.common.lock import FolderLock
-from erfsfm.common.progress import progress_lines, silent
+from erfsfm.common.progress import progress_bar, progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
 from slam.commands.run.continuation import (
@@ -48,7 +49,7 @@ logger = logging.getLogger(__name__)
 def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
     """Run the whole system on one sequence.
 
-    Without ``progress``, the log says every ten seconds (level INFO) what is done.
+    Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
 
     Args:
         dataset: as in `RunRequest`.
@@ -65,7 +66,8 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
     request = RunRequest.of(dataset=dataset, sequence=sequence, **options)
     if request.progress is not None:
         return perform(request)
-    with progress_lines(logger.info) as progress:
+    in_notebook = "ipykernel" in sys.modules
+    with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
         return perform(replace(request, progress=progress))
 
 

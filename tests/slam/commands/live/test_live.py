@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -146,6 +147,18 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
     assert folder.metrics().tree()["status"] == "ok" and folder.metrics().tree()["sequence"]["frames"] == len(used)
     said = caplog.text
     assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
+
+
+def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wanted(
+    street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages: list[dict[str, Any]] = []
+    request = request_of(street / "images", tiny_weights, SETTINGS, tmp_path / "live", wait=0.5)
+    with pytest.raises(SlamError, match=r"images were dropped, .* \(--every-frame drops none\)"):
+        run_live(request, messages.append)  # while the first one is measured, all others come
+    assert "images dropped, " in caplog.text
+    folder = run_live(replace(request, every_frame=True), messages.append)
+    assert messages[-1]["dropped"] == 0 and folder.metrics().tree()["sequence"]["frames"] == FRAMES
 
 
 @pytest.mark.parametrize(

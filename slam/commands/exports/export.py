@@ -86,19 +86,8 @@ def export(
         source = folder.require(GRAPH)
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
-    elif what == "colmap":
-        write_model(
-            folder,
-            output,
-            _trajectory(folder, up),
-            R_UP_WORLDS[up],
-            _cloud(folder, up, options, progress),
-            options,
-            progress,
-        )
-    elif what == "nerfstudio":
-        cloud = _cloud(folder, up, options, progress)
-        write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
+    elif what in ("colmap", "nerfstudio"):
+        _export_scene(folder, what, output, up, options, progress)
     elif what == "raster":
         _export_raster(folder, output, options, progress)
     else:
@@ -119,6 +108,16 @@ def _export_map(
             write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
         else:
             _WRITERS[suffix](output, _rotated(prepared(ply, options), up))
+
+
+def _export_scene(
+    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress
+) -> None:
+    trajectory, cloud = _trajectory(folder, up), _cloud(folder, up, options, progress)
+    if what == "colmap":
+        write_model(folder, output, trajectory, R_UP_WORLDS[up], cloud, options, progress)
+    else:
+        write_scene(folder, output, trajectory, cloud, options.dataset, progress)
 
 
 def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress) -> None:

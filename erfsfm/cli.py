@@ -16,6 +16,8 @@ from erfsfm import __version__
 from erfsfm.cli_evaluate import evaluate_app
 from erfsfm.cli_options import Device, Fidelity, Json, Seed, UnusedSeed, Weights, print_rows
 from erfsfm.common import command_line
+from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.progress import progress_bar
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +62,7 @@ def train(
     Example: erfsfm-slam simulate worlds/0 --depth && erfsfm train --config tiny --dataset worlds/0 --output runs/toy
     """
     from erfsfm.config import load_experiment
+    from erfsfm.training.comparison import depth_before_and_after
     from erfsfm.training.run import train as run_training
 
     changes = list(overrides or [])
@@ -67,8 +70,17 @@ def train(
         changes.append(f"training.seed={seed}")
     experiment = load_experiment(config, changes).with_roots(dataset or [])
     command = shlex.join(["erfsfm", *sys.argv[1:]])
-    folder = run_training(experiment, output, resume, device, command, quiet=not sys.stderr.isatty())
-    typer.echo(f"weights in {folder}: use them with --weights {folder}")
+    with progress_bar() as progress:
+        folder = run_training(experiment, output, resume, device, command, progress)
+        typer.echo(f"weights in {folder}: use them with --weights {folder}")
+        if experiment.initial_weights is None or experiment.data.validation_share == 0:
+            return
+        try:
+            rows = depth_before_and_after(experiment, folder, device, progress)
+        except ErfsfmError as error:
+            logger.warning("depth before and after training was not compared: %s", error)
+            return
+    print_rows(rows, as_json=False)
 
 
 @app.command()
@@ -94,7 +106,8 @@ def pack(
     from erfsfm.training.pack import pack as run_packing
 
     experiment = load_experiment(config, list(overrides or [])).with_roots(dataset or [])
-    done = run_packing(experiment, output, shard_megabytes, quality, quiet=not sys.stderr.isatty())
+    with progress_bar() as progress:
+        done = run_packing(experiment, output, shard_megabytes, quality, progress)
     typer.echo(
         f"{done.size / 1e6:.1f} MB in {output}: {done.shards} shards with {done.frames} frames and {done.labels} labels"
     )

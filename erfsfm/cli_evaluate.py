@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -46,11 +45,11 @@ def evaluate_depth(
     Example: erfsfm evaluate depth --weights sim --dataset KITTI_RAW --split eigen --fidelity paper
     """
     from erfsfm.common.errors import ConfigError
+    from erfsfm.common.progress import progress_bar
     from erfsfm.evaluation.eigen import eigen_protocol
     from erfsfm.evaluation.many_view_truth import many_view_protocol
     from erfsfm.evaluation.protocols import depth_protocol
     from erfsfm.inference import DepthPosePredictor
-    from erfsfm.training.progress import stage_bars
 
     if truth == "many-views" and split is not None:
         raise ConfigError("--truth many-views measures depth itself: leave --split out, name frames with --sequence")
@@ -60,7 +59,7 @@ def evaluate_depth(
         raise ConfigError("--fidelity paper needs --split eigen or a file of frames of KITTI raw")
     predictor = DepthPosePredictor.from_weights(weights, device)
     if truth == "many-views":
-        with stage_bars(not sys.stderr.isatty()) as show:
+        with progress_bar() as show:
             rows = many_view_protocol(predictor, dataset, sequence or (), cache, allow_leak, show)
         print_rows(rows, as_json)
     elif split is None:

@@ -70,6 +70,9 @@ class DataConfig(Section):
         description="recordings or frames (kitti_odometry/00[290:300]) used for validation alone; named ones must be "
         "among the data",
     )
+    validation_share: float = Field(
+        default=0.0, ge=0, lt=1, description="last part of each recording that is used for validation alone"
+    )
     split: str | None = Field(
         default=None,
         description="file of the recordings to train, validate and test on, or the name of one in configs/splits",

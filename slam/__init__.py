@@ -6,7 +6,7 @@ from typing import Any
 
 from erfsfm import DISTRIBUTION as DISTRIBUTION
 
-__all__ = ["Slam", "run_slam"]
+__all__ = ["RunFolder", "Slam", "run_slam"]
 
 
 def __getattr__(name: str) -> Any:
@@ -15,6 +15,10 @@ def __getattr__(name: str) -> Any:
         from slam.pipeline.live import Slam
 
         return Slam
+    if name == "RunFolder":
+        from slam.results.folder import RunFolder
+
+        return RunFolder
     if name == "run_slam":
         from slam.commands.run.run import run_slam
 

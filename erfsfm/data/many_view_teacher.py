@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError, TrainingError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.progress import Progress
 from erfsfm.common.readers.video import VideoFrames
 from erfsfm.data.array_cache import ArrayCache
 from erfsfm.data.recordings import Recording
@@ -38,7 +39,6 @@ LARGEST_WIDTH = 800
 LEAST_NEIGHBOURS = 2
 _CHUNK = 8  # labels of one task
 
-Progress = Callable[[str, int, int], None]
 Measures = Literal["depth and poses", "poses"]
 Guess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]  # inverse depth (H, W) in any unit, of an RGB image
 

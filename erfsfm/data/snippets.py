@@ -31,6 +31,7 @@ from erfsfm.labels.structure import StructureCache, TeacherStructure
 
 logger = logging.getLogger(__name__)
 
+_SHORTEST_END = 20  # frames: fewer give neither a trajectory with its scale nor depth by many views
 _DEFAULT_VALIDATION = DataConfig().validation  # may match no recording: the data need not be simulated
 
 
@@ -202,6 +203,9 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
             f"nothing left to train on: every recording found ({names}) is excluded or used to validate or test; see "
             "data.exclude, data.validation, data.split and data.leave_out"
         )
+    if config.validation_share > 0:
+        training, ends = _ends_split_off(training, config.validation_share)
+        validation += ends
     if not validation and (split.validation or config.validation != _DEFAULT_VALIDATION) and config.validation:
         names, wanted = _some([recording.name for recording in found]), _some([*config.validation, *split.validation])
         raise DataError(
@@ -213,6 +217,24 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     if absent:
         logger.warning("data.validation names %s, which is not among the data", _some(absent))
     return _without_stops(training, config), _without_stops(validation, config)
+
+
+def _ends_split_off(recordings: list[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+    """The recordings without their last parts, and these.
+
+    Raises:
+        DataError: all are too short.
+    """
+    cuts = [round((1 - share) * len(recording)) for recording in recordings]
+    long = [len(recording) - cut >= _SHORTEST_END for recording, cut in zip(recordings, cuts)]
+    if not any(long):
+        lengths = _some([f"{recording.name} ({len(recording)} frames)" for recording in recordings])
+        raise DataError(
+            f"nothing to validate on: data.validation_share {share:g} leaves fewer than {_SHORTEST_END} frames of "
+            f"{lengths}: give longer recordings or a larger share"
+        )
+    kept = [r.part(0, cut) if is_long else r for r, cut, is_long in zip(recordings, cuts, long)]
+    return kept, [r.part(cut, len(r)) for r, cut, is_long in zip(recordings, cuts, long) if is_long]
 
 
 def _some(names: Sequence[str]) -> str:

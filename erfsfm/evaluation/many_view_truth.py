@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import DataError
+from erfsfm.common.progress import Progress
 from erfsfm.data.discovery import discover
-from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher, Progress
+from erfsfm.data.many_view_teacher import LARGEST_WIDTH, ManyViewTeacher
 from erfsfm.data.recordings import Recording
 from erfsfm.evaluation.depth_metrics import DepthErrors, depth_errors, mean_errors
 from erfsfm.evaluation.protocols import PoseDepthNetworks, named_recordings, refuse_leak
@@ -54,10 +55,22 @@ def many_view_protocol(
         DataError: no such recording, a leak that was not allowed, or no depth could be measured.
         TrainingError: a recording gives no trajectory or no scale.
     """
-    if cache is None:
-        with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
-            return many_view_protocol(networks, root, sequences, Path(folder), allow_leak, progress, every)
     recordings = [each for name in sequences for each in named_recordings(root, name)] or discover(root)
+    if cache is not None:
+        return many_view_errors(networks, recordings, cache, allow_leak, progress, every)
+    with tempfile.TemporaryDirectory(prefix="erfsfm-truth-") as folder:
+        return many_view_errors(networks, recordings, Path(folder), allow_leak, progress, every)
+
+
+def many_view_errors(
+    networks: PoseDepthNetworks,
+    recordings: Sequence[Recording],
+    cache: Path,
+    allow_leak: bool,
+    progress: Progress,
+    every: int = 5,
+) -> list[dict[str, Any]]:
+    """`many_view_protocol` of recordings."""
     leaks = [refuse_leak(networks, [each.frames_name], allow_leak) for each in recordings]
     rows = []
     for recording, leak in zip(recordings, leaks):

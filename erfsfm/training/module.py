@@ -102,7 +102,7 @@ class SelfSupervision(lightning.LightningModule):
             )
         if result.disparities:
             self._refuse_constant(result.disparities[0].detach())
-        self.log("loss", result.total.detach(), prog_bar=True)
+        self.log("loss", result.total.detach())
         self.log_dict({f"loss/{name}": value.detach() for name, value in result.terms.items()})
         if result.disparities and self.global_step % (20 * self.config.training.log_every) == 0:
             self._log_pictures(snippets, result.disparities[0], result.warped)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.common.files import write_atomically
+from erfsfm.common.progress import Progress, silent
 from erfsfm.config import ExperimentConfig, NetworkConfig
 from erfsfm.data.compact_label import encode
 from erfsfm.data.many_view_teacher import ManyViewTeacher
@@ -37,7 +38,6 @@ from erfsfm.data.recordings import Recording
 from erfsfm.data.shards import CLIPS_FILE, FOLDER, MOST_SNIPPETS, POSES, ShardIndex, ShardWriter, clip_name
 from erfsfm.data.snippets import ValidationSnippets, split_recordings, usable
 from erfsfm.data.window import Snippet
-from erfsfm.training.progress import stage_bars
 from erfsfm.training.run import trained_on
 from erfsfm.training.supervision import measured_views
 
@@ -65,7 +65,7 @@ class _Span:
 
 
 def pack(
-    config: ExperimentConfig, output: Path, megabytes: float = 4, quality: int = 85, quiet: bool = True
+    config: ExperimentConfig, output: Path, megabytes: float = 4, quality: int = 85, progress: Progress = silent
 ) -> PackSummary:
     """Write what a training needs of its data as tar files, one clip after the other in random order.
 
@@ -76,7 +76,7 @@ def pack(
         output: new or empty; receives the index, the shards, and the snippets to validate on.
         megabytes: largest size of a shard, 1e6 bytes each.
         quality: of the JPEG images, 1 to 100.
-        quiet: no progress bar.
+        progress: told of the stage, what is done, and of how many.
 
     Raises:
         ConfigError: no place for the measurements, or ``output`` is taken.
@@ -88,10 +88,10 @@ def pack(
         raise ConfigError(f"--output {output} is not empty: choose a new folder; nothing was changed")
     training, validation = split_recordings(config.data)
     training = _readable_parts(usable(training, config.network.sources + 1), config.network)
-    teacher = measured_views(training, config, config.teacher.cache or output, quiet)
+    teacher = measured_views(training, config, config.teacher.cache or output, progress)
     unfinished = output.with_name(f".{output.name}.{os.getpid()}.partial")
     try:
-        clips, labels = _write_clips(unfinished, training, config, teacher, megabytes, quality, quiet)
+        clips, labels = _write_clips(unfinished, training, config, teacher, megabytes, quality, progress)
         index = ShardIndex(
             files=int(clips[-1, 0]) + 1,
             most_bytes=int(megabytes * 1e6),
@@ -174,19 +174,18 @@ def _write_clips(
     teacher: ManyViewTeacher | None,
     megabytes: float,
     quality: int,
-    quiet: bool,
+    progress: Progress,
 ) -> tuple[NDArray[np.int64], int]:
     """Write the shards and the list of their clips; returns this list, and how many labels there are."""
     spans, rows, labels = _spans(training, config), [], 0
     shards = ShardWriter(output / FOLDER, int(megabytes * 1e6))
-    with stage_bars(quiet) as show:
-        for done, span in enumerate(spans):
-            show("packing", done, len(spans))
-            members = dict(_members(span, config, teacher, quality))
-            first = span.recording.start + span.first
-            shard = shards.write(clip_name(span.number, first), members)
-            rows.append((shard, span.number, first, span.frames))
-            labels += sum(name.endswith(".webp") for name in members)
+    for done, span in enumerate(spans):
+        progress("packing", done, len(spans))
+        members = dict(_members(span, config, teacher, quality))
+        first = span.recording.start + span.first
+        shard = shards.write(clip_name(span.number, first), members)
+        rows.append((shard, span.number, first, span.frames))
+        labels += sum(name.endswith(".webp") for name in members)
     shards.close()
     clips = np.array(rows, dtype=np.int64)
     with (output / CLIPS_FILE).open("wb") as file:

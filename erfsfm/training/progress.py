@@ -1,37 +1,41 @@
-"""Progress bars on the terminal: of the stages before training, and of its steps."""
+"""What the steps of a training say of themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import logging
+import time
+from typing import Any
 
-from lightning.pytorch.callbacks import RichProgressBar
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+import lightning
+from lightning.pytorch.callbacks import Callback
 
+from erfsfm.common.progress import Progress
 
-@contextmanager
-def stage_bars(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """One bar a stage on stderr, each by its name, what is done and the total; none where ``quiet``."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bars:
-        tasks: dict[str, TaskID] = {}
+logger = logging.getLogger(__name__)
 
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done)
-
-        yield show
+_TIMED_STEPS = 20
 
 
-class StepBar(RichProgressBar):
-    """Lightning's bar on stderr; it counts the steps of the whole run, also after a resume."""
+class StepProgress(Callback):
+    """Tells of all steps, also after a resume, and of the loss of the latest; logs what a step takes."""
 
-    def __init__(self) -> None:
-        super().__init__(refresh_rate=1, leave=True, console_kwargs={"stderr": True})
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._began: tuple[int, float] | None = None
 
-    @property
-    def total_train_batches(self) -> int:
-        """All steps: Lightning gives those that are left, and counts from the first."""
-        return int(self.trainer.max_steps)
+    def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Tell that the steps begin."""
+        if trainer.is_global_zero:
+            self._progress("steps", trainer.global_step, trainer.max_steps)
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Tell of a step; reading the loss waits for the device."""
+        if not trainer.is_global_zero:
+            return
+        loss = float(trainer.callback_metrics["loss"])
+        step, steps, now_s = trainer.global_step, trainer.max_steps, time.monotonic()
+        first, began_s = self._began = self._began or (step, now_s)
+        if step - first == min(_TIMED_STEPS, steps - first) > 0:
+            took_s = (now_s - began_s) / (step - first)
+            logger.info("a step takes %.2g s, all %d steps take %.2g min", took_s, steps, steps * took_s / 60)
+        self._progress(f"steps, loss {loss:.4g}", step, steps)

@@ -27,6 +27,7 @@ from erfsfm.checkpoint import KINDS, load_model
 from erfsfm.common.errors import ConfigError, DataError
 from erfsfm.common.files import write_atomically
 from erfsfm.common.lock import FolderLock
+from erfsfm.common.progress import Progress, silent
 from erfsfm.common.readers.frame_range import merge
 from erfsfm.common.signals import Terminated, raising_on_termination
 from erfsfm.common.threads import single_threaded_opencv
@@ -41,7 +42,7 @@ from erfsfm.training.keeper import Patience, WeightKeeper
 from erfsfm.training.module import SelfSupervision
 from erfsfm.training.objective import needs_poses
 from erfsfm.training.output_folder import OutputFolder
-from erfsfm.training.progress import StepBar
+from erfsfm.training.progress import StepProgress
 from erfsfm.training.supervision import measured_views
 
 logger = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ def train(
     resume: bool = False,
     device: str = "auto",
     command: str = "",
-    quiet: bool = True,
+    progress: Progress = silent,
 ) -> Path:
     """Train, validate, keep the best.
 
@@ -69,7 +70,7 @@ def train(
         resume: continue from ``checkpoints/last.ckpt``.
         device: ``auto``, ``cpu`` or ``cuda``.
         command: recorded in the weights.
-        quiet: no progress bar.
+        progress: told of the stage, what is done, and of how many.
 
     Returns:
         The output folder.
@@ -89,7 +90,7 @@ def train(
     lightning.seed_everything(config.training.seed, verbose=False)
     timer = _timer(config.training.minutes)
     module = SelfSupervision(config, timer.time_elapsed)
-    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, quiet)
+    draws = _draws(training, in_shards(training, validation), config, (done_steps, rank), output, progress)
     validation_loader = DataLoader(ValidationSnippets(validation, config), 1) if validation else None
     before = [] if resume else _start_from(module, config)
     seen = merge([*trained_on(draws.recordings), *before])
@@ -97,7 +98,7 @@ def train(
     if resume:
         module.validation_metrics = keeper.metrics_at(done_steps)
     loader = _loader(draws, config, device)
-    trainer = _trainer(config, output, device, quiet or rank > 0, (keeper, timer), done_steps)
+    trainer = _trainer(config, output, device, (keeper, timer, StepProgress(progress)), done_steps)
     if config.training.nodes > 1:
         logger.warning("training begins when this command runs on all %d machines", config.training.nodes)
     with raising_on_termination(), FolderLock() as lock:
@@ -147,7 +148,7 @@ def _draws(
     config: ExperimentConfig,
     position: tuple[int, int],
     output: Path,
-    quiet: bool,
+    progress: Progress,
 ) -> SnippetDraws | ShardDraws:
     """What this process trains on; ``position``: steps done and rank."""
     done_steps, rank = position
@@ -159,7 +160,7 @@ def _draws(
         return ShardDraws(training, config, draws, done, rank)
     folder = config.teacher.cache or output / "teacher"
     _, measured = by_label(training, config.data)
-    many_views = measured_views(measured, config, folder, quiet or rank > 0)
+    many_views = measured_views(measured, config, folder, progress if rank == 0 else silent)
     return SnippetDraws(training, config, draws, done, rank, many_views)
 
 
@@ -240,8 +241,7 @@ def _trainer(
     config: ExperimentConfig,
     output: Path,
     device: str,
-    quiet: bool,
-    callbacks: tuple[WeightKeeper, Timer],
+    callbacks: tuple[WeightKeeper, Timer, StepProgress],
     done_steps: int,
 ) -> lightning.Trainer:
     training = config.training
@@ -265,7 +265,6 @@ def _trainer(
     csv = f"csv_from_{done_steps}" if done_steps else "csv"
     logs = [CSVLogger(output, "logs", csv), TensorBoardLogger(output, "logs", "tensorboard")]
     stops = [Patience(training.patience)] if training.patience else []
-    progress = [] if quiet else [StepBar()]
     several = training.processes > 1
     return lightning.Trainer(
         accelerator="cpu" if on_cpu else "gpu",
@@ -283,9 +282,9 @@ def _trainer(
         num_sanity_val_steps=0,
         log_every_n_steps=training.log_every,
         logger=logs,
-        callbacks=[latest, *callbacks, *stops, *progress],
+        callbacks=[latest, *callbacks, *stops],
         plugins=[AtomicCheckpoints()],
-        enable_progress_bar=not quiet,
+        enable_progress_bar=False,
         enable_model_summary=False,
         default_root_dir=output,
     )

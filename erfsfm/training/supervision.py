@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.progress import Progress
 from erfsfm.config import ExperimentConfig
 from erfsfm.data.many_view_teacher import ManyViewTeacher, Measures
 from erfsfm.data.recordings import Recording
 from erfsfm.data.snippets import labels_mb
 from erfsfm.inference import DepthPosePredictor
-from erfsfm.training.progress import stage_bars
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def _predictor(weights: str) -> DepthPosePredictor:
 
 
 def measured_views(
-    recordings: list[Recording], config: ExperimentConfig, folder: Path, quiet: bool
+    recordings: list[Recording], config: ExperimentConfig, folder: Path, progress: Progress
 ) -> ManyViewTeacher | None:
     """The teacher, with what is not there yet measured; None where the experiment has no many views.
 
@@ -43,7 +43,7 @@ def measured_views(
         recordings: to train on.
         config: of the experiment.
         folder: of the measurements.
-        quiet: no progress bar.
+        progress: told of the stage, what is done, and of how many.
     """
     if config.teacher.views != "many":
         return None
@@ -52,6 +52,5 @@ def measured_views(
     cache_mb = labels_mb(config.data)
     guess = GuessedDepth(config.teacher.slam_weights)
     teacher = ManyViewTeacher(folder, size, config.teacher.stride, cache_mb, measures, guess)
-    with stage_bars(quiet) as show:
-        teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, show)
+    teacher.prepare(recordings, config.network.sources, config.teacher.slam_weights, progress)
     return teacher

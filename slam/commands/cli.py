@@ -13,6 +13,7 @@ import typer
 
 from erfsfm import __version__
 from erfsfm.common import command_line
+from erfsfm.common.progress import progress_bar
 from slam.commands.batch.cli import verbs as batch_verbs
 from slam.commands.calibration.cli import verbs as calibration_verbs
 from slam.commands.downloads.cli import verbs as download_verbs
@@ -22,7 +23,6 @@ from slam.commands.live.cli import verbs as live_verbs
 from slam.commands.localisation.cli import verbs as localisation_verbs
 from slam.commands.options import Json, Seed, UnusedDevice, options_of
 from slam.commands.run.request import RunRequest
-from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 
 if TYPE_CHECKING:
@@ -120,7 +120,9 @@ def config() -> None:
 @app.command()
 def doctor(
     dataset: Annotated[Path | None, typer.Option(help="a data set to check")] = None,
-    camera: Annotated[Path | None, typer.Option(help="camera.yaml of the data set, or fov=70")] = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", "--calibration", help="camera.yaml of the data set, or fov=70")
+    ] = None,
 ) -> None:
     """Check the installation. Missing parts come with what to do, and exit code 1.
 

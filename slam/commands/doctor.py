@@ -114,10 +114,17 @@ def _sequence(root: Path, name: str, kind: str, camera: Path | None) -> str:
         sequence = open_sequence(root, name, camera)
     except SlamError as error:
         return f"missing  sequence {name}: {error} ({kind})"
-    truth = "true poses" if sequence.reference is not None else "no true poses"
+    truth = "true poses" if sequence.reference is not None else "no true poses" + _unused_truth(root)
     height = f"camera {sequence.camera_height_m:.2f} m high" if sequence.camera_height_m else "camera height unknown"
     scans = sum(sequence.has_scan(k) for k in range(len(sequence)))
     size = f"{sequence.intrinsics.width}x{sequence.intrinsics.height}"
     return (
         f"ok       sequence {name}: {len(sequence)} frames of {size}, {truth}, {height}, {scans} LiDAR scans ({kind})"
     )
+
+
+def _unused_truth(root: Path) -> str:
+    """How to use a file of poses that lies in or beside a recording: nothing tells whose they are."""
+    places = (root, root.absolute().parent) if root.is_dir() else (root.absolute().parent,)
+    found = next((path for place in places for path in sorted(place.glob("poses*.txt"))), None)
+    return "" if found is None else f" (--truth {found} gives some)"

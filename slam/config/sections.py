@@ -26,6 +26,7 @@ from slam.config.frontend import (
     ScaleMode,
     VisualOdometryConfig,
 )
+from slam.runtime.imports import plug_ins
 
 __all__ = [
     "DepthConfig",
@@ -50,6 +51,7 @@ __all__ = [
 
 
 DEPTH_SOURCES = ("onnx", "npy", "png")
+DEPTH_PLUG_INS = "erfsfm_slam.depth"  # entry points of other packages: see docs/depth.md
 
 
 class DepthConfig(Section):
@@ -99,8 +101,9 @@ class DepthConfig(Section):
     @classmethod
     def _known_source(cls, source: str) -> str:
         kind, colon, path = source.partition(":")
-        if source != "network" and not (kind in DEPTH_SOURCES and colon and path):
-            raise ValueError("network, onnx:FILE, npy:FOLDER or png:FOLDER")
+        others = plug_ins(DEPTH_PLUG_INS)
+        if source != "network" and not (kind in (*DEPTH_SOURCES, *others) and colon and path):
+            raise ValueError(", ".join(("network, onnx:FILE, npy:FOLDER or png:FOLDER", *(f"{n}:..." for n in others))))
         return source
 
     @field_validator("std")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.progress import Progress, silent
 from slam.frames import RelativePose, Sequence
 from slam.frontend.failure import MeasurementFailure
 from slam.geometry.se3 import FloatArray, invert
@@ -50,7 +51,7 @@ def readable_scan(sequence: Sequence, frame: int) -> FloatArray | str:
         return str(error)
 
 
-def lidar_path(sequence: Sequence) -> LidarPath | MeasurementFailure | None:
+def lidar_path(sequence: Sequence, progress: Progress = silent) -> LidarPath | MeasurementFailure | None:
     """Register the scans of a sequence one after the other; None where it has fewer than two.
 
     Scans that cannot be read are left out, with one warning; a failure where fewer than two can.
@@ -68,7 +69,8 @@ def lidar_path(sequence: Sequence) -> LidarPath | MeasurementFailure | None:
     settings.registration.max_num_threads = 1  # reproducible
     odometry = KissICP(settings)
     frames, T_first_lidar, unreadable = [], [], {}
-    for frame in scanned:
+    for done, frame in enumerate(scanned):
+        progress("lidar scans", done, len(scanned))
         points = readable_scan(sequence, frame)
         if isinstance(points, str):
             unreadable[frame] = points

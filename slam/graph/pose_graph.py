@@ -124,6 +124,21 @@ class PoseGraph:
         self._dropped += gone
         return gone
 
+    def marginal(self, frame: int) -> FloatArray:
+        """Covariance ``(6, 6)`` of a frame's pose at the optimised trajectory, with the first frame fixed.
+
+        It is of a perturbation in the camera, ``T_world_camera Exp(xi)``: rotation first, radians and the unit of the
+        factors.
+
+        Raises:
+            SlamError: there is no such frame, or the graph was not optimised.
+        """
+        T_world_camera = self._solution()
+        if not 0 <= frame < len(T_world_camera):
+            raise SlamError(f"no frame {frame} in the pose graph: it has 0 to {len(T_world_camera) - 1}")
+        values = self._values(T_world_camera)
+        return np.asarray(gtsam.Marginals(self._factors(values), values).marginalCovariance(frame))
+
     def write_g2o(self, path: Path) -> None:
         """Write the optimised graph in g2o's text format at full precision, atomically."""
         write_g2o(path, self._relative_poses, self._solution())
@@ -134,10 +149,7 @@ class PoseGraph:
         return self._T_world_camera
 
     def _solve(self, T_world_camera_initial: FloatArray) -> FloatArray:
-        values = gtsam.Values()
-        for k, T in enumerate(self._T_fixed_world @ T_world_camera_initial):
-            values.insert(k, _pose3(T))
-        values = self._minimise(values)
+        values = self._minimise(self._values(T_world_camera_initial))
         T_fixed_camera = np.stack([values.atPose3(k).matrix() for k in range(len(T_world_camera_initial))])
         if not np.isfinite(T_fixed_camera).all():
             raise RuntimeError("the solution is not finite")
@@ -148,13 +160,23 @@ class PoseGraph:
         rebased[0] = T_world_camera_initial[0]
         return rebased
 
-    def _minimise(self, values: Any) -> Any:
+    def _values(self, T_world_camera: FloatArray) -> Any:
+        values = gtsam.Values()
+        for k, T in enumerate(self._T_fixed_world @ T_world_camera):
+            values.insert(k, _pose3(T))
+        return values
+
+    def _factors(self, values: Any) -> Any:
         graph = gtsam.NonlinearFactorGraph()
         graph.add(_anchor(values.atPose3(0), is_loose=bool(self._positions)))
         for edge in self._relative_poses:
             graph.add(_between(edge, self._config))
         for position in self._positions:
             graph.add(_position(position, self._config))
+        return graph
+
+    def _minimise(self, values: Any) -> Any:
+        graph = self._factors(values)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(_MAX_ITERATIONS)
         parameters.setRelativeErrorTol(_RELATIVE_TOLERANCE)

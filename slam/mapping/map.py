@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, invert, rotation_angle
@@ -19,7 +20,6 @@ from slam.mapping.submap import BLOCK_VOXELS, Submap, remove_submaps, submap_pat
 from slam.mapping.surface import MapSurface, colours, normals, positions
 from slam.mapping.views import ViewChooser
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.progress import Progress
 from slam.runtime.run_files import SUBMAPS
 
 _FUSION_SHARE = 0.25  # of the memory: growing needs twice the blocks, and the rest of the map has its own
@@ -136,7 +136,7 @@ class TsdfMap:
                 found.append(position)
         return found
 
-    def surface(self, progress: Progress | None = None) -> MapSurface:
+    def surface(self, progress: Progress = silent) -> MapSurface:
         """The surface of all that was fused; more depth maps may follow.
 
         Raises:

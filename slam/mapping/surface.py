@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from erfsfm.common.progress import Progress, silent
 from slam.config.sections import MappingConfig
 from slam.formats.ply import write_ply_pieces
 from slam.frames import Mask
@@ -25,7 +26,6 @@ from slam.mapping.merged_submaps import TILE_BLOCKS, MergedSubmaps
 from slam.mapping.submap import BLOCK_SIDE
 from slam.mapping.tile_surface import TileSurface, Triangles, extract_tile
 from slam.runtime.errors import EmptyMapError
-from slam.runtime.progress import Progress
 from slam.runtime.storage.spill import SpilledArray, SpillFile
 
 _LENGTHS, _COLOURS = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
@@ -80,7 +80,7 @@ def colours(records: NDArray[np.void]) -> FloatArray:
 class MapSurface:
     """The cleaned surface of finished submaps."""
 
-    def __init__(self, paths: list[Path], config: MappingConfig, progress: Progress | None = None) -> None:
+    def __init__(self, paths: list[Path], config: MappingConfig, progress: Progress = silent) -> None:
         """Merge the submaps and extract their surface.
 
         Args:
@@ -149,7 +149,7 @@ class MapSurface:
         """Write the cloud as binary PLY, atomically; ``RunError`` where that fails."""
         write_ply_pieces(path, VERTEX, self.points, self.cloud_pieces)
 
-    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress | None) -> None:
+    def _extract(self, submaps: MergedSubmaps, config: MappingConfig, progress: Progress) -> None:
         painter = Painter(submaps, config.voxel_size_m, config.reach_m)
         tiles = submaps.tiles()
         least_weight = min(config.min_weight, float(submaps.fused))  # with fewer frames nothing would be extracted
@@ -161,8 +161,7 @@ class MapSurface:
                     patch = with_holes_closed(patch, tile, config.voxel_size_m, up, config.close_holes_m)
                 if patch.own.any():
                     self._pieces.append(_piece(patch, painter, self._spill))
-            if progress is not None:
-                progress("mesh", done, len(tiles))
+            progress("mesh", done, len(tiles))
 
     @staticmethod
     def _written(piece: Piece, kept: _Kept) -> Mask:

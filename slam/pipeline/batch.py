@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
+from erfsfm.common.progress import Progress, silent
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
@@ -43,7 +44,6 @@ from slam.pipeline.observer import Observer
 from slam.pipeline.positioning import Location, Positioning
 from slam.runtime.errors import SequenceError
 from slam.runtime.imports import import_open3d_beside
-from slam.runtime.progress import Progress
 from slam.runtime.threads import read_ahead
 from slam.runtime.timing import Stopwatch
 from slam.sequences.continued import Continued
@@ -69,7 +69,7 @@ class SlamPipeline:
         sequence: FrameSequence,
         predictor: Predictor,
         config: SlamConfig,
-        progress: Progress | None = None,
+        progress: Progress = silent,
         noise: PoseNoise | None = None,
         checkpoint: SessionCheckpoint | None = None,
         seed: int = 0,
@@ -91,7 +91,7 @@ class SlamPipeline:
             logger.info("no noise.yaml beside the weights: the pose network's noise is measured on the drive")
         self._noise = noise
         self._sequence, self._predictor, self._config = sequence, predictor, config
-        self._progress = progress or (lambda stage, done, total: None)
+        self._progress = progress
         self._checkpoint = checkpoint
         self.first = 0 if checkpoint is None else len(checkpoint.state.drive)  # frames before are measured
         self._seed = seed
@@ -126,9 +126,12 @@ class SlamPipeline:
         if self._config.mapping.enabled:
             import_open3d_beside()
         drive, state = self._observe(checkpoints, frames, watch)
+        self._progress("loops and graph", 0, 1)
         drive, closure = self.close_maps(drive)
         warn_of_doubts(drive, state.gate)
-        return self.solve(drive, state, closure)
+        estimate = self.solve(drive, state, closure)
+        self._progress("loops and graph", 1, 1)
+        return estimate
 
     def solve(self, drive: Drive, state: FrontEndState, closure: MapClosure | None = None) -> Estimate:
         """Lengths, factors and loops of a drive after `close_maps`, and the trajectory that fits them.
@@ -138,7 +141,7 @@ class SlamPipeline:
         """
         T_network = chain_raw(drive.snippets, len(drive))
         with self._watch.stage("lidar"):
-            lidar = lidar_path(self._sequence)
+            lidar = lidar_path(self._sequence, self._progress)
         scale, factors, T_odometry = self._measure(drive, T_network, lidar)
         views = [view.scaled(float(scale.per_frame[view.index])) for view in drive.views]
         if closure is None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from threading import RLock
-from typing import Concatenate, ParamSpec, Self, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar, cast
 
 import numpy as np
 
@@ -17,16 +18,23 @@ from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import SlamConfig
 from slam.formats.trajectory import Trajectory
 from slam.frames import Frame, Image, Intrinsics, Predictor
+from slam.geometry.se3 import FloatArray, apply
 from slam.loops.closure import LoopClosures
+from slam.loops.places import Places
+from slam.loops.structure import PlaceStructure
+from slam.loops.thresholds import OF_KEYFRAMES
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
+from slam.pipeline.estimate import Estimate
 from slam.pipeline.front_end_state import FrontEndState
 from slam.pipeline.keyframe_tracking import choose
-from slam.pipeline.live_poses import LivePoses
+from slam.pipeline.live_poses import LivePose, LivePoses
 from slam.pipeline.observer import Observer
 from slam.prediction.assembly import make_predictor, open_depth
 from slam.prediction.depth_source import mixed_sha256
 from slam.runtime.errors import SlamError
+from slam.runtime.imports import import_open3d
+from slam.runtime.run_files import MAP_MESH
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.timing import Stopwatch
 from slam.sequences.growing import GrowingSequence
@@ -47,7 +55,7 @@ def _in_turn(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[
 
 
 class Slam:
-    """Monocular SLAM frame by frame; it keeps no images and makes no map.
+    """Monocular SLAM frame by frame; it keeps no images, unless a `surface` is wanted.
 
     Poses come from the measurements of the last 100 frames; older ones stay, so a frame costs the same however long
     the drive is. `close_loops` solves the whole drive as `run` does. Threads may share a session: each call waits for
@@ -71,7 +79,7 @@ class Slam:
         Args:
             predictor: depth and snippet poses; ``config.depth`` is read by `from_weights` alone.
             intrinsics: of all images.
-            config: None for the defaults.
+            config: None for the defaults; with ``output.keep=keyframes`` images are kept on disk, for `surface`.
             camera_height_m: above the road; None where unknown, then lengths are in camera heights.
             update_frames: lengths of the last steps are solved after so many frames.
             sweep_frames: the whole drive is solved after so many frames, which takes longer the longer it is; 0: only
@@ -91,8 +99,8 @@ class Slam:
                 f"wanted update_frames >= 1, sweep_frames >= 0 and a seed of 31 bits; got {update_frames}, "
                 f"{sweep_frames} and {seed}"
             )
-        without_map = config.mapping.model_copy(update={"enabled": False})
-        config = config.model_copy(update={"mapping": without_map})
+        mapping = config.mapping.model_copy(update={"enabled": config.output.keep == "keyframes"})
+        config = config.model_copy(update={"mapping": mapping})
         self._weights_sha256 = weights_sha256
         self._sequence = GrowingSequence(intrinsics, camera_height_m)
         self._config, self._predictor, self._seed = config, predictor, seed
@@ -102,6 +110,8 @@ class Slam:
         self._is_closed = False
         self._poses = LivePoses(predictor.sources, camera_height_m, config, noise, update=update_frames)
         self._sweep_frames = sweep_frames
+        self._newest = LivePose(0, np.eye(4), "starting", None)
+        self._estimate: Estimate | None = None
 
     @classmethod
     def from_weights(
@@ -138,7 +148,7 @@ class Slam:
 
     @property
     def unit_name(self) -> str | None:
-        """Of the lengths of `trajectory`: ``m``, ``camera heights`` or ``the networks' own unit``.
+        """Of the lengths of `trajectory`: ``m``, ``camera heights``, ``no metric unit`` or ``the networks' own unit``.
 
         None before the first snippet and, where metres are wanted, until a road is seen: lengths are the networks' own
         up to then.
@@ -161,8 +171,8 @@ class Slam:
             self._observer.close()
 
     @_in_turn
-    def add_frame(self, image: Image, stamp: float) -> None:
-        """Process the next frame.
+    def add_frame(self, image: Image, stamp: float) -> LivePose:
+        """Process the next frame; the newest one that is finished, which may be the one before, is returned.
 
         Args:
             image: ``(H, W, 3)`` uint8 RGB at the size of the intrinsics.
@@ -191,9 +201,10 @@ class Slam:
         finally:  # the error may be of the frame before
             if self._observer.frames > index:
                 self._sequence.stamps = np.append(self._sequence.stamps, stamp)
-        self._poses.add(self._observer)
+        self._newest = (self._poses.add(self._observer) or [self._newest])[-1]
         if self._sweep_frames and len(self) % self._sweep_frames == 0:
             self.close_loops()
+        return self._newest
 
     @_in_turn
     def save(self, path: str | Path) -> None:
@@ -253,7 +264,63 @@ class Slam:
         drive, closure = self._pipeline.close_maps(self._observer.complete_drive())
         estimate = self._pipeline.solve(drive, self._observer.state(), closure)
         self._poses.correct(estimate.optimised.T_world_camera, estimate.scale)
+        self._estimate = estimate
         return estimate.loops
+
+    @_in_turn
+    def keyframes(self) -> Trajectory:
+        """The frames whose corners `points` gives; the whole drive so far is solved first, as by `close_loops`.
+
+        Raises:
+            SlamError: there are too few usable frames, or the graph has no solution.
+        """
+        estimate = self._solved()
+        return estimate.optimised.select(np.array([view.index for view in estimate.views], dtype=np.intp))
+
+    @_in_turn
+    def points(self) -> FloatArray:
+        """Points ``(M, 3)`` of the corners of `keyframes` in the world, in `unit_name`; raises as `keyframes`.
+
+        Those of a hand-held camera are triangulated among neighbouring keyframes, those of a drive have learned depth.
+        """
+        estimate, T_world_camera = self._solved(), self.keyframes().T_world_camera
+        if estimate.drive.maps:
+            places = Places(self._sequence.intrinsics, tuple(estimate.views), T_world_camera)
+            structure = PlaceStructure(places, OF_KEYFRAMES)
+            of_views = [structure.points(row, learned=False) for row in range(len(estimate.views))]
+        else:
+            pairs = zip(T_world_camera, estimate.views, strict=True)
+            of_views = [apply(T, view.points.astype(np.float64)) for T, view in pairs]
+        points = np.concatenate(of_views)
+        known: FloatArray = points[np.isfinite(points).all(axis=1)]
+        return known
+
+    @_in_turn
+    def marginals(self, frame: int) -> FloatArray:
+        """Covariance ``(6, 6)`` of a frame's pose, as `PoseGraph.marginal`; raises as `keyframes`."""
+        return self._solved().graph.marginal(frame)
+
+    @_in_turn
+    def surface(self) -> Any:
+        """The map of the drive so far as an Open3D ``TriangleMesh``, y down; raises as `keyframes`.
+
+        Raises:
+            SlamError: the session was made without ``output.keep=keyframes``, or nothing was seen often enough.
+        """
+        fused = self._pipeline.fuse(self._solved())
+        if fused is None:
+            raise SlamError("this session keeps no images: make Slam with output.keep=keyframes")
+        with tempfile.TemporaryDirectory(prefix="erfsfm-slam-surface-") as folder:
+            fused.surface().write_mesh(Path(folder) / MAP_MESH)
+            return import_open3d().io.read_triangle_mesh(str(Path(folder) / MAP_MESH))
+
+    def _solved(self) -> Estimate:
+        """Of the whole drive so far."""
+        if self._estimate is None or len(self._estimate.optimised) != len(self):
+            self.close_loops()
+        if self._estimate is None:
+            raise SlamError("there are too few usable frames to solve the drive")
+        return self._estimate
 
     def _observe(self, state: FrontEndState | None) -> Observer:
         return Observer(

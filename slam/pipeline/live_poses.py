@@ -24,6 +24,7 @@ State = Literal["starting", "tracking", "bridged", "relocalised"]
 class LivePose:
     """A frame's pose ``(4, 4)``; ``unit`` is that of the pose over that of learned depth, None while unknown."""
 
+    frame: int
     T_world_camera: FloatArray
     state: State
     unit: float | None
@@ -83,7 +84,8 @@ class LivePoses:
         if drive.snippets and (self._unit is None or count // self._update > first // self._update):
             self._solve(observer, count)
         unit = None if self.unit_name is None else self._unit
-        return [LivePose(self._T_world_camera[k], self._state(k in drive.unusable), unit) for k in range(first, count)]
+        added = [(k, self._T_world_camera[k].copy(), self._state(k in drive.unusable)) for k in range(first, count)]
+        return [LivePose(*each, unit) for each in added]
 
     def correct(self, T_world_camera: FloatArray, scale: Scale) -> None:
         """Go on from the poses ``(N, 4, 4)`` and the unit of a whole drive."""

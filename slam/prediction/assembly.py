@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from erfsfm.inference import DepthPosePredictor
-from slam.config.sections import DepthConfig
+from slam.config.sections import DEPTH_PLUG_INS, DepthConfig
 from slam.frames import Intrinsics, Predictor
 from slam.prediction.depth_folder import DepthFolder, FrameNumbers, Undistort
 from slam.prediction.depth_source import DepthSource, SourcedPredictor
 from slam.prediction.networks import NetworkPredictor
 from slam.prediction.onnx_depth import OnnxDepth
 from slam.runtime.errors import SlamError
+from slam.runtime.imports import import_plug_in, plug_ins
 from slam.runtime.storage.cache import CacheNamespace, DiskCache
 from slam.runtime.storage.fingerprint import code_fingerprint
 
@@ -30,11 +31,14 @@ def open_depth(
     Raises:
         SlamError: the source is missing, damaged or does not fit.
     """
-    kind = config.source.partition(":")[0]
+    kind, _, argument = config.source.partition(":")
     if kind == "network":
         return None
     if kind == "onnx":
         return OnnxDepth(config)
+    if kind in plug_ins(DEPTH_PLUG_INS):
+        opened: DepthSource = import_plug_in(plug_ins(DEPTH_PLUG_INS)[kind])(argument, intrinsics)
+        return opened
     if numbers is None:
         raise SlamError(
             f"depth.source={config.source} needs a whole sequence, with its depth on disk: choose network or onnx:FILE "

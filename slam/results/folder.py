@@ -5,15 +5,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from erfsfm.common.lock import FolderLock
 from slam.formats.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 from slam.results.metrics import Metrics
 from slam.results.output_folder import claim, reclaim, replace_run, stamped, whole_place
 from slam.runtime.errors import RunError
-from slam.runtime.run_files import ESTIMATE, METRICS, trajectory_file
+from slam.runtime.imports import import_open3d
+from slam.runtime.run_files import ESTIMATE, MAP_CLOUD, MAP_MESH, METRICS, trajectory_file
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import MISSING, Missing
+
+if TYPE_CHECKING:
+    from slam.frontend.drive import Keyframe
 
 logger = logging.getLogger(__name__)
 
@@ -21,14 +26,14 @@ logger = logging.getLogger(__name__)
 class RunFolder:
     """The files of one run, under the names of the contract (``docs/run-folder.md``)."""
 
-    def __init__(self, path: Path, replaces: Path | None = None) -> None:
-        """A folder that exists.
+    def __init__(self, path: str | Path, replaces: Path | None = None) -> None:
+        """A folder that exists, such as ``results/latest``.
 
         Args:
             path: where its files are.
             replaces: the folder of an earlier run, which `publish` replaces by this one.
         """
-        self.path = path
+        self.path = Path(path)
         self.replaces = replaces
 
     @classmethod
@@ -131,6 +136,35 @@ class RunFolder:
         """One of the trajectories (``network``, ``optimised``, ``reference`` ...), or None where absent."""
         path = self.path / trajectory_file(name, "tum")
         return read_trajectory(path, "tum") if path.exists() else None
+
+    def mesh(self) -> Any:
+        """The map as an Open3D ``TriangleMesh``, y down; `RunError` where the run has none."""
+        return import_open3d().io.read_triangle_mesh(str(self.require(MAP_MESH)))
+
+    def cloud(self) -> Any:
+        """The map as an Open3D ``PointCloud``, y down; `RunError` where the run has none."""
+        return import_open3d().io.read_point_cloud(str(self.require(MAP_CLOUD)))
+
+    def keyframes(self) -> dict[int, Keyframe]:
+        """Images and depth of the map's keyframes by frame; needs ``output.keep=keyframes``.
+
+        Depth is unscaled: ``metrics().scale.value`` takes it to the unit of the run, but for drift.
+
+        Raises:
+            RunError: the run kept none.
+        """
+        from slam.pipeline.checkpoint import SessionCheckpoint
+
+        found = {keyframe.index: keyframe for keyframe in SessionCheckpoint.open(self.path).state.drive.keyframes}
+        if not found:
+            raise RunError(f"{self.path} kept no keyframes: run with --set output.keep=keyframes")
+        return found
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from slam.results.notebook import html
+
+        return html(self)
 
     def require(self, name: str) -> Path:
         """The path of a file of the run.

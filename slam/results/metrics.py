@@ -14,6 +14,7 @@ from slam.runtime.storage.record import MISSING, Count, Known, Missing, Record, 
 
 METRES = "metres"
 CAMERA_HEIGHTS = "camera heights"
+NO_UNIT = "no metric unit"
 
 
 class Recording(Record):
@@ -24,6 +25,7 @@ class Recording(Record):
     gps: Known[str] = MISSING
     sequence: Known[str] = MISSING
     frames: Known[str] = MISSING
+    truth: Known[str] = MISSING
 
 
 class Provenance(Record):
@@ -270,7 +272,7 @@ class Metrics(Record):
 
     @property
     def unit(self) -> str:
-        """``metres``, ``camera heights``, or ``the networks' own unit`` where no road was found."""
+        """``metres``, ``camera heights``, or without a road ``no metric unit`` or ``the networks' own unit``."""
         return known(self.scale.unit) or METRES
 
     @property
@@ -285,6 +287,13 @@ class Metrics(Record):
                 "Scale mode none: lengths of odometry, optimised and the map are in camera heights of the learned road "
                 "plane, not in metres; only the alignments with scale (scale, 7 dof) compare with metres. "
                 "For metres: camera_height_m in camera.yaml, a GPS track or scale.mode=known."
+            ]
+        if self.scale.mode == "none" and self.unit == NO_UNIT:
+            seen, frames = known(self.scale.frames_used), known(self.sequence.frames)
+            return [
+                f"No metric unit: {seen} of {frames} frames see a road. Only "
+                "the alignments with scale (scale, 7 dof) compare with metres. For metres, give the distance of two "
+                "frames: --set scale.mode=known --set scale.known_between=[0,50] --set scale.known_m=1.5."
             ]
         if self.is_metric:
             return []

@@ -1,1 +1,1 @@
-"""Time, threads, progress bars and imports of heavy libraries."""
+"""Time, threads and imports of heavy libraries."""

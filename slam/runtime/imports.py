@@ -5,8 +5,10 @@ import functools
 import importlib
 import sys
 from contextlib import suppress
+from importlib.metadata import EntryPoint, entry_points
 from threading import Thread
 from types import ModuleType
+from typing import Any
 
 from slam.runtime.errors import DownloadError, SequenceError, SlamError
 
@@ -74,6 +76,25 @@ def import_extra(extra: str) -> tuple[ModuleType, ...]:
         return tuple(importlib.import_module(name) for name in modules)
     except (ImportError, OSError) as error:
         raise error_type(f"{needs} ({error}): pip install 'erfsfm-slam[{extra}]'") from error
+
+
+@functools.cache
+def plug_ins(group: str) -> dict[str, EntryPoint]:
+    """What other packages offer as entry points of a group, by name."""
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def import_plug_in(point: EntryPoint) -> Any:
+    """What an entry point names.
+
+    Raises:
+        SlamError: its package cannot be loaded.
+    """
+    try:
+        return point.load()
+    except (ImportError, AttributeError, OSError) as error:
+        package = "another package" if point.dist is None else point.dist.name
+        raise SlamError(f"{point.name} of {package} cannot be loaded ({error}): repair or uninstall it") from error
 
 
 def import_open3d_beside() -> None:

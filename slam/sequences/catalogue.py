@@ -12,18 +12,22 @@ from erfsfm.common.readers.kitti_drives import drive_name, find_odometry_root
 from erfsfm.common.readers.video import VIDEO_SUFFIXES
 from slam.frames import Sequence
 from slam.runtime.errors import SequenceError, sequence_errors
+from slam.runtime.imports import import_plug_in, plug_ins
 from slam.sequences import argoverse, euroc, folder, nuscenes, scannet, seven_scenes, tum, tum_mono, video
 from slam.sequences.excerpt import Excerpt, SourcedSequence, frame_range
 from slam.sequences.kitti import odometry, raw
 from slam.sequences.loader import Asked, Loader, Opener
 from slam.sequences.ros import loader as ros
+from slam.sequences.truth import take_truth
 
 KITTI_VARIABLE = "KITTI_ODOMETRY"
 KITTI_NAME = "KITTI"
 EMBEDDED_SEED = 1000
 EMBEDDED_FRAMES = 320
 
-# the first that recognises a path opens it
+PLUG_INS = "erfsfm_slam.sequences"  # entry points of other packages: each names a `Loader`
+
+# the first that recognises a path opens it; loaders of other packages come before these
 LOADERS: tuple[Loader, ...] = (
     odometry.LOADER,
     raw.LOADER,
@@ -54,6 +58,7 @@ def open_sequence(
     name: str | None = None,
     camera: Path | None = None,
     frames: str | None = None,
+    truth: Path | None = None,
 ) -> Sequence:
     """Open a sequence of any kind.
 
@@ -64,6 +69,7 @@ def open_sequence(
         name: which sequence of ``dataset``; optional where there is one only.
         camera: a ``camera.yaml``, or ``fov=DEGREES``; it replaces the calibration of the data set.
         frames: ``A:B``, half-open, as Python reads a slice.
+        truth: its true poses, in place of those that the data set has.
 
     Returns:
         The sequence, or the ``Excerpt`` of it.
@@ -72,12 +78,15 @@ def open_sequence(
         SequenceError: one line on what was searched, where, what was found and what to do.
     """
     if dataset is None and name is None:
-        if camera is not None:
-            raise SequenceError(f"a camera file ({camera}) without a data set: give --dataset as well")
+        for what, given in (("a camera file", camera), ("a file of true poses", truth)):
+            if given is not None:
+                raise SequenceError(f"{what} ({given}) without a data set: give --dataset as well")
         sequence = _open_embedded()
     else:
         root = _root(dataset, name)
         sequence = _choose(root, Asked(name, camera))
+    if truth is not None:
+        take_truth(sequence, truth)
     if frames is None:
         return sequence
     return Excerpt(sequence, *frame_range(frames, len(sequence)))
@@ -138,8 +147,12 @@ def _contents(root: Path, asked: Asked) -> dict[str, Found]:
     return found
 
 
+def _loaders() -> tuple[Loader, ...]:
+    return (*map(import_plug_in, plug_ins(PLUG_INS).values()), *LOADERS)
+
+
 def _recognised(root: Path, asked: Asked) -> dict[str, Found]:
-    for loader in LOADERS:
+    for loader in _loaders():
         openers = loader.find(root, asked)
         if openers:
             return {name: Found(loader.kind, opener) for name, opener in openers.items()}
@@ -178,7 +191,7 @@ def _unknown(root: Path) -> str:
             f"no sequence with images under {kitti.sequences}: looked for png or jpg in */image_2, image_3, "
             f"image_0, image_1; found {_listed(kitti.sequences)}; unpack the images there"
         )
-    looked = ", ".join(f"{loader.layout} ({loader.kind})" for loader in LOADERS)
+    looked = ", ".join(f"{loader.layout} ({loader.kind})" for loader in _loaders())
     return f"{root} is no data set: looked for {looked}; found {_listed(root)}; check the path"
 
 

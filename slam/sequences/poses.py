@@ -90,7 +90,7 @@ def describe_unknown(T_any_camera: FloatArray, path: Path) -> None:
     longest = max(runs(np.flatnonzero(known).tolist()), key=lambda run: run[1] - run[0], default=None)
     advice = "" if longest is None else f"; frames {longest[0]}:{longest[1] + 1} have one each (--frames)"
     missing = int(np.argmin(known))
-    logger.warning("%s has no pose within 0.1 s of image %d: the sequence has no reference%s", path, missing, advice)
+    logger.warning("%s has no pose of image %d: the sequence has no reference%s", path, missing, advice)
 
 
 def known_poses(T_any_camera: FloatArray) -> NDArray[np.bool_]:

@@ -115,6 +115,11 @@ class RecordedSequence:
         _require_plausible_rate(self.name, self.stamps)
         if self.T_camera_lidar is not None and not is_se3(self.T_camera_lidar, _RIGID_TOLERANCE):
             raise SequenceError(f"{self.name}: the calibration of its LiDAR is no rotation and translation")
+        self.take_truth(self.T_any_camera)
+
+    def take_truth(self, T_any_camera: FloatArray | None) -> None:
+        """Let these be the true poses."""
+        self.T_any_camera, self.reference = T_any_camera, None
         self.reference = self.true_poses(0, len(self))
         if self.reference is not None:
             _doubt_speed(self.name, self.reference, self.stamps)

@@ -50,7 +50,8 @@ def test_weights_have_the_name_of_the_configuration_that_trains_them(weights: st
 def test_it_starts(name: str, data: list[Path], measure: Callable[..., None], tmp_path: Path) -> None:
     written = load_experiment(name)
     small = ["training.batch=2", "training.steps=1", "data.workers=0", "data.validation=[simulated/500]"]
-    small += ["data.validation_snippets=1", "data.cache_mb=50", f"teacher.cache={tmp_path / 'measured'}"]
+    small += ["data.validation_share=0", "data.validation_snippets=1", "data.cache_mb=50"]
+    small += [f"teacher.cache={tmp_path / 'measured'}"]
     if written.initial_weights is None:  # those fit one size and width
         small += ["network.height=96", "network.width=160", "network.depth_width=0.0625", "network.pose_width=0.125"]
         small += [] if written.network.fidelity == "default" else ["network.height=128", "network.width=192"]

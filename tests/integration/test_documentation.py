@@ -92,6 +92,7 @@ NOT_RUN: tuple[tuple[str, str], ...] = (
     (r"^erfsfm-slam batch ", "it starts a cluster; tests/slam/commands/batch does"),
     (r"--dataset walk ", "it wants a walk of 311 frames; tests/slam/pipeline/test_positioning.py has known distances"),
     (r"clear640|other640|kitti05", "several drives of 300 frames; tests/slam/commands/localisation has short ones"),
+    (r"--config own |runs/own", "it wants a drive; tests/integration/test_own_training.py has one"),
     (r"--install-completion", "it changes the profile of the user's shell"),
 )
 if importlib.util.find_spec("rerun") is None:

@@ -9,6 +9,10 @@ from typing import Any
 import pytest
 
 from slam import run_slam
+from slam.commands.localisation.accuracy import MapTruth
+from slam.commands.localisation.localiser import localise
+from slam.formats.trajectory import read_trajectory
+from slam.geometry.se3 import invert
 
 TRAJECTORY_ALONE = ("mapping.enabled=false", "output.report=false")
 
@@ -30,6 +34,25 @@ def test_a_drive_at_full_size(data_root: Path, tmp_path: Path) -> None:
     root = data_root / "kitti_odometry_original"
     run = run_slam(root, "00", frames="0:25", output=tmp_path / "run", device="cpu", overrides=TRAJECTORY_ALONE)
     assert run.metrics().tree()["trajectories"]["optimised"]["align"]["6dof"]["ate_rmse_m"] < 0.5
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_images_beside_the_map_of_a_kitchen_are_localised(data_root: Path, tmp_path: Path) -> None:
+    """Learned depth of a room is wrong by half, so only triangulated points can tell where an image was taken."""
+    images, poses = data_root / "handheld_kitchen" / "images", data_root / "handheld_kitchen" / "poses.kitti.txt"
+    overrides = [*TRAJECTORY_ALONE, "scale.mode=reference"]
+    run = run_slam(images, frames="0:300", truth=poses, output=tmp_path / "run", device="cpu", overrides=overrides)
+    numbers = range(322, 342, 2)  # 0.2 to 0.4 m from the nearest view
+    known = read_trajectory(poses).T_world_camera
+    truth = MapTruth.of(run)
+    errors = [
+        truth.error(found, invert(known[0]) @ known[number])
+        for number, found in zip(numbers, localise(images, run, numbers=numbers), strict=True)
+    ]
+    assert sum(error is not None and error.error_m < 0.1 for error in errors) >= 9
+    street = data_root / "street_depth" / "images"
+    assert all(found.T_world_camera is None for found in localise(street, run, Path("fov=70")))
 
 
 @pytest.mark.data

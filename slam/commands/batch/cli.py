@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import Config, Device, Overrides, Seed
 from slam.runtime.errors import RunError, SlamError
-from slam.runtime.progress import progress_bar
 from slam.runtime.storage.files import from_anywhere
 from slam.runtime.terminal import print_table
 

@@ -12,11 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from erfsfm.common.progress import Progress
 from slam.commands.batch.cluster import Spread
 from slam.commands.batch.manifest import Drive
 from slam.results.folder import RunFolder
 from slam.runtime.errors import SlamError
-from slam.runtime.progress import Progress
 
 Status = Literal["whole", "kept", "failed"]
 _POLL_S = 0.5
@@ -45,6 +45,7 @@ class Outcome:
 def run_drives(drives: list[Drive], output: Path, limits: Limits, spread: Spread, progress: Progress) -> list[Outcome]:
     """Run the drives that are not whole in ``output``; one outcome a drive, in their order."""
     outcomes: dict[int, Outcome] = {}
+    progress("drives", 0, len(drives))
     for number, result in spread(partial(run_drive, output=output.absolute(), limits=limits), drives):
         drive = drives[number]
         if isinstance(result, Outcome):

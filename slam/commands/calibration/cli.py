@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import UnusedDevice, UnusedSeed
-from slam.runtime.progress import progress_bar
 
 verbs = typer.Typer()
 

@@ -10,6 +10,7 @@ import yaml
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.figure_file import require_figure
+from erfsfm.common.progress import Progress
 from erfsfm.common.readers.camera_file import CameraFile, read_camera_file
 from erfsfm.common.readers.folder import image_folder
 from erfsfm.common.readers.images import list_images
@@ -20,7 +21,6 @@ from slam.commands.calibration.picture import write_picture
 from slam.commands.calibration.solve import Calibration, Model, calibrate
 from slam.commands.calibration.views import chosen, find_views
 from slam.runtime.errors import CalibrationError, sequence_errors
-from slam.runtime.progress import Progress
 from slam.runtime.storage.files import write_atomically
 from slam.sequences.camera_file import DEFAULT_FPS
 from slam.sequences.images import ImageFiles, ImageSource

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from erfsfm.common.progress import Progress
 from slam.commands.calibration.board import Board, Detector
 from slam.frames import Grey, Image
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import CalibrationError
-from slam.runtime.progress import Progress
 from slam.sequences.images import ImageSource
 
 MOST_VIEWS = 40

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.runtime.errors import DownloadError
-from slam.runtime.progress import progress_bar
 
 verbs = typer.Typer()
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from erfsfm.common.progress import Progress
 from slam.commands.downloads.connection import require_space
 from slam.commands.downloads.zip_members import ZipMembers
 from slam.runtime.errors import DownloadError
-from slam.runtime.progress import Progress
 
 LICENCE = """KITTI odometry: A. Geiger, P. Lenz, C. Stiller, R. Urtasun; Karlsruhe Institute of Technology and Toyota
 Technological Institute at Chicago. Licence: Creative Commons Attribution-NonCommercial-ShareAlike 3.0

@@ -10,9 +10,9 @@ import tarfile
 import zlib
 from pathlib import Path
 
+from erfsfm.common.progress import Progress
 from slam.commands.downloads.connection import CHUNK, BrokenError, Connection, connection_errors, require_space, retried
 from slam.runtime.errors import DownloadError
-from slam.runtime.progress import Progress
 
 LICENCE = """TUM RGB-D: J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers; Technical University of Munich.
 Licence: Creative Commons Attribution 4.0 (https://creativecommons.org/licenses/by/4.0/): name the authors.

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import UnusedDevice, UnusedSeed
-from slam.runtime.progress import progress_bar
 
 verbs = typer.Typer()
 
@@ -30,7 +30,10 @@ def export(
     origin: Annotated[
         str | None, typer.Option(help="LAT,LON,HEADING of the first camera, degrees: a raster also as GeoTIFF")
     ] = None,
-    dataset: Annotated[Path | None, typer.Option(help="where the images of the run are now, for nerfstudio")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="where the images of the run are now, for colmap and nerfstudio")
+    ] = None,
+    points: Annotated[int | None, typer.Option(help="at most so many points of a COLMAP model")] = None,
     seed: UnusedSeed = 0,
     device: UnusedDevice = "auto",
 ) -> None:
@@ -46,10 +49,12 @@ def export(
     from slam.commands.exports.options import ExportOptions, parse_crop, parse_origin
     from slam.results.folder import RunFolder
 
-    options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset)
+    options = ExportOptions(parse_crop(crop), voxel, triangles, resolution, parse_origin(origin), dataset, points)
     folder = RunFolder.open(run)
     with progress_bar() as progress:
+        progress(f"export of {what}", 0, 1)
         written = export_run(folder, what, output, up, options, progress)
+        progress(f"export of {what}", 1, 1)
     typer.echo(f"{what} of {run} in {written}")
     for note in folder.metrics().unit_notes():
         typer.echo(note)

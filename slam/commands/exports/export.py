@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.commands.exports.nerfstudio import interpolated, write_scene
+from erfsfm.common.progress import Progress, silent
+from slam.commands.exports.colmap import write_model
+from slam.commands.exports.nerfstudio import write_scene
 from slam.commands.exports.occupancy import occupancy_grid
 from slam.commands.exports.options import DEFAULT_RESOLUTION, R_UP_WORLDS, ExportOptions
 from slam.commands.exports.parts import PARTS, check_options, check_target
 from slam.commands.exports.raster import height_raster, write_raster
 from slam.commands.exports.surface import prepared
 from slam.config.sections import load_stored
-from slam.formats.colmap import write_colmap
 from slam.formats.g2o import check_g2o
 from slam.formats.gltf import write_gltf
 from slam.formats.las import write_las
@@ -27,14 +28,12 @@ from slam.formats.ply import Ply, read_ply, rotated, write_ply
 from slam.formats.ros_map import write_ros_map
 from slam.formats.trajectory import Trajectory, write_kitti, write_tum
 from slam.geometry import se3
-from slam.loops.places import Places
 from slam.mapping.submap import Submap, submap_paths
 from slam.mapping.surface import MapSurface
 from slam.results.folder import RunFolder
 from slam.results.metrics import CAMERA_HEIGHTS, METRES
 from slam.runtime.errors import RunError
-from slam.runtime.progress import Progress
-from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
+from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, MAP_CLOUD, MAP_MESH, SUBMAPS
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.storage.record import known
 
@@ -50,7 +49,7 @@ def export(
     output: Path,
     up: str = "y-down",
     options: ExportOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Path:
     """Write one part of a run, each file whole or not at all; missing parent folders are made.
 
@@ -87,11 +86,8 @@ def export(
         source = folder.require(GRAPH)
         check_g2o(source)
         write_atomically(output, lambda path: shutil.copyfile(source, path), RunError)
-    elif what == "colmap":
-        _export_colmap(folder, output, up, options, progress)
-    elif what == "nerfstudio":
-        cloud = _cloud(folder, up, options, progress)
-        write_scene(folder, output, _trajectory(folder, up), cloud, options.dataset, progress)
+    elif what in ("colmap", "nerfstudio"):
+        _export_scene(folder, what, output, up, options, progress)
     elif what == "raster":
         _export_raster(folder, output, options, progress)
     else:
@@ -100,7 +96,7 @@ def export(
 
 
 def _export_map(
-    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress | None
+    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress
 ) -> None:
     suffix, suffixes = output.suffix.lower(), PARTS[what].beginnings
     if suffix not in suffixes:
@@ -114,16 +110,17 @@ def _export_map(
             _WRITERS[suffix](output, _rotated(prepared(ply, options), up))
 
 
-def _export_colmap(folder: RunFolder, output: Path, up: str, options: ExportOptions, progress: Progress | None) -> None:
-    """Poses of all frames with a usable image, the run's camera, and the cloud of the map where there is one."""
-    trajectory, camera = _trajectory(folder, up), Places.read(folder.require(PLACES)).intrinsics
-    cloud = _cloud(folder, up, options, progress)
-    points = np.zeros((0, 3)) if cloud is None else cloud.points
-    colours = np.zeros((0, 3), np.uint8) if cloud is None else cloud.colours_or_grey
-    write_colmap(output, camera, trajectory.T_world_camera, points, colours, interpolated(folder))
+def _export_scene(
+    folder: RunFolder, what: str, output: Path, up: str, options: ExportOptions, progress: Progress
+) -> None:
+    trajectory, cloud = _trajectory(folder, up), _cloud(folder, up, options, progress)
+    if what == "colmap":
+        write_model(folder, output, trajectory, R_UP_WORLDS[up], cloud, options, progress)
+    else:
+        write_scene(folder, output, trajectory, cloud, options.dataset, progress)
 
 
-def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> None:
+def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress) -> None:
     unit = folder.metrics().unit
     if options.origin is not None and unit != METRES:
         raise RunError(f"a place on the earth needs metres, but this run's lengths are in {unit}: leave --origin")
@@ -132,7 +129,7 @@ def _export_raster(folder: RunFolder, output: Path, options: ExportOptions, prog
     write_raster(output, raster, unit)
 
 
-def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress | None) -> Path:
+def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, progress: Progress) -> Path:
     if output.suffix.lower() not in (".yaml", ".pgm"):
         raise RunError(f"an occupancy grid is a .yaml and a .pgm; got '{output.name}', give a name that ends in .yaml")
     unit = folder.metrics().unit
@@ -147,21 +144,21 @@ def _export_occupancy(folder: RunFolder, output: Path, options: ExportOptions, p
     return written
 
 
-def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress | None) -> Ply | None:
+def _cloud(folder: RunFolder, up: str, options: ExportOptions, progress: Progress) -> Ply | None:
     """The cloud of the map, None where the run has neither it nor submaps of which it can be made."""
     if not (folder.path / MAP_CLOUD).is_file() and not submap_paths(folder.path / SUBMAPS):
         return None
     return _map(folder, "cloud", up, options, progress)
 
 
-def _map(folder: RunFolder, what: str, up: str, options: ExportOptions, progress: Progress | None) -> Ply:
+def _map(folder: RunFolder, what: str, up: str, options: ExportOptions, progress: Progress) -> Ply:
     """The mesh or cloud of the map as the options want it, in the given axes."""
     with _map_file(folder, what, progress) as source:
         return _rotated(prepared(read_ply(source), options), up)
 
 
 @contextmanager
-def _map_file(folder: RunFolder, what: str, progress: Progress | None) -> Iterator[Path]:
+def _map_file(folder: RunFolder, what: str, progress: Progress) -> Iterator[Path]:
     """The ``mesh`` or ``cloud`` as a PLY file, which may be gone afterwards; of a killed run that of its submaps."""
     paths = submap_paths(folder.path / SUBMAPS)
     if (folder.path / _MAPS[what]).is_file() or not paths:

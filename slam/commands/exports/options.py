@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.geometry.se3 import FloatArray
 from slam.runtime.errors import RunError
@@ -29,7 +30,7 @@ class Crop:
     low: FloatArray
     high: FloatArray
 
-    def contains(self, points: FloatArray) -> FloatArray:
+    def contains(self, points: FloatArray) -> NDArray[np.bool_]:
         """Which points ``(P, 3)`` lie inside, ``(P,)`` bool."""
         return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1))
 
@@ -54,6 +55,7 @@ class ExportOptions:
         resolution: side of a raster's or grid's cell.
         origin: makes a raster a map with north up, and writes GeoTIFF.
         dataset: where the images of the run are now.
+        points: at most so many of a COLMAP model.
     """
 
     crop: Crop | None = None
@@ -62,6 +64,7 @@ class ExportOptions:
     resolution: float | None = None
     origin: Origin | None = None
     dataset: Path | None = None
+    points: int | None = None
 
 
 def parse_crop(text: str | None) -> Crop | None:

@@ -53,7 +53,10 @@ PARTS = {
     "cloud": Part(("crop", "voxel"), {".ply": b"ply", ".las": b"LASF", ".laz": b"LASF"}),
     "trajectory": Part(),
     "graph": Part((), {".g2o": b"VERTEX_SE3", ".txt": b"VERTEX_SE3"}, up="y-down"),
-    "colmap": Part(("crop", "voxel"), folder=FolderPart("a COLMAP model", MODEL_FILES, is_own_model)),
+    "colmap": Part(
+        ("crop", "voxel", "dataset", "points"),
+        folder=FolderPart("a COLMAP model", ("images", *MODEL_FILES), is_own_model),
+    ),
     "nerfstudio": Part(
         ("crop", "voxel", "dataset"), folder=FolderPart("a scene", ("images", POINTS, TRANSFORMS), is_own_scene)
     ),
@@ -82,6 +85,8 @@ def check_options(what: str, up: str, options: ExportOptions) -> None:
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and value > 0):
             raise RunError(f"--{name} {value} must be a positive length")
+    if options.points is not None and options.points < 1:
+        raise RunError(f"--points {options.points} is too few: give 1 or more")
     if options.triangles is not None and options.triangles < _MIN_TRIANGLES:
         raise RunError(f"--triangles {options.triangles} is too few: give {_MIN_TRIANGLES} or more")
     only = PARTS[what].up

@@ -23,7 +23,7 @@ def live(
 ) -> None:
     """Poses while frames arrive, one JSON line a frame. Ctrl-C, or the end of the stream, leaves a whole run folder.
 
-    Example: erfsfm-slam live --camera 0 --calibration camera.yaml --output walk
+    Example: erfsfm-slam live --dataset 0 --camera camera.yaml --output walk
     """
     from slam.commands.live.messages import emitters
     from slam.commands.live.run import run_live

@@ -32,16 +32,20 @@ class Reader:
         ended: why there are no more, after the last one.
     """
 
-    def __init__(self, source: Source, most_wait_s: float, prepare: Callable[[Image], Image]) -> None:
+    def __init__(
+        self, source: Source, most_wait_s: float, prepare: Callable[[Image], Image], every_frame: bool = False
+    ) -> None:
         """Start to read.
 
         Args:
             source: is read until it ends, dies, or sends nothing for ``most_wait_s``.
             most_wait_s: seconds.
             prepare: what is done with every image that is taken, such as undistortion.
+            every_frame: the source waits until each image was taken.
         """
         self.dropped, self.ended = 0, ""
         self._source, self._most_wait_s, self._prepare = source, most_wait_s, prepare
+        self._every_frame = every_frame
         self._newest: Arrival | None = None
         self._reason: str | None = None
         self._changed, self._stopped = Condition(), Event()
@@ -65,6 +69,7 @@ class Reader:
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None or self._reason is not None, self._most_wait_s)
             arrival, self._newest = self._newest, None
+            self._changed.notify()
             if arrival is None:
                 self.ended = self._reason or f"nothing came for {self._most_wait_s:g} s"
                 self._stopped.set()
@@ -74,6 +79,8 @@ class Reader:
         try:
             for stamp, image in self._source.images(self._stopped):
                 with self._changed:
+                    if self._every_frame:
+                        self._changed.wait_for(lambda: self._newest is None or self._stopped.is_set())
                     if self._stopped.is_set():
                         return
                     self.dropped += self._newest is not None

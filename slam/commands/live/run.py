@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -71,22 +72,22 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
         import_extra("rerun")
     settings = load_config(request.config, request.overrides or ())
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
-    source = open_source(request.camera, request.wait)
-    camera = calibration_of(request.camera, request.calibration, source)
+    source = open_source(request.source, request.wait)
+    camera = calibration_of(request.source, request.camera_file, source)
     source.fps = camera.fps
     intrinsics = StreamedSequence.intrinsics_of(camera)
     depth = open_depth(settings.depth, intrinsics, None)
     predictor = make_predictor(networks, depth, settings.depth, intrinsics)
-    name = Path(request.camera).stem or "live"
+    name = Path(request.source).stem or "live"
     growing = GrowingSequence(intrinsics, camera.height_or(None), name=name)
     require_possible(growing, settings, predictor.sources + 1)
-    sequence = StreamedSequence(name, source, camera, request.wait)
+    sequence = StreamedSequence(name, source, camera, request.wait, request.every_frame)
     pipeline = SlamPipeline(sequence, predictor, settings, noise=networks.noise, seed=request.seed)
     poses = LivePoses(predictor.sources, sequence.camera_height_m, settings, networks.noise)
     session = _Session(sequence, poses, emit, Viewer(intrinsics) if request.view else None)
     recorded = RunRequest(
-        dataset=Path(request.camera),
-        camera=request.calibration,
+        dataset=Path(request.source),
+        camera=request.camera_file,
         weights=request.weights,
         output=request.output,
         seed=request.seed,
@@ -98,7 +99,7 @@ def _prepare(request: LiveRequest, emit: Emit) -> tuple[Job, StreamedSequence]:
     return Job(settings, sequence, pipeline, provenance, sha256, None, stream=stream), sequence
 
 
-_DROPPED = "; {} images were dropped, for they came faster than they were measured ('run' takes all of a recording)"
+_DROPPED = "; {} images were dropped, for they came faster than they were measured (--every-frame drops none)"
 
 
 class _Session:
@@ -107,11 +108,13 @@ class _Session:
     def __init__(self, sequence: StreamedSequence, poses: LivePoses, emit: Emit, viewer: Viewer | None) -> None:
         self._sequence, self._poses, self._emit, self._viewer = sequence, poses, emit, viewer
         self._said = 0
+        self._dropped, self._dropped_said_s = 0, -math.inf
 
     def watch(self, observer: Observer) -> None:
         """Say the poses of frames that were finished since the last call."""
         if not self._sequence.reader.is_waiting:
             observer.flush()
+        self._say_dropped()
         for newest in self._poses.add(observer):
             index, self._said = self._said, self._said + 1
             arrival = self._sequence.arrivals.get(index)
@@ -120,6 +123,13 @@ class _Session:
             self._emit(message | {"latency_ms": late, "dropped": self._sequence.reader.dropped})
             if self._viewer is not None:
                 self._viewer.show(index, observer.drive, newest)
+
+    def _say_dropped(self) -> None:
+        """Once a second, while more images are dropped."""
+        dropped, now_s = self._sequence.reader.dropped, time.monotonic()
+        if dropped > self._dropped and now_s - self._dropped_said_s >= 1.0:
+            self._dropped, self._dropped_said_s = dropped, now_s
+            logger.warning("%d images dropped, %d measured", dropped, len(self._sequence))
 
     def tracked(self) -> Trajectory:
         """The poses that were said so far."""

@@ -20,10 +20,13 @@ from slam.sequences.undistortion import Undistortion
 class StreamedSequence(GrowingSequence):
     """The frames that a reader gave so far; ``arrivals`` are the arrival times of the last ones, by frame."""
 
-    def __init__(self, name: str, source: Source, camera: CameraFile, most_wait_s: float) -> None:
+    def __init__(
+        self, name: str, source: Source, camera: CameraFile, most_wait_s: float, every_frame: bool = False
+    ) -> None:
         """Begin to read.
 
         Raises:
+            SequenceError: every frame is wanted of a source that does not wait.
             SequenceError: the camera has another image size than the source.
         """
         if (camera.width, camera.height) != (source.width, source.height):
@@ -31,9 +34,12 @@ class StreamedSequence(GrowingSequence):
                 f"{name} gives images of {source.width} x {source.height} and the camera file is for {camera.width} x "
                 f"{camera.height}: give the calibration of this camera at this size"
             )
+        if every_frame and not source.is_stored:
+            raise SequenceError(f"{name} does not wait while an image is measured: leave out --every-frame")
         undistortion = Undistortion(camera) if camera.is_distorted else None
         super().__init__(self.intrinsics_of(camera), camera.height_or(None), name=name)
-        self.reader = Reader(source, most_wait_s, _as_they_are if undistortion is None else undistortion.apply)
+        prepare = _as_they_are if undistortion is None else undistortion.apply
+        self.reader = Reader(source, most_wait_s, prepare, every_frame)
         self.arrivals: dict[int, Arrival] = {}
 
     @staticmethod
@@ -63,9 +69,7 @@ def calibration_of(camera: str, given: Path | None, source: Source) -> CameraFil
     found = beside(*places)
     if found is None:
         looked = f"; no {CAMERA_FILE} is in {' or '.join(map(str, places))}" if places else ""
-        raise SequenceError(
-            f"camera {camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70{looked}"
-        )
+        raise SequenceError(f"{camera} needs its calibration: give --calibration {CAMERA_FILE} or fov=70{looked}")
     return found
 
 

@@ -29,11 +29,12 @@ logger = logging.getLogger(__name__)
 
 
 class Source(Protocol):
-    """Images as they come, each with its stamp in seconds."""
+    """Images as they come, each with its stamp in seconds; ``is_stored`` where they wait to be read."""
 
     width: int
     height: int
     fps: float
+    is_stored: bool
 
     def images(self, stopped: Event) -> Iterator[tuple[float, Image]]:
         """All images until the source ends or ``stopped`` is set; ``SequenceError`` where it dies."""
@@ -42,6 +43,8 @@ class Source(Protocol):
 
 class FolderSource:
     """A folder that another program fills; image ``k`` in natural order was taken at ``k / fps``."""
+
+    is_stored = True
 
     def __init__(self, folder: Path, wait_s: float) -> None:
         """Wait up to ``wait_s`` for the first image that can be read; it gives the size.
@@ -130,12 +133,12 @@ class VideoSource:
             SequenceError: it cannot be opened or gives no image.
         """
         self._name = name
-        self._is_file = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
+        self.is_stored = Path(name).is_file() and Path(name).suffix.lower() not in _DESCRIBED_STREAMS
         self._pipe = _opened(name, wait_s) if Path(name).is_fifo() else None
         # by its descriptor: who wrote a short video is gone before OpenCV opens the pipe, and OpenCV waits for ever
         source = name if self._pipe is None else f"pipe:{self._pipe.fileno()}"
         self._capture: Any = cv2.VideoCapture(int(name)) if name.isdecimal() else cv2.VideoCapture(source)
-        self.fps = float(self._is_file and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
+        self.fps = float(self.is_stored and self._capture.get(cv2.CAP_PROP_FPS)) or DEFAULT_FPS
         self._first = self._next()
         if self._first is None:
             raise SequenceError(f"no image comes from {name}: check the camera, the address or the file")
@@ -145,8 +148,8 @@ class VideoSource:
         """Images at their time: in a file that of its frame rate, elsewhere that of their arrival."""
         began, count, image = time.monotonic(), 0, self._first
         while image is not None and not stopped.is_set():
-            stamp = count / self.fps if self._is_file else time.monotonic() - began
-            if self._is_file and stopped.wait(max(began + stamp - time.monotonic(), 0.0)):
+            stamp = count / self.fps if self.is_stored else time.monotonic() - began
+            if self.is_stored and stopped.wait(max(began + stamp - time.monotonic(), 0.0)):
                 break
             yield stamp, image
             count, image = count + 1, self._next()

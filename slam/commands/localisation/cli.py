@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from erfsfm.common.progress import progress_bar
 from slam.commands.options import Json, UnusedDevice, UnusedSeed
-from slam.runtime.progress import progress_bar
 from slam.runtime.terminal import print_table
 
 verbs = typer.Typer()
@@ -20,7 +20,10 @@ def localize(
     images: Annotated[Path, typer.Argument(help="an image or a folder of images")],
     map: Annotated[Path, typer.Option("--map", help="a run folder")],
     camera: Annotated[
-        Path | None, typer.Option(help="camera.yaml or fov=DEGREES; default: beside the images, else the run's")
+        Path | None,
+        typer.Option(
+            "--camera", "--calibration", help="camera.yaml or fov=70; default: beside the images, else the run's"
+        ),
     ] = None,
     frames: Annotated[str | None, typer.Option(help="A:B of the images, half-open")] = None,
     every: Annotated[int, typer.Option(min=1, help="every n-th of them")] = 1,

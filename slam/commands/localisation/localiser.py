@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from erfsfm.common.errors import DataError
 from erfsfm.common.readers.camera_file import CAMERA_FILE, CameraFile
@@ -18,12 +19,15 @@ from erfsfm.common.readers.numbering import in_order
 from erfsfm.common.threads import take_working_memory
 from slam.config.sections import LoopsConfig, load_stored
 from slam.frames import Frame, Image, Intrinsics, View
-from slam.geometry.se3 import FloatArray, apply, invert
-from slam.loops.descriptors import FeatureExtractor
+from slam.frontend.keyframes.camera_pose import CameraPose, resect
+from slam.geometry.resection import consensus
+from slam.geometry.se3 import FloatArray, apply, invert, make
+from slam.loops.descriptors import FeatureExtractor, hamming
 from slam.loops.places import Places
 from slam.loops.retrieval import PlaceIndex
-from slam.loops.thresholds import LoopThresholds
-from slam.loops.verification import LoopVerifier, matches
+from slam.loops.structure import PlaceStructure
+from slam.loops.thresholds import OF_KEYFRAMES, LoopThresholds
+from slam.loops.verification import matches
 from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError
 from slam.runtime.run_files import CONFIG, PLACES
@@ -33,8 +37,13 @@ from slam.sequences.images import ImageFiles
 from slam.sequences.undistortion import Undistortion
 
 _PLACES_TRIED = 8
-# lower than for loops: corners match at several places, and learned depth is too uncertain for those seen from close by
-_MIN_INLIER_RATIO = 0.25
+_PLACES_AROUND = 12  # around the pose, whose points are looked for in the image
+_MOST_DIFFERING = 50  # bits of descriptors where the pose is known: less sure matches pull it towards itself
+_SAMPLES = 300  # of RANSAC
+_LEAST_POINTS = 8  # of a place, to try it
+_LEAST_INLIERS = 30
+_LEAST_RATIO = 0.5
+_MOST_SIGMA = 0.01  # of the position, over the depth of the points
 _ASPECT_TOLERANCE = 0.01
 
 
@@ -122,17 +131,17 @@ class Localiser:
             intrinsics: of the new images; None for those of the run, with images resized to it.
         """
         self._places = places
-        self._thresholds = LoopThresholds.of_frames(config)
+        self._thresholds = replace(LoopThresholds.of_frames(config), max_hamming=OF_KEYFRAMES.max_hamming)
         self._resizes = intrinsics is None
         self._intrinsics = intrinsics or places.intrinsics
         self._features = FeatureExtractor(self._intrinsics)
-        self._verifier = LoopVerifier(self._thresholds, self._intrinsics)
+        self._structure = PlaceStructure(places, self._thresholds)
         self._index = PlaceIndex(places.views)
 
     def locate(self, name: str, image: Image) -> Localisation:
-        """Localise an image ``(H, W, 3)`` uint8 RGB: by the points of all similar places of a street together.
+        """Localise an image ``(H, W, 3)`` uint8 RGB: at the similar place with most inliers, then in the map around it.
 
-        The pose is supported by two of them, or by very many inliers.
+        Triangulated points are tried first, then those of learned depth as well.
 
         Raises:
             SequenceError: the image has another shape than its camera.
@@ -141,7 +150,9 @@ class Localiser:
         rows = self._index.nearest(view, _PLACES_TRIED)
         if not rows:
             return Localisation(name, reason="no place of the map is similar")
-        found = self._best([self._matched(row, view) for row in rows], view)
+        found = self._found(rows, view, learned=False)
+        if isinstance(found, str):
+            found = self._found(rows, view, learned=True)
         if isinstance(found, str):
             return Localisation(name, reason=f"{len(rows)} similar places; {found}")
         away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - found.T_world_camera[:3, 3], axis=1)
@@ -161,57 +172,63 @@ class Localiser:
         no_depth = np.full(image.shape[:2], np.nan, np.float32)
         return self._features.view(Frame(0, 0.0, image), no_depth)
 
-    def _matched(self, row: int, view: View) -> _Matches:
-        place, T_world_place = self._places.views[row], self._places.T_world_camera[row]
-        rows_place, rows_view = matches(place, view, self._thresholds)
-        points = place.points[rows_place].astype(np.float64)
+    def _found(self, rows: list[int], view: View, learned: bool) -> _Pose | str:
+        """The pose by the place with most inliers, and by all corners of the map around it; or why there is none."""
+        starts = [self._start(row, view, learned) for row in rows]
+        best = max((start for start in starts if start is not None), key=lambda start: len(start[2]), default=None)
+        if best is None:
+            return "no place has corners that fit one pose"
+        T_camera_world = make(cv2.Rodrigues(best[0])[0], best[1])
+        for widening in (4.0, 2.0, 1.0):
+            radius_px = widening * self._thresholds.reprojection_px
+            points, pixels = self._around(T_camera_world, rows, view, learned, radius_px)
+            if len(points) < self._thresholds.min_inliers:
+                return f"only {len(points)} corners agree"
+            pose = resect([T_camera_world], points, pixels, self._intrinsics)
+            T_camera_world = pose.T_camera_world
+        return self._accepted(pose, points)
+
+    def _start(self, row: int, view: View, learned: bool) -> tuple[FloatArray, FloatArray, NDArray[np.intp]] | None:
+        """The pose by one place, as `consensus` gives it."""
+        corners, seen = matches(self._places.views[row], view, self._thresholds)
+        points = self._structure.points(row, learned)[corners]
         known = np.isfinite(points).all(axis=1)
-        return _Matches(place.index, T_world_place, apply(T_world_place, points[known]), rows_view[known])
+        if known.sum() < _LEAST_POINTS:
+            return None
+        pixels = view.pixels[seen[known]].astype(np.float64)
+        return consensus(points[known], pixels, self._intrinsics.K, _SAMPLES, self._thresholds.reprojection_px)
 
-    def _best(self, places: list[_Matches], view: View) -> _Pose | str:
-        """The pose with most inliers at one place and those around it that has enough support; or why there is none."""
-        best: _Pose | None = None
-        reasons = []
-        for place in places:
-            found = self._resect(place, self._around(place, places), view)
-            if isinstance(found, str):
-                reasons.append(f"at that of frame {place.frame} {found}")
-            elif best is None or found.inliers > best.inliers:
-                best = found
-        return reasons[0] if best is None else best
+    def _around(
+        self, T_camera_world: FloatArray, rows: list[int], view: View, learned: bool, radius_px: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points ``(M, 3)`` of the map that look like corners ``(M, 2)`` of the image near where they project."""
+        centre = invert(T_camera_world)[:3, 3]
+        away = np.linalg.norm(self._places.T_world_camera[:, :3, 3] - centre, axis=1)
+        near = sorted({*rows, *np.argsort(away)[:_PLACES_AROUND].tolist()})
+        points = np.concatenate([self._structure.points(row, learned) for row in near])
+        X = apply(T_camera_world, points)
+        ahead = X[:, 2] > 0  # false of unknown ones
+        if not ahead.any() or not len(view):
+            return np.zeros((0, 3)), np.zeros((0, 2))
+        points, seen = points[ahead], self._intrinsics.project(X[ahead])
+        descriptors = np.concatenate([self._places.views[row].descriptors for row in near])[ahead]
+        differing = hamming(view.descriptors, descriptors)
+        differing[cdist(view.pixels, seen) > radius_px] = np.inf
+        best = differing.argmin(axis=1)
+        corners = np.flatnonzero(differing[np.arange(len(view)), best] <= _MOST_DIFFERING)
+        return points[best[corners]], view.pixels[corners].astype(np.float64)
 
-    def _around(self, place: _Matches, places: list[_Matches]) -> list[_Matches]:
-        """Places no farther away than the points that match here: they show the same street."""
-        if not len(place.points_world):
-            return [place]
-        here = place.T_world_camera[:3, 3]
-        reach = float(np.median(np.linalg.norm(place.points_world - here, axis=1)))
-        return [other for other in places if np.linalg.norm(other.T_world_camera[:3, 3] - here) <= reach]
-
-    def _resect(self, place: _Matches, around: list[_Matches], view: View) -> _Pose | str:
-        """The pose by the points of all these places, supported by two of them or by very many inliers."""
-        points_world = np.concatenate([other.points_world for other in around])
-        rows_view = np.concatenate([other.rows_view for other in around])
-        points = apply(invert(place.T_world_camera), points_world).astype(np.float32)
-        found = self._verifier.resect(points, view.pixels[rows_view], _MIN_INLIER_RATIO)
-        if isinstance(found, str):
-            return found
-        owner = np.repeat(np.arange(len(around)), [len(other.rows_view) for other in around])
-        supporting = np.bincount(owner[found.resection.inliers]) >= self._thresholds.min_inliers / 2
-        inliers = len(np.unique(rows_view[found.resection.inliers]))  # a corner may match at several places
-        if supporting.sum() < 2 and inliers < self._thresholds.alone_inliers:
-            return f"no second place supports the pose ({inliers} inliers)"
-        return _Pose(place.T_world_camera @ invert(found.T_image_points), inliers)
-
-
-@dataclass(frozen=True)
-class _Matches:
-    """A place and the points of the world ``(M, 3)`` that match corners of the image, by the rows of these."""
-
-    frame: int
-    T_world_camera: FloatArray
-    points_world: FloatArray
-    rows_view: NDArray[np.intp]
+    def _accepted(self, pose: CameraPose, points: FloatArray) -> _Pose | str:
+        """The pose, if enough corners agree and determine it."""
+        inliers = pose.residual_px < self._thresholds.reprojection_px
+        count = int(inliers.sum())
+        if count < max(_LEAST_INLIERS, self._thresholds.min_inliers) or count < _LEAST_RATIO * len(inliers):
+            return f"only {count} of {len(inliers)} corners agree"
+        depth = float(np.median(apply(pose.T_camera_world, points[inliers])[:, 2]))
+        sigma = float(np.linalg.norm(pose.sigmas[3:])) / depth
+        if sigma > _MOST_SIGMA:
+            return f"{count} corners agree, but give the position to {sigma:.1%} of their depth only"
+        return _Pose(invert(pose.T_camera_world), count)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from erfsfm.common.errors import ErfsfmError
+from erfsfm.common.progress import Progress, silent
 from erfsfm.common.signals import Terminated
 from erfsfm.common.threads import limit_library_threads, take_working_memory
 from slam.config.sections import SlamConfig, dump_yaml
@@ -38,7 +39,6 @@ from slam.results.report.page import DepthExample, write_report
 from slam.results.report.rerun import write_rerun
 from slam.results.run_log import RunLog
 from slam.runtime.errors import EmptyMapError, RunError, SlamError
-from slam.runtime.progress import Progress
 from slam.runtime.run_files import CONFIG, ESTIMATE, GRAPH, LOG, LOOPS, MAP_CLOUD, MAP_MESH, PLACES, SUBMAPS
 from slam.runtime.storage.record import Missing
 from slam.sequences.continued import Continued
@@ -71,7 +71,7 @@ class Job:
     predictors_sha256: str
     checkpoint: SessionCheckpoint | None
     rerun: Path | None = None
-    progress: Progress | None = None
+    progress: Progress = silent
     stream: Stream | None = None
 
     def checkpoint_of(self, state: FrontEndState) -> SessionCheckpoint:
@@ -125,10 +125,12 @@ def _run(job: Job, folder: RunFolder) -> None:
     timing = timing_of(result.stopwatch, len(job.recording) - result.first)
     folder.write_metrics(metrics.changed(status="ok", reason=None, timing=timing, depth=depth, map=map_metrics))
     output = job.settings.output
+    job.progress("report", 0, 1)
     views = write_map_views(folder, output.viewer_triangles if output.report else 0)
     if output.report:
         examples = [DepthExample(i, image, depth) for i, image, depth in result.drive.examples]
         write_report(folder, examples, views)
+    job.progress("report", 1, 1)
     if job.rerun is not None:
         write_rerun(job.rerun, result, job.recording.intrinsics)
 
@@ -178,12 +180,14 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
         logger.warning("no map: %s", error)
         remove_submaps(folder.path / SUBMAPS)
         return MapMetrics.missing(str(error))
+    job.progress("map files", 0, 1)
     with result.stopwatch.stage("mesh"):
         surface.write_mesh(folder.path / MAP_MESH)
         surface.write_cloud(folder.path / MAP_CLOUD)
     share = double_wall_share(surface.meshes()) if result.scale.is_metric else Missing("lengths are not in metres")
     remove_submaps(folder.path / SUBMAPS)
     errors = map_errors(lambda: (positions(piece) for piece in surface.cloud_pieces()), result, job.recording)
+    job.progress("map files", 1, 1)
     return MapMetrics(**asdict(result.map.statistics()), double_wall_share=share, **dict(errors))
 
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from erfsfm.common.progress import Progress
 from slam.commands.options import LARGEST_SEED, Config, Device, Output, Overrides, Weights
 from slam.runtime.errors import RunError
-from slam.runtime.progress import Progress
 from slam.runtime.storage.files import from_anywhere
 
 if TYPE_CHECKING:
     from slam.results.metrics import Provenance, Recording
 
-_RECORDING = ("dataset", "camera", "gps", "sequence", "frames")
+_RECORDING = ("dataset", "camera", "gps", "sequence", "frames", "truth")
 _TEXTS = ("weights", "config")  # names, or paths
 
 
@@ -39,12 +39,16 @@ class RunRequest:
         typer.Option("--sequence", "-s", "--topic", help="name inside the data set, e.g. 09; the image topic of a bag"),
     ] = None
     camera: Annotated[
-        Path | None, typer.Option(help="camera.yaml, or fov=70: the horizontal field of view in degrees")
+        Path | None,
+        typer.Option("--camera", "--calibration", help="camera.yaml, or fov=70: the horizontal field of view, degrees"),
     ] = None
     weights: Weights = "default"
     config: Config = None
     overrides: Overrides = None
     frames: Annotated[str | None, typer.Option(help="A:B, half-open")] = None
+    truth: Annotated[Path | None, typer.Option(help="true camera poses: KITTI (a row a frame) or TUM (by stamps)")] = (
+        None
+    )
     output: Output = None
     cache: Annotated[
         Path | None, typer.Option(help="folder that keeps network outputs and image measurements for later runs")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from erfsfm import __version__
 from erfsfm.common.lock import FolderLock
+from erfsfm.common.progress import progress_bar, progress_lines, silent
 from erfsfm.common.signals import raising_on_termination
 from erfsfm.inference import DepthPosePredictor, commit
 from slam.commands.run.continuation import (
@@ -47,6 +49,8 @@ logger = logging.getLogger(__name__)
 def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **options: Any) -> RunFolder:
     """Run the whole system on one sequence.
 
+    Without ``progress``, the log says every ten seconds (level INFO) what is done; in a notebook its cell does.
+
     Args:
         dataset: as in `RunRequest`.
         sequence: as in `RunRequest`.
@@ -59,7 +63,12 @@ def run_slam(dataset: str | Path | None = None, sequence: str | None = None, **o
         TypeError: an unknown argument.
         SlamError, ErfsfmError: as `perform`.
     """
-    return perform(RunRequest.of(dataset=dataset, sequence=sequence, **options))
+    request = RunRequest.of(dataset=dataset, sequence=sequence, **options)
+    if request.progress is not None:
+        return perform(request)
+    in_notebook = "ipykernel" in sys.modules
+    with progress_bar() if in_notebook else progress_lines(logger.info) as progress:
+        return perform(replace(request, progress=progress))
 
 
 def perform(request: RunRequest) -> RunFolder:
@@ -114,7 +123,7 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)
-    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
+    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording
@@ -135,11 +144,11 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
         )
     predictor = make_predictor(networks, source, settings.depth, recording.intrinsics, request.cache)
     rest = checkpoint, request.seed or 0, None if request.gps is None else read_gps(request.gps)
-    pipeline = SlamPipeline(recording, predictor, settings, request.progress, networks.noise, *rest)
+    pipeline = SlamPipeline(recording, predictor, settings, request.progress or silent, networks.noise, *rest)
     pipeline.require_possible()
     provenance = provenance_of(request, networks, recording, source)
     settings = _settings_from_anywhere(settings)
-    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress)
+    return Job(settings, recording, pipeline, provenance, sha256, checkpoint, request.rerun, request.progress or silent)
 
 
 def _settings(request: RunRequest, resumes: Path | None) -> SlamConfig:

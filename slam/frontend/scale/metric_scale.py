@@ -24,9 +24,10 @@ from slam.frontend.visual.motion import Motion
 from slam.geometry.robust import mad_sigma
 from slam.geometry.se3 import FloatArray
 
-LengthUnit = Literal["metres", "camera heights", "the networks' own unit"]
+LengthUnit = Literal["metres", "camera heights", "no metric unit", "the networks' own unit"]
 
 logger = logging.getLogger(__name__)
+_LEAST_ROAD = 0.5  # of the frames; fewer see a floor or a table now and then
 _MAX_CONTRADICTION = 2.5  # largest factor between a measured length and that by learned depth
 
 
@@ -86,7 +87,10 @@ def find_scale(
     lidar_steps: Sequence[RelativePose],
     lengths: LengthConfig,
 ) -> Scale:
-    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps)."""
+    """All lengths of a run in metres, or in camera heights where no mode gives metres (none, reference, known, gps).
+
+    Without a road in most frames, the planes that were found give no unit that means anything.
+    """
     motions, frames = drive.steps.triangulated, len(drive)
     metres = {pose.ends: float(np.linalg.norm(pose.T_from_to[:3, 3])) for pose in lidar_steps}
     height = camera_height_m if mode == "camera-height" else None
@@ -124,6 +128,8 @@ def find_scale(
     elif isinstance(by_planes, MeasurementFailure):
         named = "the networks' own unit"
         logger.warning("no scale (%s): lengths stay in %s", by_planes.reason, named)
+    elif named == "camera heights" and by_planes.frames_used < _LEAST_ROAD * frames:
+        named = "no metric unit"
     if mode == "lidar" and not is_metric:
         estimate = MeasurementFailure("no step was measured by LiDAR, and the height of the camera is unknown")
         logger.warning("no metres (%s): lengths stay in %s", estimate.reason, named)

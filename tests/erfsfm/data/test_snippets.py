@@ -422,3 +422,16 @@ def test_ranges_and_gaps(tmp_path: Path, write_root: Callable[..., Path]) -> Non
     assert names(ranges={"simulated/3": "2:7"}) == ["simulated/3[2:4]", "simulated/3[5:7]"]
     with pytest.raises(DataError, match=r"simulated/3\[12:\] begins after the 12 frames that the recording has"):
         names(ranges={"simulated/3": "12:"})
+
+
+def test_the_end_of_each_recording_that_is_long_enough_is_kept_to_validate_on(
+    tmp_path: Path, write_root: Callable[..., Path]
+) -> None:
+    write_root(tmp_path / "long", 50, ("01",), size=(32, 48))
+    write_root(tmp_path / "short", 20, ("04",), size=(32, 48))
+    config = DataConfig(roots=[tmp_path / "long", tmp_path / "short"], validation=[], validation_share=0.4)
+    training, validation = split_recordings(config)
+    assert [each.frames_name for each in training] == ["kitti_odometry/01[0:30]", "kitti_odometry/04[0:20]"]
+    assert [each.frames_name for each in validation] == ["kitti_odometry/01[30:50]"]
+    with pytest.raises(DataError, match=r"validation_share 0\.4 leaves fewer than 20 frames of .*/04 \(20 frames\)"):
+        split_recordings(config.model_copy(update={"roots": [tmp_path / "short"]}))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.formats.colmap import write_colmap
+from slam.formats.colmap import Sightings, write_colmap
 from slam.frames import Intrinsics
 from slam.geometry.se3 import FloatArray, apply, chain, from_rotation_vector, invert
 
@@ -37,18 +37,23 @@ def rotation(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
 
 
 def test_a_model_reads_back(tmp_path: Path) -> None:
-    write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS)
+    pixels = np.array([[10.0, 20.0], [11.0, 21.0], [12.0, 22.0]])
+    seen = Sightings(np.array([3, 0, 3]), pixels, np.array([1, 1, 0]), np.array([0.25, 0.75, 1.0]))
+    write_colmap(tmp_path / "new" / "model", CAMERA, drive(), POINTS, COLOURS, seen)
     folder = tmp_path / "new" / "model"
     assert {path.name for path in folder.iterdir()} == {"cameras.txt", "images.txt", "points3D.txt"}
     ((camera_id, model, width, height, *pinhole),) = rows(folder / "cameras.txt")
     assert (camera_id, model, width, height) == ("1", "PINHOLE", "416", "128")
     fx, fy, cx, cy = map(float, pinhole)
-    points = np.array(rows(folder / "points3D.txt"), dtype=float)
+    lines = rows(folder / "points3D.txt")
+    assert [line[7:] for line in lines] == [["1", "4", "1"], ["0.5", "1", "0", "4", "0"], ["0"]]
+    points = np.array([line[:7] for line in lines], dtype=float)
     np.testing.assert_array_equal(points[:, 0], [1, 2, 3])
     np.testing.assert_allclose(points[:, 1:4], POINTS, rtol=1e-5)
     np.testing.assert_array_equal(points[:, 4:7], COLOURS)
     images = rows(folder / "images.txt")
-    assert len(images) == 10 and all(line == [] for line in images[1::2])
+    corners = [["11.5", "21.5", "2"], [], [], ["10.5", "20.5", "2", "12.5", "22.5", "1"], []]
+    assert images[1::2] == corners, "theirs are half a pixel more"
     for k, (image_id, *pose, camera, name) in enumerate(images[::2]):
         assert (image_id, camera, name) == (str(k + 1), "1", f"{k:06d}.png")
         numbers = np.array(pose, dtype=float)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import gc
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from erfsfm.common.progress import Progress, silent
 from erfsfm.inference import DepthPosePredictor
 from erfsfm.pose_noise import PoseNoise
 from slam.config.sections import load_config
@@ -280,7 +281,7 @@ def street() -> Excerpt:
 
 def drive_street(
     street: Excerpt,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress = silent,
     noise: PoseNoise | None = None,
     use: str = "calibrated",
     mode: str = "auto",
@@ -324,7 +325,8 @@ def test_two_runs_write_the_same_bytes(street: Excerpt, tmp_path: Path) -> None:
 def test_images_reach_geometry_map_and_report(street: Excerpt) -> None:
     calls: list[tuple[str, int, int]] = []
     result = drive_street(street, lambda *words: calls.append(words))
-    assert calls == [("frames", k, 25) for k in range(1, 26)] + [("map", k, 13) for k in range(1, 14)]
+    solved = [("loops and graph", k, 1) for k in range(2)]
+    assert calls == [("frames", k, 25) for k in range(1, 26)] + solved + [("map", k, 13) for k in range(1, 14)]
     seen = result.drive
     assert len(seen.steps) > 15 and len(seen.steps) + len(seen.failures) == 24
     measured = {first for first, _ in seen.steps.motions}

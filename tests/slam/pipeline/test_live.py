@@ -17,6 +17,7 @@ import pytest
 from slam import Slam
 from slam.config.sections import SlamConfig, load_config
 from slam.frames import DepthMap, Frame, SnippetPoses
+from slam.geometry.se3 import apply
 from slam.pipeline.batch import SlamPipeline
 from slam.pipeline.checkpoint import SessionCheckpoint
 from slam.prediction.oracle import OracleNoise, OraclePredictor
@@ -94,6 +95,36 @@ def test_the_trajectory_grows_with_the_frames() -> None:
         assert T_world_camera.shape == (count, 4, 4)
         distance = np.linalg.norm(T_world_camera[-1, :3, 3])
         assert distance == 0.0 if count < 5 else 0.5 * count < distance < 1.5 * count
+
+
+def test_a_frame_gives_the_newest_pose_and_its_state() -> None:
+    slam = started(load_config(None, SETTINGS), update_frames=10)
+    poses = [slam.add_frame(drive().frame(k).image, drive().frame(k).stamp) for k in range(20)]
+    assert poses[0].state == "starting" and poses[-1].state == "tracking"
+    assert [pose.frame for pose in poses] == sorted(pose.frame for pose in poses) and poses[-1].frame >= 17
+    np.testing.assert_allclose(poses[-1].T_world_camera, slam.trajectory().T_world_camera[poses[-1].frame], atol=1.0)
+
+
+def test_a_session_gives_its_points_keyframes_marginals_and_surface() -> None:
+    slam = started(load_config(None, [*SETTINGS, "output.keep=keyframes"]), update_frames=10)
+    with pytest.raises(SlamError, match="too few usable frames"):
+        slam.points()
+    feed(slam, 0, 32)
+    keyframes, points = slam.keyframes(), slam.points()
+    assert set(keyframes.stamps) < set(slam.trajectory().stamps) and len(keyframes) == 11
+    T_street_first = drive().street.T_world_camera[0]
+    away = drive().street.distance_to_surface(apply(T_street_first, points[:: max(len(points) // 500, 1)]))
+    assert len(points) > 500 and np.median(away) < 1.0
+    near, far = (np.sqrt(np.diag(slam.marginals(frame))) for frame in (5, 31))
+    assert (near > 0).all() and (near < far).all() and far[5] < 1.0, "metres ahead"
+    vertices = np.asarray(slam.surface().vertices)
+    assert np.median(drive().street.distance_to_surface(apply(T_street_first, vertices[::50]))) < 1.0
+    with pytest.raises(SlamError, match="no frame 32"):
+        slam.marginals(32)
+    plain = started(load_config(None, SETTINGS))
+    feed(plain, 0, 12)
+    with pytest.raises(SlamError, match=r"make Slam with output\.keep=keyframes"):
+        plain.surface()
 
 
 def test_the_camera_stays_at_its_place_until_there_is_a_unit() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import slam
 from slam.formats.trajectory import Trajectory
 from slam.results.folder import RunFolder
 from slam.results.metrics import MapMetrics, Metrics, Provenance
@@ -178,3 +179,16 @@ def test_a_missing_map_is_explained_by_the_run(make_run: MakeRun, reason: str) -
     folder.write_metrics(folder.metrics().changed(map=Missing("the run ended before its map was whole")))
     with pytest.raises(RunError, match=r"has no map_mesh\.ply: the run ended before its map was whole"):
         folder.require("map_mesh.ply")
+
+
+def test_a_run_opens_by_its_name_and_shows_itself(make_run: MakeRun) -> None:
+    path = make_run("mine").path
+    run = slam.RunFolder(str(path))
+    assert run.path == path and len(run.mesh().vertices) == 3
+    shown = run._repr_html_()
+    assert "<th>ATE RMSE, 7 dof</th>" in shown and "<td>optimised</td>" in shown and "<script" not in shown
+    (path / "map_mesh.ply").unlink()
+    with pytest.raises(RunError, match=r"has no map_mesh\.ply"):
+        run.mesh()
+    with pytest.raises(RunError, match=r"has no drive\.zip"):
+        run.keyframes()

@@ -142,7 +142,7 @@ def test_errors_are_clear_and_leave_nothing(
         ("trajectory", "drive/images.txt", "images.txt exists and is a file of another kind"),
         ("trajectory", "drive/truth.txt", "truth.txt belongs to the recording of the run"),
         ("nerfstudio", "drive", "drive/images is none of ours"),
-        ("colmap", "drive", "drive/images.txt is none of ours"),
+        ("colmap", "drive", "drive/images is none of ours"),
         ("raster", "drive", "drive/height.png is none of ours"),
         ("raster", "terrain", "terrain/raster.yaml is none of ours"),
     ],

@@ -198,7 +198,7 @@ def test_other_vertex_fields_survive(make_recorded: MakeRecorded, sheet: Ply, tm
         ("mesh", ExportOptions(voxel=100.0), "--voxel 100 leaves no triangle"),
         ("cloud", ExportOptions(voxel=1e-12), "is too small for a map that is .* wide"),
         ("raster", ExportOptions(resolution=1e-5), "--resolution 1e-05 gives .* cells"),
-        ("mesh", ExportOptions(dataset=Path("x")), "--dataset does nothing for mesh: it is for nerfstudio"),
+        ("mesh", ExportOptions(dataset=Path("x")), "--dataset does nothing for mesh: it is for colmap, nerfstudio"),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(

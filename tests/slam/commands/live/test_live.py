@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -27,10 +28,11 @@ from slam.commands.live.messages import emitters
 from slam.commands.live.reader import Reader
 from slam.commands.live.request import LiveRequest
 from slam.commands.live.run import run_live
-from slam.commands.live.sequence import calibration_of
+from slam.commands.live.sequence import StreamedSequence, calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
-from slam.runtime.errors import SequenceError, SlamError
+from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
 FRAMES = 14
@@ -147,6 +149,18 @@ def test_broken_images_are_left_out_and_a_folder_that_vanishes_leaves_a_whole_ru
     assert "000005.png" in said and "000008.png is 30 x 20, not" in said and said.count("it is left out") == 2
 
 
+def test_images_that_are_there_are_dropped_and_counted_unless_every_one_is_wanted(
+    street: Path, tiny_weights: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    messages: list[dict[str, Any]] = []
+    request = request_of(street / "images", tiny_weights, SETTINGS, tmp_path / "live", wait=0.5)
+    with pytest.raises(SlamError, match=r"images were dropped, .* \(--every-frame drops none\)"):
+        run_live(request, messages.append)  # while the first one is measured, all others come
+    assert "images dropped, " in caplog.text
+    folder = run_live(replace(request, every_frame=True), messages.append)
+    assert messages[-1]["dropped"] == 0 and folder.metrics().tree()["sequence"]["frames"] == FRAMES
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -204,7 +218,7 @@ def test_a_drive_that_fails_leaves_the_poses_that_it_had(
 class Scripted:
     """A source of small images that calls ``before`` with the number of each, and may die after the last one."""
 
-    width, height, fps = 8, 6, 10.0
+    width, height, fps, is_stored = 8, 6, 10.0, False
 
     def __init__(self, images: int, before: Callable[[int], object], dies: bool = False) -> None:
         self._images, self._before, self._dies, self.is_over = images, before, dies, Event()
@@ -228,6 +242,32 @@ def test_a_source_that_is_faster_than_we_are_is_dropped_from() -> None:
         first_is_taken.set()
         source.is_over.wait()
     assert taken == [0, 50] and reader.dropped == 49 and reader.ended == "the source ended"
+
+
+def test_with_every_frame_a_source_waits_until_its_image_was_taken() -> None:
+    reader = Reader(Scripted(20, lambda number: None), 60.0, lambda image: image, every_frame=True)
+    taken = []
+    for arrival in reader:
+        taken.append(int(arrival.image[0, 0, 0]))
+        time.sleep(0.001)
+    assert taken == list(range(20)) and reader.dropped == 0 and reader.ended == "the source ended"
+
+
+def test_only_a_source_that_is_stored_can_wait(street: Path) -> None:
+    source = FolderSource(street / "images", 1.0)
+    source.is_stored = False
+    camera = explicit_camera(Path("fov=70"), source, 10.0)
+    with pytest.raises(SequenceError, match="door does not wait while an image is measured: leave out --every-frame"):
+        StreamedSequence("door", source, camera, 1.0, every_frame=True)
+
+
+def test_dataset_and_camera_mean_what_they_mean_in_run() -> None:
+    as_in_run = LiveRequest(dataset="0", camera="camera.yaml")
+    assert (as_in_run.source, as_in_run.camera_file) == ("0", Path("camera.yaml"))
+    before = LiveRequest(camera="0", calibration=Path("camera.yaml"))
+    assert (before.source, before.camera_file) == ("0", Path("camera.yaml"))
+    with pytest.raises(RunError, match="name where images come from: --dataset 0"):
+        _ = LiveRequest().source
 
 
 def test_a_source_that_stalls_and_one_that_dies_say_so() -> None:

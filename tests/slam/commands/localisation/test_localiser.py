@@ -112,6 +112,18 @@ def test_images_of_the_street_are_localised_where_they_were_taken(hazards: tuple
     assert found >= 7
 
 
+def test_wrong_learned_depth_is_replaced_by_what_neighbouring_places_measure() -> None:
+    rng = np.random.default_rng(0)
+    views = tuple(
+        replace(view, points=(view.points * rng.lognormal(0.0, 0.5, (len(view), 1))).astype(np.float32))
+        for view in places().views
+    )
+    localiser = Localiser(replace(places(), views=views), CONFIG)
+    for k in (10, 25, 40):
+        found = localiser.locate(f"{k}", street(630).frame(k).image).T_world_camera
+        assert found is not None and np.linalg.norm(found[:3, 3] / UNIT - reference()[k, :3, 3]) < 0.5
+
+
 def test_another_size_of_the_same_camera_is_found_too() -> None:
     image = street(630).frame(31).image
     twice = np.asarray(cv2.resize(image, (624, 192), interpolation=cv2.INTER_CUBIC), np.uint8)

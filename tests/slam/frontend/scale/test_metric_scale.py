@@ -165,6 +165,16 @@ def test_a_later_estimate_scales_everything_and_a_failure_nothing():
     assert refused.estimate == MeasurementFailure("it stands")
 
 
+@pytest.mark.parametrize(("share", "unit"), [(0.3, "no metric unit"), (0.7, "camera heights")])
+def test_a_floor_seen_now_and_then_gives_no_metric_unit(share: float, unit: str) -> None:
+    drive, scans = measured(road=False)
+    seen = int(share * FRAMES)
+    drive = replace(drive, roads=[*drive.roads[:seen], *[MeasurementFailure("a table")] * (FRAMES - seen)])
+    scale = find("none", (drive, scans), None)
+    assert scale.unit == scale.unit_name == unit
+    assert isinstance(scale.estimate, ScaleEstimate) and scale.estimate.frames_used == seen
+
+
 @pytest.mark.parametrize(
     ("mode", "road", "unit"),
     [

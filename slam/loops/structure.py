@@ -1,0 +1,115 @@
+"""Points of the places of a run, triangulated among neighbouring places; learned depth gives the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from slam.geometry.se3 import FloatArray, apply, invert
+from slam.geometry.triangulation import triangulate
+from slam.loops.places import Places
+from slam.loops.thresholds import LoopThresholds
+from slam.loops.verification import matches
+
+_NEIGHBOURS = 4  # places on either side that a place is matched with
+_LEAST_SIGHTINGS = 3
+_LEAST_ANGLE = np.deg2rad(1.0)  # between two rays of a point
+_LEAST_DEPTH = 1e-6
+
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Points ``(P, 3)`` in the world, NaN where unknown, and their sightings ``(S,)``.
+
+    A sighting has the row of its place in ``views``, its row there in ``corners``, and that of its ``point``.
+    """
+
+    points: FloatArray
+    views: Rows
+    corners: Rows
+    point: Rows
+    errors_px: FloatArray
+
+
+class PlaceStructure:
+    """The points of each place in the world, made when they are asked for first and kept."""
+
+    def __init__(self, places: Places, thresholds: LoopThresholds) -> None:
+        self._places, self._thresholds = places, thresholds
+        self._T_camera_world = invert(places.T_world_camera)
+        self._around = cache(self._triangulated_around)
+
+    def points(self, row: int, learned: bool) -> FloatArray:
+        """Points ``(M, 3)`` of the corners of a place, NaN where unknown; ``learned``: with those of learned depth."""
+        points = self._around(row).points
+        if not learned:
+            return points
+        by_depth = apply(self._places.T_world_camera[row], self._places.views[row].points.astype(np.float64))
+        return np.where(np.isfinite(points), points, by_depth)
+
+    def tracks(self) -> Tracks:
+        """Corners of all places joined to points that three or more of them see."""
+        first = np.cumsum([0, *map(len, self._places.views)])
+        around = [self._around(row) for row in range(len(self._places.views))]
+        known = [np.isfinite(each.points[each.point, 0]) for each in around]
+        ends = [
+            (first[row] + each.point[kept], first[each.views[kept]] + each.corners[kept])
+            for row, (each, kept) in enumerate(zip(around, known, strict=True))
+        ]
+        one, other = (np.concatenate(side) for side in zip(*ends, strict=True))
+        joined = csr_array((np.ones(len(one)), (one, other)), (first[-1], first[-1]))
+        _, track = connected_components(joined, directed=False)
+        views = np.repeat(np.arange(len(self._places.views)), np.diff(first))
+        # of two corners of a place that were joined to one point, one is wrong
+        _, once = np.unique(track * len(self._places.views) + views, return_index=True)
+        return self._triangulated(views[once], once - first[views[once]], track[once], int(track.max(initial=-1)) + 1)
+
+    def _triangulated_around(self, row: int) -> Tracks:
+        """A point for each corner of a place, by the places around it."""
+        place, found = self._places.views[row], []
+        for other in range(max(0, row - _NEIGHBOURS), min(len(self._places.views), row + _NEIGHBOURS + 1)):
+            own = np.arange(len(place))
+            pairs = (own, own) if other == row else matches(place, self._places.views[other], self._thresholds)
+            found.append((np.full(len(pairs[0]), other), *pairs))
+        views, corners, seen = (np.concatenate(column) for column in zip(*found, strict=True))
+        return self._triangulated(views, seen, corners, len(place))
+
+    def _triangulated(self, views: Rows, corners: Rows, point: Rows, count: int) -> Tracks:
+        """Points ``(count, 3)``, NaN where unknown, and the sightings that agree with them.
+
+        Args:
+            views: of each sighting the place ``(S,)``.
+            corners: its row there ``(S,)``.
+            point: which point it is of ``(S,)``.
+            count: points.
+        """
+        intrinsics, allowed_px = self._places.intrinsics, self._thresholds.reprojection_px
+        pixels = np.concatenate([view.pixels for view in self._places.views]).astype(np.float64)
+        first = np.cumsum([0, *map(len, self._places.views)])
+        pixels = pixels[first[views] + corners]
+        for tolerance in (2.0, 1.0, 1.0):  # wrong matches spoil the first points
+            points, _ = triangulate(self._T_camera_world[views], intrinsics.rays(pixels), point, count)
+            error = self._errors(views, points[point], pixels)
+            kept = error < tolerance * allowed_px
+            views, corners, point, pixels = views[kept], corners[kept], point[kept], pixels[kept]
+        points, angle = triangulate(self._T_camera_world[views], intrinsics.rays(pixels), point, count)
+        error = self._errors(views, points[point], pixels)
+        kept = error < allowed_px
+        confirmed = np.bincount(point[kept], minlength=count) >= _LEAST_SIGHTINGS
+        points[~confirmed | (angle < _LEAST_ANGLE)] = np.nan
+        return Tracks(points, views[kept], corners[kept], point[kept], error[kept])
+
+    def _errors(self, views: Rows, points: FloatArray, pixels: FloatArray) -> FloatArray:
+        """Reprojection error of each sighting, pixels; infinite behind a camera."""
+        T = self._T_camera_world[views]
+        X = np.einsum("sij,sj->si", T[:, :3, :3], points) + T[:, :3, 3]
+        ahead = X[:, 2] > _LEAST_DEPTH
+        X[~ahead] = 1.0
+        return np.where(ahead, np.linalg.norm(self._places.intrinsics.project(X) - pixels, axis=1), np.inf)

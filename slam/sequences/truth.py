@@ -1,0 +1,44 @@
+"""True poses of a recording from a file of the user."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from slam.formats.trajectory import read_trajectory
+from slam.runtime.errors import SequenceError
+from slam.sequences.poses import describe_unknown, known_poses, poses_near
+from slam.sequences.recording import RecordedSequence
+
+
+def take_truth(recording: object, path: Path) -> None:
+    """Let a recording have the camera poses of a KITTI or TUM file as its truth; they are in metres, in any world.
+
+    Rows with stamps belong to the frames of these times, rows with frame numbers to these frames, and others to the
+    frames one by one.
+
+    Raises:
+        SequenceError: the rows are not of its frames, or its loader makes no `RecordedSequence`.
+        TrajectoryError: the file cannot be read.
+    """
+    if not isinstance(recording, RecordedSequence):
+        raise SequenceError(f"the loader of this recording takes no true poses: leave out --truth {path}")
+    truth, frames = read_trajectory(path), len(recording)
+    numbers = truth.stamps if truth.numbered else np.arange(len(truth))
+    if truth.timed:
+        T_any_camera = poses_near(truth.T_world_camera, truth.stamps, recording.stamps, path)
+    elif truth.numbered or len(truth) == frames:
+        T_any_camera = np.full((frames, 4, 4), np.nan)
+        of_frame = (numbers >= 0) & (numbers < frames)
+        T_any_camera[numbers[of_frame].astype(np.intp)] = truth.T_world_camera[of_frame]
+        describe_unknown(T_any_camera, path)
+    else:
+        raise SequenceError(
+            f"--truth {path} has {len(truth)} rows and the recording {frames} frames: give each frame a row, or rows "
+            "with stamps (TUM)"
+        )
+    if not known_poses(T_any_camera).any():
+        its, ours = (f"{numbers[0]:.3f} to {numbers[-1]:.3f}" for numbers in (truth.stamps, recording.stamps))
+        raise SequenceError(f"--truth {path} covers {its} and the recording {ours}: bring both to the same clock")
+    recording.take_truth(T_any_camera)

@@ -1,0 +1,57 @@
+"""Progress of long work: bars on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+import time
+
+import pytest
+
+from erfsfm.common.progress import progress_bar, progress_lines
+
+
+def lines_of(steps: list[tuple[str, int, int]], pause_s: float) -> list[str]:
+    """What is said of these steps, each followed by a pause in which one line is due."""
+    lines: list[str] = []
+    with progress_lines(lines.append, every_s=pause_s) as progress:
+        for step in steps:
+            progress(*step)
+            time.sleep(1.5 * pause_s)
+    return lines
+
+
+def test_lines_say_what_is_done_how_fast_and_the_time_left() -> None:
+    lines = lines_of([("frames", 1, 100), ("frames", 2, 100), ("loops", 0, 1)], 0.2)
+    assert lines[0].startswith("frames: 1 of 100 after ")
+    assert any(re.fullmatch(r"frames: 2 of 100, [\d.e+-]+ a second, \d min \d+ s left", line) for line in lines)
+    assert lines[-1].startswith("loops: 0 of 1 after "), "said while one item takes long"
+
+
+def test_what_follows_the_comma_of_a_stage_does_not_begin_another() -> None:
+    lines = lines_of([("steps, loss 3", 1, 9), ("steps, loss 2", 2, 9)], 0.2)
+    assert lines[-1].startswith("steps, loss 2: 2 of 9, ") and lines[-1].endswith("s left")
+
+
+def test_short_work_is_quiet_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar() as progress:
+        progress("frames", 1, 2)
+        progress("frames", 2, 2)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_has_a_bar_for_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("COLUMNS", "100")
+    with progress_bar() as progress:
+        for done in range(3):
+            progress("frames", done, 2)
+        progress("map, 7 keyframes", 1, 7)
+    shown = terminal.getvalue()
+    assert "frames" in shown and "2/2" in shown and "map, 7 keyframes" in shown and "1/7" in shown

@@ -1,0 +1,90 @@
+"""True poses from a file of the user, for any recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam.commands.doctor import examine
+from slam.formats.trajectory import Trajectory, write_kitti, write_tum
+from slam.geometry.se3 import FloatArray, chain, from_rotation_vector
+from slam.runtime.errors import SequenceError
+from slam.sequences.catalogue import open_sequence
+
+FRAMES = 8
+
+
+def true_poses() -> FloatArray:
+    rotation, step = np.zeros((2, FRAMES - 1, 3))
+    rotation[:, 1], step[:, 2] = 0.02, 1.0
+    return chain(from_rotation_vector(rotation, step))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    folder = tmp_path / "walk" / "images"
+    folder.mkdir(parents=True)
+    for k in range(FRAMES):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), np.full((48, 64, 3), 10 * k, np.uint8))
+    (folder / "camera.yaml").write_text("{width: 64, height: 48, fx: 50, fy: 50, cx: 31.5, cy: 23.5, fps: 10}")
+    return folder
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    return tmp_path / "truth.txt"
+
+
+def reference(recording: Path, truth: Path, frames: str | None = None) -> FloatArray | None:
+    return open_sequence(recording, frames=frames, truth=truth).reference
+
+
+def test_a_row_a_frame(recording: Path, truth: Path) -> None:
+    write_kitti(truth, Trajectory(np.arange(8.0), true_poses()))
+    found = reference(recording, truth)
+    assert found is not None
+    np.testing.assert_allclose(found, true_poses(), atol=1e-6)
+    part = reference(recording, truth, "3:6")
+    assert part is not None
+    np.testing.assert_allclose(part, np.linalg.inv(true_poses()[3]) @ true_poses()[3:6], atol=1e-6)
+
+
+def test_rows_with_stamps_are_interpolated_at_the_frames(recording: Path, truth: Path) -> None:
+    write_tum(truth, Trajectory(np.arange(0.0, 0.71, 0.1)[::2], true_poses()[::2]))
+    found = reference(recording, truth, "0:7")
+    assert found is not None
+    np.testing.assert_allclose(found, true_poses()[:7], atol=0.02)
+
+
+def test_rows_with_frame_numbers_are_of_these_frames(
+    recording: Path, truth: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = [f"{k} {' '.join(map(str, true_poses()[k, :3].ravel()))}\n" for k in range(2, FRAMES)]
+    truth.write_text("".join(rows))
+    assert reference(recording, truth) is None
+    assert "has no pose of image 0" in caplog.text and "frames 2:8 have one each" in caplog.text
+    part = reference(recording, truth, "2:8")
+    assert part is not None
+    np.testing.assert_allclose(part, np.linalg.inv(true_poses()[2]) @ true_poses()[2:], atol=1e-6)
+
+
+def test_poses_of_other_frames_are_refused(recording: Path, truth: Path) -> None:
+    write_kitti(truth, Trajectory(np.arange(5.0), true_poses()[:5]))
+    with pytest.raises(SequenceError, match="has 5 rows and the recording 8 frames: give each frame a row"):
+        reference(recording, truth)
+    write_tum(truth, Trajectory(np.arange(8.0) + 1e9, true_poses()))
+    with pytest.raises(SequenceError, match=r"covers 1000000000\.000 .* bring both to the same clock"):
+        reference(recording, truth)
+    with pytest.raises(SequenceError, match=r"a file of true poses .* without a data set"):
+        open_sequence(truth=truth)
+
+
+def test_poses_beside_a_folder_are_named_and_not_used(recording: Path) -> None:
+    beside = recording.parent / "poses.kitti.txt"
+    write_kitti(beside, Trajectory(np.arange(8.0), true_poses()))
+    assert open_sequence(recording).reference is None
+    line = examine(recording)[-1]
+    assert f"no true poses (--truth {beside} gives some)" in line

@@ -50,6 +50,11 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
             partial.unlink(missing_ok=True)
 
 
+def is_foreign(path: Path, mark: str) -> bool:
+    """Whether something is at ``path`` that is no file with ``mark`` in it, by which a program knows its own."""
+    return path.exists() and not (path.is_file() and mark.encode() in path.read_bytes())
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """The content of a file that has no more than ``most`` bytes; also of a pipe that something is written to.
 

@@ -14,6 +14,7 @@ from erfsfm.inference import DepthPosePredictor, commit
 from slam.commands.run.continuation import (
     inputs_to_continue,
     provenance_to_resume,
+    recording_to_resume,
     require_other_output,
     settings_to_continue,
     settings_to_resume,
@@ -114,12 +115,14 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)
-    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
+    recording = None if resumes is None else recording_to_resume(resumes)
+    if recording is None:
+        recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording
     if resumes is not None:
-        checkpoint = state_to_resume(resumes, recording)
+        checkpoint = state_to_resume(resumes, recording, settings.mapping.enabled)
     elif request.continues is not None:
         checkpoint = state_to_continue(request.continues, following)
         recording = checkpoint.continued(following)

@@ -112,6 +112,8 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     """Open and check all inputs of a run; writes nothing but the cache's folder."""
     if request.output is not None:
         check_output(request.output)
+        if request.cache is not None and request.cache.resolve() == request.output.resolve():
+            raise RunError(f"--cache and --output are one folder, {request.output}: choose another --cache")
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)

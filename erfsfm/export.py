@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from erfsfm.checkpoint import Absent, Model
 from erfsfm.common.errors import ExportError
-from erfsfm.common.files import write_atomically
+from erfsfm.common.files import is_foreign, write_atomically
 from erfsfm.common.onnx_session import open_session
 from erfsfm.config import NetworkConfig
 from erfsfm.networks.onnx_export import exported
@@ -26,6 +26,7 @@ from erfsfm.networks.presets import NetworkKind
 
 # of the largest output; a thousand roundings of float32
 TOLERANCE = 1e-4
+_MARK = "erfsfm_version"
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,13 @@ def export_onnx(model: Model, path: Path, seed: int = 0) -> list[Exported]:
         seed: of the random images on which both are compared.
 
     Raises:
-        ExportError: another ending, or outputs that differ.
+        ExportError: another ending, outputs that differ, or another file in the place of the pose network.
         ConfigError: the paper's dilated depth network, which cannot run.
     """
     if path.suffix != ".onnx":
         raise ExportError(f"--output must end in .onnx; got {path}")
+    if not isinstance(model.pose_net, Absent) and is_foreign(pose_path(path), _MARK):
+        raise ExportError(f"{pose_path(path)} is none of ours and would be replaced: choose another --output")
     config, generator = model.record.network, torch.Generator().manual_seed(seed)
     files = []
     if not isinstance(model.depth_net, Absent):
@@ -144,7 +147,7 @@ def _with_metadata(content: bytes, kind: NetworkKind, preset: str, model: Model)
         "input": "RGB in [-1, 1]",
         "licence": record.licence,
         "trained_on": json.dumps(record.trained_on),
-        "erfsfm_version": record.version,
+        _MARK: record.version,
     }
     onnx.helper.set_model_props(graph, notes)
     serialised: bytes = graph.SerializeToString()

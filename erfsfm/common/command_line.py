@@ -20,12 +20,8 @@ from erfsfm.common.signals import Terminated
 
 SHOW_TRACEBACK = "ERFSFM_TRACEBACK"
 _LOADING_BYTES = 384 * 2**20  # of NumPy, OpenCV and SciPy: OpenBLAS waits for ever for memory that it cannot have
-# what they would say of a file is said in our own line; twice the pixels of the largest camera that is read
-_OPENCV = {
-    "OPENCV_LOG_LEVEL": "SILENT",
-    "OPENCV_FFMPEG_LOGLEVEL": "-8",
-    "OPENCV_IO_MAX_IMAGE_PIXELS": str(2**27),
-}
+# what they would say of a file is said in our own line
+_OPENCV = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
 _INTERRUPTED = 130  # exit code that typer gives to ctrl-C
 _NOT_UTF8 = "is not in UTF-8: rename it, or set the environment variable LC_ALL to C.UTF-8"
 _OPTION = re.compile(r"--[a-z][a-z-]*=")
@@ -69,7 +65,7 @@ def _check_current_folder(name: str) -> None:
 
 
 def _checked(words: Sequence[str], name: str) -> list[str]:
-    """The words with ``~/`` as the home folder.
+    """The words with ``~`` and ``~/`` as the home folder.
 
     An empty one, as of a shell variable that is not set, is refused, and one that no text file can hold.
     """
@@ -82,7 +78,7 @@ def _checked(words: Sequence[str], name: str) -> list[str]:
         if not value and before not in _MAY_BE_EMPTY and start not in _MAY_BE_EMPTY:
             where = start.rstrip("=") or (before if before.startswith("--") else "one of its words")
             _end(f"{name}: {where} is empty: give a value or leave it out (is a shell variable not set?)", 2)
-        checked.append(start + (str(Path(value).expanduser()) if value.startswith("~/") else value))
+        checked.append(start + (str(Path(value).expanduser()) if value == "~" or value.startswith("~/") else value))
     return checked
 
 

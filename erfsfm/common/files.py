@@ -50,6 +50,11 @@ def write_atomically(path: Path, fill: Callable[[Path], object], sync: bool = Tr
             partial.unlink(missing_ok=True)
 
 
+def is_foreign(path: Path, mark: str) -> bool:
+    """Whether something is at ``path`` that is no file with ``mark`` in it, by which a program knows its own."""
+    return path.exists() and not (path.is_file() and mark.encode() in path.read_bytes())
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """The content of a file that has no more than ``most`` bytes; also of a pipe that something is written to.
 
@@ -58,13 +63,13 @@ def read_bytes(path: Path, most: int) -> bytes:
     """
     with open(path, "rb", opener=lambda name, _: open_written(name, WAIT_FOR_PIPE_S)) as file:
         size = os.fstat(file.fileno()).st_size  # 0 of a pipe, which is read in blocks
-        parts = [file.read(min(size, most))]
-        while sum(map(len, parts)) <= most and (block := file.read(_BLOCK_BYTES)):
+        parts = [file.read(size)] if size <= most else []
+        while size <= most and (block := file.read(_BLOCK_BYTES)):
             parts.append(block)
-    content = b"".join(parts)
-    if len(content) > most:
+            size += len(block)
+    if size > most:
         raise OSError(errno.EFBIG, f"larger than {most // 2**20} MiB", str(path))
-    return content
+    return b"".join(parts)
 
 
 def open_written(path: str, wait_s: float) -> int:

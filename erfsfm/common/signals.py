@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 _NAMES = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 
@@ -19,6 +20,31 @@ class Terminated(SystemExit):
 
     def __str__(self) -> str:
         return f"ended by {signal.Signals(self.number).name}{self.place}"
+
+
+@contextmanager
+def calling_on_signals(stop: Callable[..., None]) -> Iterator[None]:
+    """Call ``stop`` at the first ctrl-C, SIGTERM or SIGHUP in the block; after it a second ctrl-C counts as before.
+
+    Only in the main thread, and only for signals that are not ignored already.
+    """
+    handlers: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        numbers = [getattr(signal, name) for name in ("SIGINT", *_NAMES) if hasattr(signal, name)]
+        handlers = {n: before for n in numbers if (before := signal.getsignal(n)) is not signal.SIG_IGN}
+
+    def first(*_: object) -> None:
+        for number in handlers:
+            signal.signal(number, handlers[number] if number == signal.SIGINT else signal.SIG_IGN)
+        stop()
+
+    for number in handlers:
+        signal.signal(number, first)
+    try:
+        yield
+    finally:
+        for number, before in handlers.items():
+            signal.signal(number, before)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from erfsfm.data.shards import InShards, ShardIndex, Shards
 from erfsfm.geometry.camera import Camera
 
 INDEX_FILE = "pack.yaml"
+_MOST_FRAMES = 10**6  # of one recording: a day at ten frames a second
 
 
 class PackedCamera(Section):
@@ -37,7 +38,7 @@ class ShardedRecording(Section):
 
     name: str = Field(min_length=1, description="as in the leak record, without frames")
     start: int = Field(ge=0, description="number of the first frame")
-    frames: int = Field(gt=0)
+    frames: int = Field(gt=0, le=_MOST_FRAMES)
     camera: PackedCamera
 
 

@@ -240,4 +240,4 @@ def _download(url: str, most: int) -> bytes:
             break
         logger.warning("%s: %s; again in %g s", url, problem, wait)
         time.sleep(wait)
-    raise DataError(f"{url} cannot be read: {problem}; continue with --resume when it can")
+    raise DataError(f"{url} cannot be read: {problem}; train again when it can, with --resume where a checkpoint is")

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from erfsfm.common.errors import DataError
-from erfsfm.common.readers.frame_range import EVERYTHING, FrameRange
+from erfsfm.common.readers.frame_range import EVERYTHING, KINDS, FrameRange
 from erfsfm.config import DataConfig, ExperimentConfig
 from erfsfm.data.array_cache import ImageCache
 from erfsfm.data.discovery import discover
@@ -184,6 +184,9 @@ def split_recordings(config: DataConfig) -> tuple[list[Recording], list[Recordin
     listed = [FrameRange.parse(name) for name in split.train]
     held_out = [FrameRange.parse(name) for name in (*config.validation, *split.validation)]
     never = [FrameRange.parse(name) for name in (*config.exclude, *split.test_recordings)]
+    unknown = [str(each) for each in never if each.recording.partition("/")[0] not in KINDS]
+    if unknown:
+        raise DataError(f"data.exclude names '{unknown[0]}', but names of recordings begin with {_some(KINDS)}")
     found = [recording for root in config.roots for recording in discover(root)]
     for key, span in zip(config.ranges, ranges):
         if all(span.counted_in(recording.name) is None for recording in found):

@@ -105,7 +105,7 @@ def train(
         if rank == 0:
             lock.take(output)
             folder.write_config(config)
-        _fit(trainer, module, loader, validation_loader, folder.checkpoint if resume else None)
+        _fit(trainer, module, loader, validation_loader, folder.checkpoint, resume)
     keeper.save(trainer, module)
     if not trainer.is_global_zero:
         sys.exit()
@@ -187,7 +187,8 @@ def _fit(
     module: SelfSupervision,
     loader: DataLoader[dict[str, Tensor]],
     validation_loader: DataLoader[dict[str, Tensor]] | None,
-    checkpoint: Path | None,
+    checkpoint: Path,
+    resume: bool,
 ) -> None:
     """Run the training loop; errors that stop it become one line."""
     try:
@@ -197,13 +198,14 @@ def _fit(
             warnings.filterwarnings("ignore", message=".*when using `ckpt_path`.*")
             warnings.filterwarnings("ignore", message=".*dirpath has changed.*")
             warnings.filterwarnings("ignore", message=".*(Checkpoint|Experiment logs) directory.*")
-            trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint, weights_only=True)
+            trainer.fit(module, loader, validation_loader, ckpt_path=checkpoint if resume else None, weights_only=True)
     except DataError as error:
         # an error of a worker process has its traceback before the message, its last line
         raise DataError(str(error).strip().splitlines()[-1].removeprefix("erfsfm.common.errors.DataError: ")) from error
     except SystemExit as error:
         number = error.number if isinstance(error, Terminated) else signal.SIGINT  # Lightning turns ctrl-C into an exit
-        raise Terminated(number, f" at step {trainer.global_step}: continue with --resume") from error
+        next_time = "continue with --resume" if checkpoint.is_file() else "start again, for it has no checkpoint yet"
+        raise Terminated(number, f" at step {trainer.global_step}: {next_time}") from error
 
 
 def _start_from(module: SelfSupervision, config: ExperimentConfig) -> list[str]:

@@ -275,7 +275,7 @@ class SlamPipeline:
                     watch(observer)
                 self._progress("frames", index + 1, total)
                 done = index + 1 - first
-                if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 < total:
+                if checkpoints is not None and done % EVERY_FRAMES == 0 and index + 1 != total:
                     with self._watch.stage("journal"):
                         checkpoints.keep(observer.state())
             drive, state = observer.complete_drive(), observer.state()

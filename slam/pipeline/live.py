@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable
 from functools import wraps
@@ -38,6 +39,7 @@ from slam.runtime.run_files import MAP_MESH
 from slam.runtime.storage.files import write_atomically
 from slam.runtime.timing import Stopwatch
 from slam.sequences.growing import GrowingSequence
+from slam.sequences.recording import POSSIBLE_PERIODS_S
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -48,6 +50,11 @@ def _in_turn(method: Callable[Concatenate[Slam, P], R]) -> Callable[Concatenate[
 
     @wraps(method)
     def locked(self: Slam, *args: P.args, **kwargs: P.kwargs) -> R:
+        if os.getpid() != self._process:
+            raise SlamError(
+                "this session is of the process that made it, whose threads a forked one has not: make Slam there, or "
+                "start processes with multiprocessing.get_context('spawn')"
+            )
         with self._lock:
             return method(self, *args, **kwargs)
 
@@ -91,7 +98,7 @@ class Slam:
         Raises:
             SlamError: a scale mode that needs more than images, an impossible camera, or a number out of its range.
         """
-        self._lock = RLock()
+        self._lock, self._process = RLock(), os.getpid()
         _check(intrinsics, camera_height_m, config)
         config = config or SlamConfig()
         if update_frames < 1 or sweep_frames < 0 or not 0 <= seed < 2**31:
@@ -193,6 +200,8 @@ class Slam:
         stamp = float(stamp)
         if not np.isfinite(stamp) or (len(self) and not stamp > self._sequence.stamps[-1]):
             raise ValueError(f"stamps must increase; got {stamp} after {self._sequence.stamps[-1:].tolist()}")
+        if len(self) and not stamp - self._sequence.stamps[-1] <= POSSIBLE_PERIODS_S[1]:
+            raise ValueError(f"stamps must be seconds; got {stamp} after {self._sequence.stamps[-1]}")
         image = image.copy()  # used again with the next one
         image.setflags(write=False)
         index = len(self)

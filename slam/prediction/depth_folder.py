@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from erfsfm.common.files import MAX_IMAGE_BYTES, read_bytes
 from erfsfm.common.readers.images import natural_key, read_values
 from erfsfm.common.readers.numbering import by_name
+from erfsfm.common.readers.pinhole import MOST_PIXELS
 from slam.config.sections import DepthConfig
 from slam.frames import DepthMap, Frame
 from slam.prediction.depth_source import Disparity, Kind, at_size, disparity_of
@@ -106,6 +107,8 @@ class DepthFolder:
                 raise SlamError(f"cannot read depth {path}: {error.strerror or error}") from error
             found = header(path, content)
             size = size or found
+            if size[0] * size[1] > MOST_PIXELS:
+                raise SlamError(f"{path} is {found[1]}x{found[0]}, more pixels than any camera has: resize it")
             if found != size:
                 raise SlamError(
                     f"{path} is {found[1]}x{found[0]}, the depth before it {size[1]}x{size[0]}: write all of one size"

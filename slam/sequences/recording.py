@@ -32,7 +32,7 @@ from slam.sequences.undistortion import calibrated
 logger = logging.getLogger(__name__)
 
 MAX_GAP_S = 10.0
-_POSSIBLE_PERIODS_S = (1e-5, 1e4)  # stamps in nanoseconds or microseconds give more
+POSSIBLE_PERIODS_S = (1e-5, 1e4)  # stamps in nanoseconds or microseconds give more
 _USUAL_PERIODS_S = (1e-3, 5.0)
 _RIGID_TOLERANCE = 0.01
 _LONG_PAUSE_S, _LONG_PAUSE_PERIODS = 30.0, 50.0
@@ -187,7 +187,7 @@ def _require_plausible_rate(name: str, stamps: FloatArray) -> None:
         return
     periods = np.diff(stamps)
     period, longest = float(np.median(periods)), float(periods.max())
-    if not _POSSIBLE_PERIODS_S[0] <= period <= _POSSIBLE_PERIODS_S[1]:
+    if not POSSIBLE_PERIODS_S[0] <= period <= POSSIBLE_PERIODS_S[1]:
         raise SequenceError(f"{name}: its frames are {period:g} s apart: check its stamps, or fps, and their unit")
     if not _USUAL_PERIODS_S[0] <= period <= _USUAL_PERIODS_S[1]:
         logger.warning("%s: its frames are %g s apart: check its stamps, or fps, and their unit", name, period)

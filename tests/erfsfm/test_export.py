@@ -63,7 +63,8 @@ def onnx_output(path: Path, **inputs: torch.Tensor) -> np.ndarray:
 )
 def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, Any]) -> None:
     model = fresh(depth=depth, pose=pose, **settings)
-    written = export_onnx(model, tmp_path / "net.onnx")
+    export_onnx(model, tmp_path / "net.onnx")
+    written = export_onnx(model, tmp_path / "net.onnx")  # its own files are replaced
     assert [(file.path.name, file.preset) for file in written] == [("net.onnx", depth), ("net_pose.onnx", pose)]
     assert all(file.difference < 1e-4 for file in written)
     config = model.record.network
@@ -73,6 +74,13 @@ def test_all_presets(tmp_path: Path, depth: str, pose: str, settings: dict[str, 
     np.testing.assert_allclose(onnx_output(tmp_path / "net.onnx", image=images[0]), disparity, rtol=1e-4)
     found = onnx_output(tmp_path / "net_pose.onnx", target=images[0], sources=images[1:].transpose(0, 1).contiguous())
     np.testing.assert_allclose(found, vectors, atol=1e-4 * float(vectors.abs().max()))
+
+
+def test_a_file_that_nobody_named_is_not_replaced(tmp_path: Path) -> None:
+    pose_path(tmp_path / "net.onnx").write_text("another network")
+    with pytest.raises(ExportError, match=r"net_pose\.onnx is none of ours"):
+        export_onnx(fresh(), tmp_path / "net.onnx")
+    assert [path.name for path in tmp_path.iterdir()] == ["net_pose.onnx"]
 
 
 @pytest.mark.parametrize("pose", [name for name in POSE if PRESETS[name].encoder == "paper"])

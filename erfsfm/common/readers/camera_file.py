@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 
 HIGHEST_M = 1000.0
 _USUAL_HEIGHTS_M = (0.1, 10.0)
+_MOST_TILT_RAD = 0.5  # of lenses that are made to tilt: 0.2
 _COEFFICIENTS = {"opencv": (4, 5, 8, 12, 14), "fisheye": (4,), "fov": (1,)}
 
 
@@ -64,6 +65,8 @@ class CameraFile(BaseModel):
         if allowed is not None and len(self.distortion) not in allowed:
             counts = " or ".join(map(str, allowed))
             raise ValueError(f"distortion: model {self.model} has {counts} numbers, not {len(self.distortion)}")
+        if any(abs(tilt) > _MOST_TILT_RAD for tilt in self.distortion[12:]):
+            raise ValueError(f"distortion: tx and ty tilt the sensor by radians, {_MOST_TILT_RAD:g} at most")
         if self.model == "fov" and not 0 < self.distortion[0] < math.pi:
             raise ValueError(f"distortion: the angle of model fov lies between 0 and pi, is {self.distortion[0]:g}")
         return self

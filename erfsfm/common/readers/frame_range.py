@@ -15,6 +15,7 @@ from erfsfm.common.errors import ConfigError
 from erfsfm.common.readers.kitti_drives import ODOMETRY_DRIVES
 
 EVERYTHING = 10**9
+KINDS = ("folder", "kitti_odometry", "kitti_raw", "simulated")
 _RANGED = re.compile(r"(?P<base>.+)\[(?P<start>\d*):(?P<stop>\d*)\]", re.DOTALL)
 _PLAIN = re.compile(r"[^\[\]]+|(?!kitti_|simulated/)\w+/.+", re.DOTALL)  # users name their own folders as they like
 

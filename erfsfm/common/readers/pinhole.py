@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 FOCAL_RATIO_LIMITS = (0.1, 20.0)
 # pixels: OpenCV resamples no longer sides; 64 million are more than the sensors of cameras have
 _SIDE_LIMITS = (8, 32766)
-_MOST_PIXELS = 2**26
+MOST_PIXELS = 2**26
 _CENTRE_TOLERANCE = 0.2  # of the image's size; the principal points of the KITTI cameras are within 0.05
 _PIXEL_ASPECT_TOLERANCE = 0.1  # pixels of PAL video are 1.09 times as wide as they are high
 
@@ -54,10 +54,10 @@ def impossible(camera: Pinhole) -> str | None:
     size = f"{camera.width}x{camera.height}"
     shortest, longest = _SIDE_LIMITS
     sides = camera.width, camera.height
-    if min(sides) < shortest or max(sides) > longest or camera.width * camera.height > _MOST_PIXELS:
+    if min(sides) < shortest or max(sides) > longest or camera.width * camera.height > MOST_PIXELS:
         return (
             f"width, height: images of {size} are none of a camera: wanted {shortest} to {longest} pixels a side, and "
-            f"{_MOST_PIXELS:,} at most; resize the images"
+            f"{MOST_PIXELS:,} at most; resize the images"
         )
     least, most = FOCAL_RATIO_LIMITS
     longer = max(camera.width, camera.height)

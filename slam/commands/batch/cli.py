@@ -57,7 +57,7 @@ def batch(
     options += ["--seed", str(seed), "--device", device]
     planned = drives_of(drives, sequence or ["all"], options)
     each = threads or (0 if scheduler else max((os.cpu_count() or 1) // workers, 1))
-    check_output(output)
+    check_output(output, planned)
     output.mkdir(parents=True, exist_ok=True)
     with dask_workers(min(workers, len(planned)), scheduler) as spread, progress_bar() as progress:
         outcomes = run_drives(planned, output, Limits(each, memory), spread, progress)

@@ -22,6 +22,7 @@ Status = Literal["whole", "kept", "failed"]
 _POLL_S = 0.5
 _GIB = 2**30
 _MOST_STDERR = 20_000
+LOG_BEGIN = "erfsfm-slam run "  # a log begins with the command
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ def run_drive(drive: Drive, output: Path, limits: Limits) -> Outcome:
     command = [sys.executable, "-Pm", "slam.commands.batch.process", str(output / f".{drive.name}.lock"), *arguments]
     log = output / f"{drive.name}.log"
     with log.open("w", encoding="utf-8") as file:
+        file.write(shlex.join(["erfsfm-slam", *arguments]) + "\n")
+        file.flush()
         process = subprocess.Popen(
             command,
             cwd=drive.folder,
@@ -82,7 +85,7 @@ def run_drive(drive: Drive, output: Path, limits: Limits) -> Outcome:
             process.wait()
     if exceeded:
         return Outcome(drive, folder, "failed", exceeded)
-    said = log.read_text(encoding="utf-8", errors="replace")[-_MOST_STDERR:]
+    said = log.read_text(encoding="utf-8", errors="replace").partition("\n")[2][-_MOST_STDERR:]
     reason = why_ended(process.returncode, said)
     if not reason and not _is_whole(folder, arguments):
         reason = "it ended well and left no whole run: leave out options that only ask something"

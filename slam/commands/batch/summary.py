@@ -11,7 +11,9 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from slam.commands.batch.execution import Outcome
+from erfsfm.common.files import is_foreign
+from slam.commands.batch.execution import LOG_BEGIN, Outcome
+from slam.commands.batch.manifest import Drive
 from slam.results.error_columns import written
 from slam.results.folder import RunFolder
 from slam.results.metrics import Metrics
@@ -46,17 +48,18 @@ _COLUMNS: tuple[tuple[str, Callable[[Metrics], object], int], ...] = (
 _TEMPLATES = Environment(loader=PackageLoader("slam", "commands/batch"), autoescape=True, undefined=StrictUndefined)
 
 
-def check_output(output: Path) -> None:
-    """Check that a batch may be written to a folder.
+def check_output(output: Path, drives: Sequence[Drive]) -> None:
+    """Check that a batch of these drives may be written to a folder.
 
     Raises:
-        RunError: a file, or a folder of other files with the names of a summary.
+        RunError: a file, or a folder of other files with the names of a summary or of a log.
     """
     if output.exists() and not output.is_dir():
         raise RunError(f"{output} is a file: give a folder as --output")
-    for name, mark in ((CSV, ",".join(_FIRST)), (PAGE, "<title>erfsfm-slam: ")):
+    logs = [(f"{drive.name}.log", LOG_BEGIN) for drive in drives]
+    for name, mark in ((CSV, ",".join(_FIRST)), (PAGE, "<title>erfsfm-slam: "), *logs):
         path = output / name
-        if path.is_file() and mark.encode() not in path.read_bytes():
+        if is_foreign(path, mark):
             raise RunError(f"{path} is none of ours and would be replaced: choose another --output")
 
 

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TextIO
 
 from slam.formats.trajectory import Trajectory
@@ -47,6 +48,9 @@ def emitters(stream: TextIO, address: str | None) -> Iterator[Emit]:
     (zmq,) = import_extra("live")
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.linger = 1000
+        place = Path(address.removeprefix("ipc://"))
+        if address.startswith("ipc://") and place.exists() and not place.is_socket():  # ZeroMQ would replace it
+            raise SlamError(f"--publish {address} cannot be bound: {place} is there: name a new one")
         try:
             socket.bind(address)
         except zmq.ZMQError as error:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +11,7 @@ from pathlib import Path
 from threading import Thread
 
 from erfsfm.common.lock import FolderLock
-from erfsfm.common.signals import raising_on_termination
+from erfsfm.common.signals import calling_on_signals, raising_on_termination
 from erfsfm.inference import DepthPosePredictor
 from slam.commands.live.messages import Emit, corrected_message, pose_message
 from slam.commands.live.reader import EXPECTED
@@ -149,18 +147,10 @@ class _Session:
 
 @contextmanager
 def _stopping(sequence: StreamedSequence) -> Iterator[None]:
-    """The first ctrl-C ends the stream, the second one the run."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.getsignal(signal.SIGINT)
+    """The first ctrl-C, SIGTERM or SIGHUP ends the stream, a second ctrl-C the run."""
 
     def stop(*_: object) -> None:
-        signal.signal(signal.SIGINT, before)
         Thread(target=sequence.reader.stop).start()  # its lock may be held by the code that was interrupted
 
-    signal.signal(signal.SIGINT, stop)
-    try:
+    with calling_on_signals(stop):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)

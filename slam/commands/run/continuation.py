@@ -17,6 +17,7 @@ from slam.results.metrics import Metrics, Provenance, Recording
 from slam.runtime.errors import ConfigError, RunError
 from slam.runtime.run_files import CONFIG, DRIVE, UNFINISHED
 from slam.runtime.storage.record import Missing, known
+from slam.sequences.growing import GrowingSequence
 
 logger = logging.getLogger(__name__)
 
@@ -120,8 +121,23 @@ def warn_of_other_noise(folder: Path, before: Provenance | Missing, now: Provena
         )
 
 
-def state_to_resume(folder: Path, recording: FrameSequence) -> SessionCheckpoint | None:
-    """The last kept state of a run that did not end; None where it kept none, and begins again.
+def recording_to_resume(folder: Path) -> FrameSequence | None:
+    """The drive of a live run up to its last kept state, for its images are gone; None of another run.
+
+    Raises:
+        RunError: a damaged file.
+    """
+    kept = SessionCheckpoint.read(folder / DRIVE) if (folder / DRIVE).is_file() else None
+    if kept is None or kept.sources:
+        return None
+    logger.info("the live drive of %s is finished without the frames after its last kept state", folder)
+    return GrowingSequence(kept.intrinsics, kept.camera_height_m, kept.stamps, kept.name)
+
+
+def state_to_resume(folder: Path, recording: FrameSequence, is_mapped: bool) -> SessionCheckpoint | None:
+    """The last kept state of a run that did not end; None where it begins again.
+
+    That is where it kept none, or its map is to be made of keyframes that were not kept.
 
     Raises:
         RunError: a damaged file, or the recording is not the same any more.
@@ -140,6 +156,9 @@ def state_to_resume(folder: Path, recording: FrameSequence) -> SessionCheckpoint
             f"{recording.name} is not the recording that {folder} was run on, or it has changed since: give the same, "
             "or run it from its first frame in another --output"
         )
+    if is_mapped and checkpoint.is_whole and checkpoint.sources and not checkpoint.state.drive.keyframes:
+        logger.warning("the run in %s begins again for its map: it kept no keyframes (output.keep=keyframes)", folder)
+        return None
     return checkpoint
 
 

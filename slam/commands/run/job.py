@@ -45,6 +45,8 @@ from slam.sequences.continued import Continued
 
 logger = logging.getLogger(__name__)
 
+_NO_KEYFRAMES = "no keyframe was kept before the run was interrupted (output.keep=keyframes)"
+
 
 @dataclass(frozen=True)
 class Stream:
@@ -107,8 +109,7 @@ def _run(job: Job, folder: RunFolder) -> None:
     folder.write_text(CONFIG, dump_yaml(job.settings))
     stream, checkpoints = job.stream, _checkpoints(job, folder.path)
     frames, watch = (None, None) if stream is None else (stream.frames(), stream.watch)
-    # a run does not go on without the images of a live drive, nor in a folder without those before its own
-    goes_on = stream is None and not isinstance(job.recording, Continued)
+    goes_on = not isinstance(job.recording, Continued)  # not in a folder without the images before its own
     estimate = job.pipeline.estimate(checkpoints if goes_on else None, frames, watch)
     _write_estimate(folder, estimate, job)
     if checkpoints is not None:
@@ -172,7 +173,8 @@ def _write_map(folder: RunFolder, result: Estimate, job: Job) -> MapMetrics:
     Finished submaps stay where a file cannot be written.
     """
     if result.map is None:
-        return MapMetrics.missing("fusion is switched off (mapping.enabled)")
+        mapped = job.settings.mapping.enabled
+        return MapMetrics.missing(_NO_KEYFRAMES if mapped else "fusion is switched off (mapping.enabled)")
     try:
         with result.stopwatch.stage("mesh"):
             surface = result.map.surface(job.progress)

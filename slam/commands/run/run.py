@@ -16,6 +16,7 @@ from erfsfm.inference import DepthPosePredictor, commit
 from slam.commands.run.continuation import (
     inputs_to_continue,
     provenance_to_resume,
+    recording_to_resume,
     require_other_output,
     settings_to_continue,
     settings_to_resume,
@@ -120,15 +121,19 @@ def _prepare(request: RunRequest, resumes: Path | None = None) -> Job:
     """Open and check all inputs of a run; writes nothing but the cache's folder."""
     if request.output is not None:
         check_output(request.output)
+        if request.cache is not None and request.cache.resolve() == request.output.resolve():
+            raise RunError(f"--cache and --output are one folder, {request.output}: choose another --cache")
     if request.rerun is not None:
         import_extra("rerun")
     settings = _settings(request, resumes)
-    recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
+    recording = None if resumes is None else recording_to_resume(resumes)
+    if recording is None:
+        recording = open_sequence(request.dataset, request.sequence, request.camera, request.frames, request.truth)
     networks = DepthPosePredictor.from_weights(request.weights, request.device, "onnx")
     checkpoint, first = None, 0
     following = recording
     if resumes is not None:
-        checkpoint = state_to_resume(resumes, recording)
+        checkpoint = state_to_resume(resumes, recording, settings.mapping.enabled)
     elif request.continues is not None:
         checkpoint = state_to_continue(request.continues, following)
         recording = checkpoint.continued(following)

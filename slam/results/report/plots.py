@@ -55,6 +55,7 @@ _LOOKS: dict[str, tuple[str, dict[str, Any]]] = {
     "lidar": ("LiDAR (KISS-ICP)", {"color": "#009e73", "linestyle": (0, (1, 1)), "linewidth": 1.8}),
 }
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # of systems
+_MOST_COLUMNS = 12
 _STROKES = ("-", (0, (6, 1.5)), (0, (1, 1)))
 
 
@@ -242,10 +243,15 @@ def plot_runs(runs: Sequence[RunFolder], what: Sequence[str], output: Path) -> N
     """Write one figure: a column for each run, a row for each of ``what``.
 
     Raises:
-        RunError: an unknown ``what``, or a run without what the figure needs.
+        RunError: an unknown ``what``, too many runs, or a run without what the figure needs.
         ConfigError: as `require_figure`.
     """
     what = _panels(what)
+    if len(runs) > _MOST_COLUMNS:
+        raise RunError(
+            f"{len(runs)} runs are wider than a page, on which {_MOST_COLUMNS} have room: give their trajectory files, "
+            "which are drawn over each other, or compare them with 'erfsfm-slam evaluate'"
+        )
     require_figure(output)
     contents = [trajectories_of(run, needs_reference=set(what) != {"trajectory"}) for run in runs]
     heights = [*map(_height, what)]

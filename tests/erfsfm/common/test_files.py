@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from erfsfm.common import files
-from erfsfm.common.files import read_text, write_atomically
+from erfsfm.common.files import read_bytes, read_text, write_atomically
 
 
 @pytest.mark.parametrize("through", ["itself", "a link"])
@@ -34,6 +34,13 @@ def test_a_disk_that_is_full_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"depth\.png: cannot be written \(No space left on device\)$"):
         write_atomically(target, fill)
     assert list(target.parent.iterdir()) == []
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(OSError, match="larger than 1024 MiB"):
+        read_bytes(tmp_path / "sparse", 2**30)
 
 
 def test_a_pipe_is_read_if_something_is_written_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -78,6 +79,13 @@ def test_a_damaged_index_is_one_line(packed: Path, text: str, problem: str) -> N
     with pytest.raises(DataError, match=problem) as caught:
         discover(packed)
     assert "\n" not in str(caught.value)
+
+
+def test_more_frames_than_there_can_be_take_no_memory(packed: Path) -> None:
+    text = (packed / INDEX_FILE).read_text()
+    (packed / INDEX_FILE).write_text(re.sub(r"frames: \d+", "frames: 1600000000", text))
+    with pytest.raises(DataError, match="frames: Input should be less than or equal to 1000000"):
+        discover(packed)
 
 
 def test_a_folder_outside_the_pack_is_refused(packed: Path) -> None:

@@ -295,6 +295,11 @@ def test_misspelt_ranges_are_refused(kitti: Path) -> None:
         split_recordings(DataConfig(roots=[kitti], ranges={"kitti_odometry/0": "0:3"}))
 
 
+def test_a_misspelt_kind_is_not_left_in_the_training(kitti: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.exclude names 'simulatd/3'"):
+        split_recordings(DataConfig(roots=[kitti], exclude=["simulatd/3"]))
+
+
 def test_exclude_a_part(kitti: Path) -> None:
     """The frames around it train."""
     held_back = ["kitti_raw/2011_10_03_drive_0027[2:4]", "kitti_odometry/03", "kitti_odometry/09", "kitti_odometry/10"]

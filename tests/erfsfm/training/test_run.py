@@ -594,8 +594,10 @@ def test_a_signal_ends_a_training_in_order(
         return original(self, batch, index)
 
     monkeypatch.setattr(SelfSupervision, "training_step", signalled)
-    with pytest.raises(Terminated, match=f"ended by {name} at step 1: continue with --resume") as ended:
-        train(alone(), tmp_path / "run", device="cpu")
+    kept = {"SIGHUP": "continue with --resume"}.get(name, "start again, for it has no checkpoint yet")
+    config = alone(training={"checkpoint_every": 1 if name == "SIGHUP" else 2})
+    with pytest.raises(Terminated, match=f"ended by {name} at step 1: {kept}") as ended:
+        train(config, tmp_path / "run", device="cpu")
     assert ended.value.code == code
     assert load_model(tmp_path / "run" / "last").record.step == 1
 

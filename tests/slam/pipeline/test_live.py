@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -159,6 +160,8 @@ def test_wrong_frames_and_modes_are_refused() -> None:
     for stamp in (1.0, 0.5, np.nan, np.inf):
         with pytest.raises(ValueError, match=rf"stamps must increase; got {stamp} after \[?1\.0\]?"):
             slam.add_frame(image, stamp)
+    with pytest.raises(ValueError, match="stamps must be seconds"):
+        slam.add_frame(image, 1.7e18)
     assert len(slam) == 1 and slam.trajectory().stamps.tolist() == [1.0]
     with pytest.raises(SlamError, match="reference needs true poses; live has none"):
         started(load_config(None, ["scale.mode=reference"]))
@@ -212,6 +215,19 @@ def test_depth_that_is_no_depth_of_the_image_is_refused() -> None:
     slam = Slam(predictor, drive().intrinsics, load_config(None, SETTINGS))
     with pytest.raises(SlamError, match=r"depth of frame 0 must be \(96, 312\) float32; got \(48, 156\)"):
         feed(slam, 0, 2)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_is_told_what_to_do() -> None:
+    with started(load_config(None, SETTINGS)) as slam:
+        child = os.fork()
+        if not child:
+            try:
+                slam.add_frame(drive().frame(0).image, 0.0)
+            except SlamError as error:
+                os._exit("spawn" in str(error))
+            os._exit(2)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
 
 
 def test_threads_take_turns() -> None:

@@ -53,6 +53,10 @@ def test_exponent_without_dot_is_a_number(tmp_path: Path, camera_yaml: str) -> N
             "{yaml}model: opencv\ndistortion: [0.1]\n",
             "model opencv has 4 or 5 or 8 or 12 or 14 numbers, not 1",
         ),
+        (
+            "{yaml}model: opencv\ndistortion: [" + "0, " * 12 + "3, 0]\n",
+            "tilt the sensor by radians, 0.5 at most",
+        ),
         ("{yaml}model: fisheye\n", "model fisheye has 4 numbers, not 0"),
     ],
 )

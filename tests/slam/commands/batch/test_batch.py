@@ -108,7 +108,7 @@ def test_a_drive_that_needs_too_much_memory_is_ended(kitti_root: Path, tiny_weig
     assert outcome.status == "failed" and "more than the 0.1 GiB of --memory" in outcome.reason
     write_summary(tmp_path, [outcome])
     assert "0 of 1 drives" in (tmp_path / "index.html").read_text()
-    check_output(tmp_path)
+    check_output(tmp_path, [sim])
 
 
 def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
@@ -135,14 +135,15 @@ def test_paths_of_the_command_line_are_seen_from_where_it_is_given(
     assert float(row["ate_7dof_m"]) > 0
 
 
-@pytest.mark.parametrize("name", ["index.html", "drives.csv"])
-def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, name: str) -> None:
-    check_output(tmp_path)
+@pytest.mark.parametrize("name", ["index.html", "drives.csv", "sim.log"])
+def test_files_of_somebody_else_are_not_replaced(tmp_path: Path, kitti_root: Path, name: str) -> None:
+    drives = drives_of(kitti_root, ["all"], [])
+    check_output(tmp_path, drives)
     (tmp_path / name).write_text("my own")
     with pytest.raises(RunError, match=f"{name} is none of ours"):
-        check_output(tmp_path)
+        check_output(tmp_path, drives)
     with pytest.raises(RunError, match="is a file: give a folder"):
-        check_output(tmp_path / name)
+        check_output(tmp_path / name, drives)
 
 
 def dies_once(path: Path) -> str:

@@ -31,7 +31,10 @@ from slam.commands.live.run import run_live
 from slam.commands.live.sequence import StreamedSequence, calibration_of
 from slam.commands.live.source import FolderSource, VideoSource, open_source
 from slam.frames import Image
+from slam.pipeline import batch
+from slam.results.folder import RunFolder
 from slam.runtime.errors import RunError, SequenceError, SlamError
+from slam.runtime.storage.record import Missing
 from slam.sequences.camera_file import explicit_camera
 
 SETTINGS = ("mapping.enabled=false", "output.report=false")
@@ -418,13 +421,22 @@ def test_messages_are_published(tmp_path: Path) -> None:
     assert json.loads(stream.getvalue().splitlines()[0]) == {"type": "pose", "frame": 7}
 
 
+def test_a_file_in_the_place_of_a_socket_stays(tmp_path: Path) -> None:
+    pytest.importorskip("zmq")
+    (tmp_path / "mine").write_text("text")
+    with pytest.raises(SlamError, match="mine is there"), emitters(io.StringIO(), f"ipc://{tmp_path}/mine"):
+        pass
+    assert (tmp_path / "mine").read_text() == "text"
+
+
 def test_a_port_that_does_not_exist_is_refused() -> None:
     pytest.importorskip("zmq")
     with pytest.raises(SlamError, match="ports end at 65535"), emitters(io.StringIO(), "tcp://127.0.0.1:99999"):
         pass
 
 
-def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: Path, number: signal.Signals) -> None:
     output, target, messages = tmp_path / "run", tmp_path / "images", []
     target.mkdir()
     fill(street / "images", target, messages, vanishes=False)
@@ -435,7 +447,7 @@ def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: P
         assert process.stdout is not None
         for _ in range(FRAMES):
             messages.append(json.loads(process.stdout.readline()))
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         rest, said = process.communicate()
     assert process.returncode == 0, said
     last = json.loads(rest.splitlines()[-1])
@@ -445,3 +457,27 @@ def test_ctrl_c_leaves_a_whole_run(street: Path, tiny_weights: Path, tmp_path: P
     assert metrics["status"] == "ok"
     recording = {"dataset": str(target), "camera": str(street / "camera.yaml")}
     assert metrics["provenance"]["recording"] == recording
+
+
+def test_a_live_run_that_was_killed_is_finished_as_far_as_it_was_kept(
+    street: Path, tiny_weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, messages = tmp_path / "images", []
+    target.mkdir()
+    shutil.copy(street / "camera.yaml", tmp_path)
+    fill(street / "images", target, messages)
+    monkeypatch.setattr(batch, "EVERY_FRAMES", 4)
+
+    def listen(message: dict[str, Any]) -> None:
+        messages.append(message)
+        if len(messages) == 10:  # nothing more is written, as if it was killed
+            shutil.copytree(tmp_path / "live", tmp_path / "killed")
+
+    run_live(request_of(target, tiny_weights, ["output.report=false"], tmp_path / "live", wait=600), listen)
+    assert RunFolder(tmp_path / "killed").metrics().status == "running"
+    folder = run_slam(continues=tmp_path / "killed")
+    metrics = folder.metrics()
+    assert (metrics.status, metrics.sequence.frames) == ("ok", 8)
+    assert isinstance(metrics.map.triangles, Missing) and "no keyframe was kept" in metrics.map.triangles.reason
+    stamps = np.loadtxt(folder.path / "trajectory_optimised.tum.txt")[:, 0]
+    np.testing.assert_allclose(stamps, [message["stamp"] for message in messages[:8]])

@@ -163,6 +163,24 @@ def test_it_can_be_killed_again_or_have_kept_nothing_yet(
         run_slam(kitti_root, "sim", **named)
 
 
+def test_a_run_that_was_killed_before_its_map_has_it_afterwards(
+    kitti_root: Path, tiny_weights: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also without keyframes, which are not kept by default: it begins again."""
+    overrides = ["output.report=false", "mapping.voxel_size_m=0.5", "depth.refine=none"]
+    options: dict[str, Any] = {"weights": tiny_weights, "overrides": overrides, "frames": "0:13", "seed": 3}
+
+    def end(*_: object) -> None:
+        raise RunError("ended")
+
+    with monkeypatch.context() as patched, pytest.raises(RunError, match="ended"):
+        patched.setattr(batch.SlamPipeline, "fuse", end)
+        run_slam(kitti_root, "sim", output=tmp_path / "run", **options)
+    metrics = run_slam(continues=tmp_path / "run").metrics()
+    assert metrics.status == "ok"
+    assert metrics.map == RunFolder(whole).metrics().map
+
+
 def test_a_run_that_was_asked_to_end_goes_on(kill: Callable[..., Path], tmp_path: Path) -> None:
     output = kill(tmp_path / "run", 9, "SIGTERM", "mapping.enabled=false")
     assert RunFolder.open(output).metrics().tree()["status"] == "failed"

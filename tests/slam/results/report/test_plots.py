@@ -93,6 +93,8 @@ def test_errors_need_a_reference(make_run: MakeRun, tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"has no reference.*plot --what trajectory"):
         plot_runs([run], ["errors"], tmp_path / "a.png")
     plot_runs([run], ["trajectory"], tmp_path / "a.png")
+    with pytest.raises(RunError, match="60 runs are wider than a page"):
+        plot_runs([run] * 60, ["trajectory"], tmp_path / "a.png")
 
 
 @pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("PDF", b"%PDF"), ("svg", b"<?xml")])

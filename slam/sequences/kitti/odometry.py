@@ -32,6 +32,7 @@ from slam.sequences.recording import (
     read_stamps,
     scans_in,
 )
+from slam.sequences.true_mesh import distance_to_mesh
 
 
 def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> RecordedSequence:
@@ -68,6 +69,7 @@ def open_kitti_odometry(root: OdometryRoot, name: str, asked: Path | None) -> Re
         T_camera_lidar=_T_camera_lidar(calibration, T_camera_cam0),
         scans=scans_in(folder / "velodyne", files),
         depth_maps=depth_maps_in(folder / f"depth_{number}", files),
+        distance_to_surface=None if root.simulation_seed() is None else distance_to_mesh(root.base / "mesh.ply"),
     )
 
 

@@ -12,8 +12,8 @@ from slam.simulation.geometry import FloatArray, IntArray
 from slam.simulation.house import House, Rectangle
 
 CELL = 0.08  # metres
-_CLEAR_M = 0.42  # of a path's cells from walls and furniture
-_SMOOTH_CLEAR_M = 0.38  # of a path after its corners are rounded
+_CLEAR_M = 0.44  # of a path's cells from walls and furniture, which begin up to a cell nearer
+_SMOOTH_CLEAR_M = 0.42  # of a path after its corners are rounded
 _PLACE_CLEAR_M = 0.55
 _CORNERS_M = (0.4, 0.25, 0.12)  # by how much corners are rounded, the first that keeps clear
 

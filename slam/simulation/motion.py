@@ -16,6 +16,7 @@ CLOCK = 120.0  # samples of a motion a second
 FASTEST_TURN_DEG = 17.0  # a frame
 _STRIDE_M = 0.72
 _SETTLED_S = 0.15  # over which turns and starts are smoothed
+_CLEAR_M = 0.4  # of the carrier in the plan, where nothing is swayed any further
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ GAITS: dict[Motion, Gait] = {
     "walk": Gait((1.45, 1.7), 0.02, 1.1, 80.0, (0.5, 0.2, 0.3), 0.025, 0.03, 10.0, 0.25, -3.0),
     "look": Gait((1.45, 1.7), 0.05, 0.8, 70.0, (1.6, 1.0, 0.4), 0.02, 0.03, 14.0, 0.3, -2.0),
     "phone": Gait((1.2, 1.5), 0.08, 0.8, 110.0, (0.8, 0.8, 0.4), 0.015, 0.04, 22.0, 0.5, -10.0),
-    "drone": Gait((1.1, 1.9), 0.25, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, -5.0),
+    "drone": Gait((1.0, 1.25), 0.2, 0.9, 70.0, (0.6, 0.5, 0.3), 0.0, 0.05, 30.0, 0.15, -5.0),
     "robot": Gait((0.25, 0.45), 0.0, 0.5, 60.0, (0.8, 0.0, 0.3), 0.0, 0.0, 0.0, 0.04, 4.0),
 }
 assert tuple(GAITS) == get_args(Motion)
@@ -92,7 +93,7 @@ def carry(floor: Floor, motion: Motion, seconds: float, rate: float, seed: int) 
     count = len(base)
     x, y, yaw, pitch = base.T
     step = np.cumsum(moved * gait.speed / CLOCK) / _STRIDE_M * 2.0 * np.pi
-    free = np.clip(floor.clearance(base[:, :2]) - 0.32, 0.0, 1.0)
+    free = np.clip(floor.clearance(base[:, :2]) - _CLEAR_M, 0.0, 1.0)
     side = moved * gait.sway_m * np.sin(0.5 * step) + gait.sway_m * _unrest(rng, count, 0.6)
     side = np.clip(side, -free, free)
     unsteady = np.deg2rad(gait.tremor_deg)

@@ -10,9 +10,9 @@ from slam.runtime.errors import SequenceError
 from slam.simulation.floor import Floor
 from slam.simulation.geometry import Float32Array, FloatArray, Material, Mesh, Soup
 from slam.simulation.hazards import SHUTTER
-from slam.simulation.house import draw_house
+from slam.simulation.house import House, draw_house
 from slam.simulation.interior import GLOWING
-from slam.simulation.interiors import furnish
+from slam.simulation.interiors import Interior, furnish
 from slam.simulation.lighting import illuminate
 from slam.simulation.motion import Carried, carry
 from slam.simulation.moving import Moving
@@ -42,8 +42,7 @@ class SimulatedRooms(SimulatedWorld):
         """
         if options.frames < 2:
             raise SequenceError(f"a walk needs at least 2 frames; got {options.frames}")
-        house = draw_house(options.seed)
-        self._interior = furnish(house, options.seed)
+        house, self._interior = _furnished_house(options.seed)
         self._lights = self._interior.lights.copy()
         if "exposure" in options.hazards:  # some rooms are dim
             strength = np.exp(np.random.default_rng([options.seed, 54]).uniform(-1.5, 0.5, len(house.rooms)))
@@ -161,6 +160,13 @@ class SimulatedRooms(SimulatedWorld):
 
 _GLOW = np.array([GLOWING.get(material, 0.0) for material in Material], dtype=np.float32)
 _METER_WEIGHT = float(np.exp(-_METER_S * np.arange(_METERED) / 0.35).sum())
+
+
+@functools.lru_cache(maxsize=4)
+def _furnished_house(seed: int) -> tuple[House, Interior]:
+    """A house, which several motions and hazards share."""
+    house = draw_house(seed)
+    return house, furnish(house, seed)
 
 
 def _people(seed: int) -> Moving:
